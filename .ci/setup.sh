@@ -1,0 +1,52 @@
+#!/bin/sh
+# From an empty Debian, Ubuntu, Fedora or macOS to a working .venv; `make` calls it. POSIX sh.
+# Installs system packages only as root or with a sudo that asks nothing; else it stops with the line to run.
+set -eu
+cd "$(dirname "$0")/.."
+venv=.venv
+
+stop() {
+    echo "set-up: $*" >&2
+    exit 1
+}
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then
+        "$@"
+    elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
+        sudo -n "$@"
+    else
+        return 1
+    fi
+}
+
+# Installs one Debian package; a small system may have no package lists yet, or old ones.
+apt_install() {
+    install="env DEBIAN_FRONTEND=noninteractive apt-get install -yq --no-install-recommends $1"
+    command -v apt-get >/dev/null && { as_root $install || { as_root apt-get update -q && as_root $install; }; }
+}
+
+new_enough() {
+    "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
+}
+
+if ! { new_enough "$venv/bin/python" && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }; then
+    python=
+    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
+        if new_enough "$candidate"; then
+            python=$candidate
+            break
+        fi
+    done
+    [ -n "$python" ] || stop "no Python 3.11 or newer found: install one, or name it: make PYTHON=/path/to/python3"
+    # Debian and Ubuntu keep what makes a virtual environment in a package of its own.
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        package=$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')
+        apt_install "$package" ||
+            stop "$python cannot make virtual environments: sudo apt-get update && sudo apt-get install -y $package"
+    fi
+    "$python" -m venv --clear "$venv"
+fi
+echo "set-up: installing the package and its dependencies into $venv (a minute or two)" >&2
+"$venv/bin/python" -m pip install -q -e '.[dev]'
+"$venv/bin/python" -m wrf_mi.doctor --install-llvm

@@ -1,0 +1,43 @@
+# `make demo` and `make test` need nothing but Python 3.11 or newer: each sets up .venv and LLVM on its first call.
+# PYTHON=... names the Python to use.
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: help setup demo lint test test-slow bench clean
+
+help:
+	@echo "make demo       train on real spectra, or on a traced room where there are none"
+	@echo "make test       lint, types, import order, tests, notebooks"
+	@echo "make test-slow  the tests that take minutes"
+	@echo "make bench      run time against error"
+	@echo "make setup      only the set-up that the others begin with"
+	@echo "make clean      remove .venv, caches and packages; runs stay"
+
+setup: $(READY)
+
+# Only what is declared in pyproject.toml can change what is installed.
+$(READY): pyproject.toml .ci/setup.sh
+	@PYTHON="$(PYTHON)" .ci/setup.sh
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/wrf-mi demo
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint
+	$(BIN)/pytest --nbmake tests notebooks
+
+test-slow: $(READY)
+	$(BIN)/pytest -m "slow and not gpu"
+
+bench: $(READY)
+	$(BIN)/wrf-mi bench
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

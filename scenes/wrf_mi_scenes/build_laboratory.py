@@ -1,0 +1,212 @@
+"""Builds the `laboratory` scene: a room of 9 x 7 x 3 m with furniture and a small inner room.
+
+Run ``python -m wrf_mi_scenes.build_laboratory`` after a change; it rewrites ``laboratory/``. Nothing here
+was measured or taken from anywhere: the room is made up, so that a machine without data can still trace one.
+
+Walls, boards and panes are single sheets, because Sionna RT treats a surface as a slab whose thickness
+belongs to the material (``thickness_m`` below); only the metal cabinets are closed boxes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import yaml
+
+from .registry import content_sha256
+
+LENGTH, WIDTH, HEIGHT = 9.0, 7.0, 3.0
+"""The room's inner size along x, y and z in metres; the origin is the floor's south-west corner."""
+
+THICKNESS_M = {
+    "itu_concrete": 0.25,
+    "itu_brick": 0.20,
+    "itu_plasterboard": 0.10,
+    "itu_ceiling_board": 0.02,
+    "itu_wood": 0.03,
+    "itu_glass": 0.012,
+    "itu_metal": 0.002,
+}
+"""Slab thickness of each material in metres: ordinary building practice."""
+
+COLOURS = {
+    "itu_concrete": "0.45 0.45 0.45",
+    "itu_brick": "0.65 0.55 0.45",
+    "itu_plasterboard": "0.80 0.80 0.76",
+    "itu_ceiling_board": "0.90 0.90 0.88",
+    "itu_wood": "0.50 0.33 0.18",
+    "itu_glass": "0.55 0.70 0.80",
+    "itu_metal": "0.35 0.36 0.40",
+}
+"""What the materials look like when Mitsuba renders the room."""
+
+Span = tuple[float, float]
+Mesh = trimesh.Trimesh
+
+
+def sheet(axis: int, at: float, first: Span, second: Span) -> Mesh:
+    """A rectangle across ``axis`` (0 = x, 1 = y, 2 = z) at coordinate ``at``.
+
+    ``first`` and ``second`` are its extents along the other two axes in ascending order.
+    """
+    others = [a for a in range(3) if a != axis]
+    corners = np.full((4, 3), at)
+    corners[:, others[0]] = [first[0], first[1], first[1], first[0]]
+    corners[:, others[1]] = [second[0], second[0], second[1], second[1]]
+    return Mesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def wall(axis: int, at: float, along: Span, up: Span, openings: Iterable[tuple[Span, Span]] = ()) -> Mesh:
+    """An upright wall with rectangular openings, each given by its extents along the wall and in height.
+
+    The openings may not overlap along the wall.
+    """
+    pieces: list[Mesh] = []
+    start = along[0]
+    for (left, right), (low, high) in sorted(openings):
+        if left > start:
+            pieces.append(sheet(axis, at, (start, left), up))
+        if low > up[0]:
+            pieces.append(sheet(axis, at, (left, right), (up[0], low)))
+        if high < up[1]:
+            pieces.append(sheet(axis, at, (left, right), (high, up[1])))
+        start = right
+    if start < along[1]:
+        pieces.append(sheet(axis, at, (start, along[1]), up))
+    return trimesh.util.concatenate(pieces)
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
+    """A closed box between two corners."""
+    return trimesh.creation.box(bounds=[low, high])
+
+
+def table(x: Span, y: Span, top: float) -> Mesh:
+    """A table: its top and one closed side panel at each end of its longer side."""
+    longer = 0 if x[1] - x[0] >= y[1] - y[0] else 1
+    ends, across = (x, y) if longer == 0 else (y, x)
+    panels = [sheet(longer, end, across, (0.0, top)) for end in (ends[0] + 0.1, ends[1] - 0.1)]
+    return trimesh.util.concatenate([sheet(2, top, x, y), *panels])
+
+
+def shelf(x: Span, y: Span, boards: Iterable[float], top: float, back_axis: int, back_at: float) -> Mesh:
+    """A metal shelf: boards at the given heights and a back sheet."""
+    back = sheet(back_axis, back_at, y if back_axis == 0 else x, (0.0, top))
+    return trimesh.util.concatenate([back, *(sheet(2, z, x, y) for z in boards)])
+
+
+def laboratory_parts() -> dict[str, tuple[str, Mesh]]:
+    """Name of each part with its material and mesh, in metres."""
+    x, y, z = (0.0, LENGTH), (0.0, WIDTH), (0.0, HEIGHT)
+    windows = [((1.0, 3.4), (0.9, 2.4)), ((4.0, 5.4), (0.9, 2.4))]
+    door = ((7.7, 8.6), (0.0, 2.1))
+    # The inner room takes the north-east corner: a wall along x with a pane, one along y with a doorway.
+    inner_x, inner_y = 6.2, 5.0
+    pane = ((6.8, 8.2), (1.0, 2.2))
+    doorway = ((5.3, 6.2), (0.0, 2.1))
+    return {
+        "floor": ("itu_concrete", sheet(2, 0.0, x, y)),
+        "ceiling": ("itu_ceiling_board", sheet(2, HEIGHT, x, y)),
+        "wall_south": ("itu_brick", wall(1, 0.0, x, z, [door])),
+        "wall_north": ("itu_brick", wall(1, WIDTH, x, z, windows)),
+        "wall_west": ("itu_brick", wall(0, 0.0, y, z)),
+        "wall_east": ("itu_brick", wall(0, LENGTH, y, z)),
+        "windows": ("itu_glass", trimesh.util.concatenate([sheet(1, WIDTH, *w) for w in windows])),
+        "door": ("itu_wood", sheet(1, 0.0, *door)),
+        "inner_room": (
+            "itu_plasterboard",
+            trimesh.util.concatenate(
+                [
+                    wall(1, inner_y, (inner_x, LENGTH), z, [pane]),
+                    wall(0, inner_x, (inner_y, WIDTH), z, [doorway]),
+                ]
+            ),
+        ),
+        "inner_pane": ("itu_glass", sheet(1, inner_y, *pane)),
+        "tables": (
+            "itu_wood",
+            trimesh.util.concatenate(
+                [
+                    table((3.4, 5.2), (1.1, 1.9), 0.74),
+                    table((3.8, 5.6), (5.6, 6.4), 0.74),
+                    table((0.2, 1.0), (4.2, 6.0), 0.74),
+                    table((6.6, 8.4), (6.1, 6.9), 0.74),
+                ]
+            ),
+        ),
+        "shelves": (
+            "itu_metal",
+            trimesh.util.concatenate(
+                [
+                    shelf((0.05, 0.45), (0.6, 2.4), (0.2, 0.7, 1.2, 1.7), 1.9, 0, 0.05),
+                    shelf((5.0, 6.6), (0.05, 0.45), (0.2, 0.8, 1.4), 1.8, 1, 0.05),
+                ]
+            ),
+        ),
+        "cabinets": (
+            "itu_metal",
+            trimesh.util.concatenate([box((8.5, 0.9, 0.0), (8.95, 2.1, 1.9)), box((3.2, 0.05, 0.0), (4.95, 0.5, 2.0))]),
+        ),
+        "whiteboard": ("itu_metal", sheet(0, 0.02, (2.8, 4.0), (0.9, 2.1))),
+    }
+
+
+def scene_xml(parts: dict[str, tuple[str, Mesh]]) -> str:
+    """The Mitsuba scene file over ``meshes/<part>.ply``.
+
+    The BSDF names ``mat-itu_*`` are what Sionna RT turns into its ITU radio materials; Mitsuba itself sees
+    plain two-sided diffuse ones.
+    """
+    lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
+    for material in dict.fromkeys(material for material, _ in parts.values()):
+        lines += [
+            f'    <bsdf type="twosided" id="mat-{material}">',
+            f'        <bsdf type="diffuse"><rgb name="reflectance" value="{COLOURS[material]}"/></bsdf>',
+            "    </bsdf>",
+        ]
+    for name, (material, _) in parts.items():
+        lines += [
+            f'    <shape type="ply" id="mesh-{name}">',
+            f'        <string name="filename" value="meshes/{name}.ply"/>',
+            '        <boolean name="face_normals" value="true"/>',
+            f'        <ref id="mat-{material}" name="bsdf"/>',
+            "    </shape>",
+        ]
+    return "\n".join([*lines, "</scene>", ""])
+
+
+def build(folder: Path) -> None:
+    """Write the scene's files into ``folder``: ``laboratory.xml``, ``meshes/*.ply`` and ``scene.yml``."""
+    parts = laboratory_parts()
+    meshes = folder / "meshes"
+    meshes.mkdir(parents=True, exist_ok=True)
+    for name, (_, mesh) in parts.items():
+        mesh.export(meshes / f"{name}.ply", vertex_normal=False)
+    (folder / "laboratory.xml").write_text(scene_xml(parts), encoding="utf-8", newline="\n")
+    facts = {
+        "description": "Made-up laboratory, 9 x 7 x 3 m: brick walls, windows, tables, metal shelves, an inner room",
+        "licence": "MIT",
+        "origin": "made by wrf_mi_scenes.build_laboratory",
+        "frame": "right-handed; x east, y north, z up; origin at the floor's south-west corner",
+        "units": "m",
+        "xml": "laboratory.xml",
+        "thickness_m": THICKNESS_M,
+        "sha256": content_sha256(folder, "laboratory.xml"),
+    }
+    text = yaml.safe_dump(facts, sort_keys=False, width=110)
+    (folder / "scene.yml").write_text(text, encoding="utf-8", newline="\n")
+
+
+def main() -> None:
+    """Write the scene into the package, or into the folder that is given."""
+    parser = argparse.ArgumentParser(description="Build the laboratory scene.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "laboratory")
+    build(parser.parse_args().out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wrf_mi import backend
+from wrf_mi.backend import cache, libraries, probe
+from wrf_mi.core import BackendError, InputError
+
+SECONDS_PER_CHILD = 300
+"""A child imports Mitsuba and may try a library: about a second, much longer on a busy machine."""
+
+CHOICE_S = 0.05
+"""What choosing may add to the import of Mitsuba once the verdicts are remembered."""
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Other tests may have initialised the backend in this process, which sets the variable.
+    monkeypatch.delenv(libraries.LLVM_VARIABLE, raising=False)
+    monkeypatch.delenv(libraries.CUDA_VARIABLE, raising=False)
+    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Makes a folder with empty files of these names all that is found."""
+
+    def build(*names: str) -> Path:
+        folder = tmp_path / "lib"
+        folder.mkdir(exist_ok=True)
+        for name in names:
+            (folder / name).touch()
+        monkeypatch.setattr(libraries, "_library_folders", lambda: [folder])
+        monkeypatch.setattr(libraries, "_linker_cache", lambda start: [])
+        return folder
+
+    return build
+
+
+def good_if(*versions: tuple[int, ...]):
+    """Stands in for the trial: only these versions work."""
+
+    def verdict(library: libraries.LlvmLibrary, *, fresh: bool = False) -> probe.Verdict:
+        usable = library.version in versions
+        return probe.Verdict(usable, "" if usable else "does not work", ".".join(map(str, library.version)))
+
+    return verdict
+
+
+def real_llvm(major: int) -> libraries.LlvmLibrary:
+    found = [library for library in backend.find_llvm(ignore_variable=True) if library.version[:1] == (major,)]
+    if not found:
+        pytest.skip(f"LLVM {major} is not installed here")
+    return found[0]
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS_PER_CHILD,
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM-17.so", (17,)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM-19.dylib", (19,)),
+        ("libLLVM.19.1.dylib", (19, 1)),
+        ("libLLVM.so", ()),
+        ("libLLVM.so.1", ()),
+        ("libLLVM.dylib", ()),
+        ("libLLVM.so.19.1-rust-1.83.0-stable", None),
+        ("libLLVMCore.a", None),
+        ("libLLVMSPIRVLib.so.15", None),
+        ("libLLVM-C.so", None),
+    ],
+)
+def test_version_from_file_name(name: str, version: tuple[int, ...] | None) -> None:
+    assert libraries.version_from_name(name) == version
+
+
+@given(st.integers(3, 99), st.integers(0, 9), st.integers(0, 99))
+def test_every_version_survives_a_file_name(major: int, minor: int, patch: int) -> None:
+    assert libraries.version_from_name(f"libLLVM-{major}.{minor}.{patch}.so") == (major, minor, patch)
+    assert libraries.version_from_name(f"libLLVM.so.{major}.{minor}") == (major, minor)
+
+
+def test_newest_first_each_file_once(only) -> None:
+    folder = only("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.9.1", "libLLVM-19.1.7.so", "libLLVMCore.a")
+    (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
+    found = [(library.version, library.path.name) for library in backend.find_llvm()]
+    assert found == [
+        ((19, 1, 7), "libLLVM-19.1.7.so"),
+        ((19, 1), "libLLVM.so.19.1"),
+        ((14,), "libLLVM-14.so.1"),
+        ((9, 1), "libLLVM.so.9.1"),
+    ]
+
+
+def test_variable_excludes_all_others(only, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
+    assert [library.version for library in backend.find_llvm()] == [(15,)]
+    assert len(backend.find_llvm(ignore_variable=True)) == 2
+    monkeypatch.setenv(libraries.LLVM_VARIABLE, str(tmp_path / "missing.so"))
+    assert backend.find_llvm() == []
+
+
+def test_version_is_read_from_the_library_where_the_name_has_none(tmp_path: Path, only) -> None:
+    library = backend.find_llvm()[0] if backend.find_llvm() else pytest.skip("no LLVM is installed here")
+    folder = only()
+    copy = folder / "libLLVM.so"
+    os.link(library.path, copy) if _same_disk(library.path, folder) else copy.write_bytes(library.path.read_bytes())
+    assert backend.find_llvm()[0].version[: len(library.version)] == library.version
+
+
+def _same_disk(file: Path, folder: Path) -> bool:
+    return os.stat(file).st_dev == os.stat(folder).st_dev and os.access(file, os.W_OK)
+
+
+def test_newest_good_library_is_chosen(only, monkeypatch: pytest.MonkeyPatch) -> None:
+    only("libLLVM.so.23.1", "libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setattr(backend, "try_llvm", good_if((20, 1), (19, 1), (15,)))
+    assert backend.choose("llvm").llvm_version == "20.1"
+
+
+@pytest.mark.parametrize("major", [14, 15, 16])
+def test_old_llvm_is_refused_unseen(only, major: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    only(f"libLLVM-{major}.so.1")
+    monkeypatch.setattr(probe, "_run_trial", lambda *arguments: pytest.fail("an old LLVM was loaded"))
+    with pytest.raises(BackendError, match=rf"LLVM {major} .* is too old .*: .*install") as caught:
+        backend.choose("llvm")
+    assert "\n" not in str(caught.value)
+
+
+def test_no_llvm_at_all(only) -> None:
+    only()
+    with pytest.raises(BackendError, match=r"no usable LLVM \(none was found\): .*install"):
+        backend.choose("llvm")
+
+
+def test_a_file_that_is_no_library_is_refused(only) -> None:
+    only("libLLVM.so.19.1")
+    with pytest.raises(BackendError, match=r"LLVM 19\.1 .* fails") as caught:
+        backend.choose("llvm")
+    assert "\n" not in str(caught.value)
+
+
+def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
+    monkeypatch.setattr(backend, "try_llvm", good_if((19, 1)))
+    with pytest.raises(BackendError, match=r"LLVM 15 .* does not work: unset it, LLVM 19\.1 .* works"):
+        backend.choose("llvm")
+
+
+def test_a_trial_in_its_own_process_finds_what_aborts() -> None:
+    verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
+    assert final
+    assert not verdict.usable
+    assert "SIGABRT" in verdict.reason
+    assert "fminimum" in verdict.reason
+    assert "0x" not in verdict.reason
+
+
+def test_verdicts_are_remembered_until_the_file_changes(only, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = only("libLLVM.so.19.1") / "libLLVM.so.19.1"
+    trials = []
+
+    def trial(variant: str, variable: str, library: Path) -> tuple[probe.Verdict, bool]:
+        trials.append(library)
+        return probe.Verdict(True, version="19.1.0"), True
+
+    monkeypatch.setattr(probe, "_run_trial", trial)
+    library = backend.find_llvm()[0]
+    assert probe.try_llvm(library) == probe.try_llvm(library)
+    assert len(trials) == 1
+    probe.try_llvm(library, fresh=True)
+    assert len(trials) == 2
+    os.utime(file, ns=(1, 1))
+    probe.try_llvm(library)
+    assert len(trials) == 3
+
+
+def test_a_failure_is_forgotten_after_its_time() -> None:
+    cache.remember("short", {"usable": False}, seconds=-1)
+    cache.remember("long", {"usable": True})
+    assert cache.recall("short") is None
+    assert cache.recall("long") == {"usable": True}
+
+
+def test_a_damaged_cache_is_an_empty_one() -> None:
+    cache.remember("key", {"usable": True})
+    cache.cache_file().write_text('{"key": {"usa')
+    assert cache.recall("key") is None
+    cache.remember("key", {"usable": True})
+    assert cache.recall("key") == {"usable": True}
+
+
+def test_a_cache_that_cannot_be_written_only_costs_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "file" / "libraries.json")
+    cache.remember("key", {"usable": True})
+    assert cache.recall("key") is None
+
+
+def test_choice_is_quick_once_remembered() -> None:
+    backend.choose()
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        backend.choose()
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < CHOICE_S
+
+
+@pytest.mark.parametrize("imported_before", ["", "import drjit; "])
+@pytest.mark.parametrize("major", [14, 15])
+def test_process_with_an_old_llvm_ends_with_one_line(major: int, imported_before: str) -> None:
+    path = str(real_llvm(major).path)
+    ended = run_python(f"{imported_before}import wrf_mi.backend as b; b.init()", **{libraries.LLVM_VARIABLE: path})
+    assert ended.returncode == 1
+    last = ended.stderr.strip().splitlines()[-1]
+    assert last.startswith("wrf_mi.core.errors.BackendError: ")
+    assert libraries.LLVM_VARIABLE in last or "install" in last
+
+
+def test_init_in_a_new_process() -> None:
+    code = """
+import os, sys
+import wrf_mi.backend as b
+assert "drjit" not in sys.modules
+first = b.init("llvm", threads=1)
+import drjit, mitsuba
+assert mitsuba.variant() == first.variant == "llvm_ad_mono_polarized"
+assert b.init() is first
+assert drjit.thread_count() == 1
+assert first.llvm_path == os.environ["DRJIT_LIBLLVM_PATH"]
+assert ".".join(map(str, drjit.detail.llvm_version())) == first.llvm_version
+try:
+    b.init("cuda")
+except b.BackendError as error:
+    assert "already computes with llvm" in str(error)
+else:
+    raise AssertionError
+"""
+    ended = run_python(code)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_init_after_drjit_was_imported() -> None:
+    code = """
+import warnings
+import mitsuba
+mitsuba.set_variant("scalar_rgb")
+import wrf_mi.backend as b
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    chosen = b.init("llvm")
+assert mitsuba.variant() == chosen.variant
+assert any("from scalar_rgb to llvm_ad_mono_polarized" in str(warning.message) for warning in caught)
+assert chosen.llvm_version and "LLVM" in (chosen.llvm_path or "libLLVM")
+"""
+    ended = run_python(code)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_cuda_with_a_driver_that_does_not_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = tmp_path / "libcuda.so.1"
+    driver.write_text("not a library")
+    monkeypatch.setenv(libraries.CUDA_VARIABLE, str(driver))
+    with pytest.raises(BackendError, match=r"CUDA cannot be used, .*libcuda\.so\.1 fails: .* or use the backend llvm"):
+        backend.choose("cuda")
+    assert backend.choose("auto").name == "llvm"
+
+
+def test_cuda_without_a_device() -> None:
+    if backend.find_cuda():
+        pytest.skip("there is a GPU here")
+    with pytest.raises(BackendError, match="CUDA cannot be used, no NVIDIA driver"):
+        backend.choose("cuda")
+
+
+@pytest.mark.gpu
+def test_cuda_is_preferred_where_it_works() -> None:
+    assert backend.choose("auto").name == "cuda"
+
+
+def test_arguments_are_checked() -> None:
+    with pytest.raises(InputError, match="backend: 'opencl' is none of"):
+        backend.init("opencl")
+    with pytest.raises(InputError, match="threads: must be at least 1, got 0"):
+        backend.init(threads=0)

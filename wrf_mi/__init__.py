@@ -1,0 +1,3 @@
+"""wrf_mi: learned wireless radiation fields and ray tracing in one differentiable program."""
+
+__version__ = "0.1.0"

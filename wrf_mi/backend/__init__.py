@@ -1,0 +1,218 @@
+"""The one place that finds LLVM or CUDA and sets Mitsuba's variant.
+
+Dr.Jit loads the newest LLVM it finds as soon as it is imported, and an LLVM that is too old does not raise:
+15 and 16 end the process in the first kernel with a minimum or maximum. So every library is tried once in a
+process of its own (the verdict is remembered per file), and the one that passed is named to Dr.Jit before
+its first import. Call `init` before importing drjit, mitsuba or sionna.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import threading
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from wrf_mi.core.errors import BackendError, InputError
+
+from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary, find_cuda, find_llvm
+from .probe import VARIANTS, try_cuda, try_llvm
+from .remedy import GOOD_FROM, install_line
+
+__all__ = ["VARIANTS", "Backend", "BackendError", "LlvmLibrary", "choose", "find_cuda", "find_llvm", "init"]
+
+_TOO_EARLY = "Dr.Jit was imported before wrf_mi.backend.init() and"
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What computes.
+
+    Attributes:
+        name: ``"llvm"`` or ``"cuda"``.
+        variant: Mitsuba's variant.
+        llvm_path: the LLVM library in use; None for CUDA, or if it cannot be told.
+        llvm_version: e.g. ``"19.1.7"``; None for CUDA.
+        device: name of the GPU or of the processor.
+    """
+
+    name: str
+    variant: str
+    llvm_path: str | None
+    llvm_version: str | None
+    device: str
+
+
+_active: Backend | None = None
+_lock = threading.Lock()
+
+
+def init(backend: str = "auto", threads: int | None = None) -> Backend:
+    """Chooses what computes, imports Dr.Jit and Mitsuba and sets the variant; later calls return the same.
+
+    Args:
+        backend: ``"auto"`` (CUDA if it works, else LLVM), ``"llvm"`` or ``"cuda"``.
+        threads: number of threads for LLVM kernels; None leaves Dr.Jit's own choice, all cores.
+
+    Raises:
+        BackendError: nothing usable was found, or another backend is already in use: one line with the remedy.
+        InputError: unknown ``backend``, or fewer than one thread.
+    """
+    global _active
+    _check_arguments(backend, threads)
+    with _lock:
+        if _active is None:
+            _active = _start(backend)
+        elif backend not in ("auto", _active.name):
+            raise BackendError(f"this process already computes with {_active.name}: start another for {backend}")
+        import drjit as dr
+        import mitsuba as mi
+
+        before = mi.variant()
+        if before != _active.variant:
+            if before is not None:
+                warnings.warn(f"Mitsuba's variant changes from {before} to {_active.variant}", stacklevel=2)
+            mi.set_variant(_active.variant)
+        if threads is not None:
+            dr.set_thread_count(threads)
+        return _active
+
+
+def choose(backend: str = "auto", *, fresh: bool = False) -> Backend:
+    """What `init` would use in a new process. Dr.Jit is not imported here.
+
+    Args:
+        backend: as in `init`.
+        fresh: try every library again, whatever is remembered.
+
+    Raises:
+        BackendError: nothing usable was found: one line with the remedy.
+        InputError: unknown ``backend``.
+    """
+    _check_arguments(backend, None)
+    cuda = None if backend == "llvm" else _choose_cuda(required=backend == "cuda", fresh=fresh)
+    return cuda or _choose_llvm(fresh)
+
+
+def _check_arguments(backend: str, threads: int | None) -> None:
+    if backend not in ("auto", *VARIANTS):
+        raise InputError(f"backend: {backend!r} is none of auto, llvm, cuda")
+    if threads is not None and threads < 1:
+        raise InputError(f"threads: must be at least 1, got {threads}")
+
+
+def _start(backend: str) -> Backend:
+    """The choice for this process; names the LLVM to Dr.Jit if that is still possible."""
+    if backend == "auto" and "mitsuba" in sys.modules:
+        # A variant that was set on purpose decides, if it is one that we can use.
+        variant = sys.modules["mitsuba"].variant()
+        backend = next((name for name, ours in VARIANTS.items() if ours == variant), backend)
+    if "drjit" in sys.modules:
+        return _judge_loaded(backend)
+    chosen = choose(backend)
+    if chosen.llvm_path is not None:
+        os.environ[LLVM_VARIABLE] = chosen.llvm_path
+    if chosen.name == "cuda":
+        os.environ[CUDA_VARIABLE] = str(find_cuda())
+    return chosen
+
+
+def _choose_cuda(*, required: bool, fresh: bool) -> Backend | None:
+    driver = find_cuda()
+    if driver is None:
+        reason, remedy = "no NVIDIA driver library with a device beside it was found", "install NVIDIA's driver"
+    else:
+        verdict = try_cuda(driver, fresh=fresh)
+        if verdict.usable:
+            return Backend("cuda", VARIANTS["cuda"], None, None, verdict.device)
+        reason, remedy = f"{driver} {verdict.reason}", "see what nvidia-smi says"
+    if required:
+        raise BackendError(f"CUDA cannot be used, {reason}: {remedy}, or use the backend llvm")
+    return None
+
+
+def _choose_llvm(fresh: bool) -> Backend:
+    refused = []
+    for library in find_llvm():
+        verdict = try_llvm(library, fresh=fresh)
+        if verdict.usable:
+            return _llvm(library.path, verdict.version)
+        refused.append(f"{library} {verdict.reason}")
+    asked = os.environ.get(LLVM_VARIABLE)
+    if asked:
+        what = refused[0] if refused else f"{asked} is not a file"
+        other = _good_llvm(ignore_variable=True)
+        remedy = f"unset it, {other} works" if other else f"unset it and install a newer one: {install_line()}"
+        raise BackendError(f"{LLVM_VARIABLE} is set, but {what}: {remedy}")
+    what = "; ".join(refused) or "none was found"
+    raise BackendError(f"no usable LLVM ({what}): {install_line()}")
+
+
+def _good_llvm(*, ignore_variable: bool) -> LlvmLibrary | None:
+    libraries = find_llvm(ignore_variable=ignore_variable)
+    return next((library for library in libraries if try_llvm(library).usable), None)
+
+
+def _judge_loaded(backend: str) -> Backend:
+    """What Dr.Jit has already loaded, if it is good."""
+    import drjit as dr
+
+    cuda = None if backend == "llvm" else _choose_cuda(required=backend == "cuda", fresh=False)
+    if cuda is not None and dr.has_backend(dr.JitBackend.CUDA):
+        return cuda
+    if backend == "cuda":
+        remedy = f"call wrf_mi.backend.init() first, or set {CUDA_VARIABLE}={find_cuda()} before Python starts"
+        raise BackendError(f"{_TOO_EARLY} did not find the NVIDIA driver: {remedy}")
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        raise BackendError(f"{_TOO_EARLY} found no LLVM that it can use: {_other_llvm()}")
+    version: tuple[int, ...] = dr.detail.llvm_version()
+    path = _loaded_llvm()
+    if path is None:
+        # Nothing says which file it is, so it cannot be tried: only its version can speak for it.
+        usable, reason = version[0] >= GOOD_FROM, f"which is older than {GOOD_FROM}"
+    else:
+        verdict = try_llvm(LlvmLibrary(path, version))
+        usable, reason = verdict.usable, f"which {verdict.reason}"
+    text = ".".join(map(str, version))
+    if not usable:
+        raise BackendError(
+            f"{_TOO_EARLY} loaded LLVM {text} ({path or 'its file is not known'}), {reason}: {_other_llvm()}"
+        )
+    return _llvm(path, text)
+
+
+def _loaded_llvm() -> Path | None:
+    """The LLVM mapped into this process (Linux), or the one that was asked for."""
+    try:
+        with open("/proc/self/maps") as maps:
+            files = {line.split(maxsplit=5)[5].strip() for line in maps if "/libLLVM" in line}
+    except OSError:
+        files = set()
+    # More than one (a graphics driver loads its own) leaves open which is Dr.Jit's.
+    name = files.pop() if len(files) == 1 else os.environ.get(LLVM_VARIABLE)
+    return Path(name) if name and Path(name).is_file() else None
+
+
+def _other_llvm() -> str:
+    """Remedy for an LLVM that was loaded too early."""
+    other = _good_llvm(ignore_variable=True)
+    if other is None:
+        return install_line()
+    return f"call wrf_mi.backend.init() first, or set {LLVM_VARIABLE}={other.path} before Python starts"
+
+
+def _llvm(path: Path | None, version: str) -> Backend:
+    return Backend("llvm", VARIANTS["llvm"], None if path is None else str(path), version, _processor())
+
+
+def _processor() -> str:
+    """Name of the processor (``/proc/cpuinfo`` on Linux)."""
+    try:
+        with open("/proc/cpuinfo") as lines:
+            name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    except OSError:
+        name = ""
+    return name or platform.processor() or platform.machine()

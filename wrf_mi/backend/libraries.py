@@ -1,0 +1,172 @@
+"""Finds the LLVM and CUDA libraries on this machine without loading one into this process.
+
+Names of the files: Debian and Ubuntu have ``libLLVM-14.so.1`` and ``libLLVM.so.19.1``, Fedora
+``libLLVM-17.so`` and ``libLLVM.so.20.1``, Homebrew ``libLLVM.dylib`` and ``libLLVM-19.dylib``.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from .cache import file_key, recall, remember
+
+LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"
+"""The environment variables by which Dr.Jit is told which library to load."""
+
+READ_TIMEOUT_S = 60
+"""Loading an LLVM takes 0.1 s; a cold network disk may need much longer."""
+
+_LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
+_READ_VERSION = """
+import ctypes, sys
+numbers = [ctypes.c_uint() for _ in range(3)]
+ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, numbers))
+print(*(number.value for number in numbers))
+"""
+
+
+@dataclass(frozen=True)
+class LlvmLibrary:
+    """An LLVM shared library.
+
+    Attributes:
+        path: the file itself, symbolic links resolved.
+        version: as far as it is known, e.g. ``(19, 1)`` or ``(14,)``; empty if it cannot be told.
+    """
+
+    path: Path
+    version: tuple[int, ...]
+
+    def __str__(self) -> str:
+        """``LLVM 19.1 (/usr/lib/libLLVM.so.19.1)``."""
+        return f"LLVM {'.'.join(map(str, self.version)) or 'of unknown version'} ({self.path})"
+
+
+def version_from_name(name: str) -> tuple[int, ...] | None:
+    """The version in a file name, ``()`` for an LLVM library without one, None for any other file."""
+    match = _LLVM_NAME.fullmatch(name)
+    if match is None:
+        return None
+    # In "libLLVM-14.so.1" and "libLLVM.so.1" the number behind .so is not LLVM's.
+    behind = "" if match[2] == ".1" else match[2]
+    digits = match[1] or behind or match[3] or ""
+    return tuple(int(part) for part in digits.split(".") if part)
+
+
+def read_version(path: Path) -> tuple[int, ...]:
+    """The version that the library itself reports (LLVM 16 and newer), or ``()``.
+
+    The library is loaded in a process of its own (LLVM registers global state and a foreign library
+    may end the process), once per file: the answer is kept in the user's cache folder.
+    """
+    key = f"version|{file_key(path)}"
+    known = recall(key)
+    if known is None:
+        command = [sys.executable, "-c", _READ_VERSION, str(path)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=READ_TIMEOUT_S)
+        except (OSError, subprocess.TimeoutExpired):
+            return ()
+        known = {"version": done.stdout.split() if done.returncode == 0 else []}
+        remember(key, known)
+    return tuple(int(part) for part in known["version"])
+
+
+def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
+    """All LLVM libraries of this machine, newest first.
+
+    If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file): whoever
+    sets it means it. Neither Dr.Jit nor an LLVM is loaded.
+
+    Args:
+        ignore_variable: look at the usual places even so.
+    """
+    asked = None if ignore_variable else os.environ.get(LLVM_VARIABLE)
+    files = [file for file in [Path(asked)] if file.is_file()] if asked else list(_llvm_files())
+    versions: dict[Path, tuple[int, ...]] = {}
+    for file in files:
+        real = file.resolve()
+        names = [version_from_name(name) or () for name in (file.name, real.name)]
+        versions[real] = max([versions.get(real, ()), *names], key=len)
+    found = [LlvmLibrary(path, version or read_version(path)) for path, version in versions.items()]
+    return sorted(found, key=lambda library: (library.version, str(library.path)), reverse=True)
+
+
+def find_cuda() -> Path | None:
+    """The NVIDIA driver's library if it is installed and a device is there to drive, else None.
+
+    Whether the two work together only a trial can tell (see ``probe``).
+    """
+    asked = os.environ.get(CUDA_VARIABLE)
+    if asked:
+        return Path(asked) if Path(asked).is_file() else None
+    # /dev/dxg is the device of the Windows subsystem for Linux.
+    if not (glob.glob("/dev/nvidia[0-9]*") or os.path.exists("/dev/dxg")):
+        return None
+    folders = [*_library_folders(), Path("/usr/lib/wsl/lib"), Path("/usr/local/nvidia/lib64")]
+    candidates = [*_linker_cache("libcuda.so"), *(folder / "libcuda.so.1" for folder in folders)]
+    return next((file.resolve() for file in candidates if file.is_file()), None)
+
+
+def _llvm_files() -> Iterator[Path]:
+    for folder in _library_folders():
+        for name in glob.glob("libLLVM*", root_dir=folder):
+            if version_from_name(name) is not None:
+                yield folder / name
+    yield from (file for file in _linker_cache("libLLVM") if version_from_name(file.name) is not None)
+
+
+def _library_folders() -> list[Path]:
+    """Existing folders in which a system's package manager, Conda or Homebrew puts shared libraries."""
+    listed = [
+        *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep),
+        *os.environ.get("DYLD_LIBRARY_PATH", "").split(os.pathsep),
+    ]
+    roots = [sys.prefix, os.environ.get("CONDA_PREFIX", "")]
+    patterns = [folder for folder in listed if folder] + [f"{root}/lib" for root in roots if root]
+    if sys.platform == "darwin":
+        patterns += [
+            "/opt/homebrew/opt/llvm*/lib",
+            "/usr/local/opt/llvm*/lib",
+            "/opt/local/libexec/llvm-*/lib",
+            "/usr/local/lib",
+        ]
+    else:
+        multiarch = sysconfig.get_config_var("MULTIARCH") or f"{os.uname().machine}-linux-gnu"
+        patterns += [
+            f"/usr/lib/{multiarch}",
+            "/usr/lib64",
+            "/usr/lib",
+            "/usr/local/lib",
+            "/usr/lib/llvm*/lib",
+            "/usr/lib64/llvm*/lib",
+            "/usr/lib/llvm*/lib64",
+            "/opt/llvm*/lib",
+            "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
+        ]
+    found = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
+    return list(dict.fromkeys(folder for folder in found if folder.is_dir()))
+
+
+def _linker_cache(start: str) -> list[Path]:
+    """Libraries whose name starts with ``start`` that the dynamic linker knows (Linux only)."""
+    # Root's folders are often missing from a user's PATH.
+    ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
+    if ldconfig is None or sys.platform == "darwin":
+        return []
+    try:
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, timeout=READ_TIMEOUT_S).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    pairs = (line.strip().split(" => ") for line in listing.splitlines() if " => " in line)
+    return [Path(target) for name, target in pairs if name.startswith(start)]

@@ -1,0 +1,56 @@
+"""The one line that installs what Dr.Jit needs from this system: LLVM and, beside it, libatomic.
+
+Dr.Jit's wheel is linked to ``libatomic.so.1``, which a small Debian does not have.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+GOOD_FROM = 19
+"""Oldest LLVM that is known to work with Dr.Jit 1.5."""
+
+
+def package_manager() -> str | None:
+    """``apt-get``, ``dnf`` or ``brew``, whichever this system has, else None."""
+    names = ["brew"] if sys.platform == "darwin" else ["apt-get", "dnf", "brew"]
+    return next((name for name in names if shutil.which(name)), None)
+
+
+def apt_packages() -> list[str]:
+    """Packages of a good LLVM that the lists on this Debian or Ubuntu know, newest first; may be empty."""
+    command = ["apt-cache", "search", "--names-only", "^libllvm[0-9]+"]
+    try:
+        listing = subprocess.run(command, capture_output=True, text=True).stdout
+    except OSError:
+        return []
+    # Ubuntu 24.04 has names with "t64" behind the number.
+    names = re.findall(r"^(libllvm(\d+)(?:t64)?) ", listing, re.MULTILINE)
+    good = [(int(number), name) for name, number in names if int(number) >= GOOD_FROM]
+    return [name for _, name in sorted(good, reverse=True)]
+
+
+def install_commands() -> list[list[str]]:
+    """Commands of which each installs an LLVM, best first, without ``sudo``; empty for an unknown system."""
+    manager = package_manager()
+    if manager == "apt-get":
+        names = apt_packages() or [f"libllvm{GOOD_FROM}"]
+        return [["apt-get", "install", "-y", "--no-install-recommends", name, "libatomic1"] for name in names]
+    return {"dnf": [["dnf", "install", "-y", "llvm-libs", "libatomic"]], "brew": [["brew", "install", "llvm"]]}.get(
+        manager or "", []
+    )
+
+
+def install_line() -> str:
+    """The command for a person to run, or advice where the package manager is another."""
+    commands = install_commands()
+    if not commands:
+        return f"install LLVM {GOOD_FROM} or newer, or set DRJIT_LIBLLVM_PATH to its libLLVM"
+    sudo = "sudo " if commands[0][0] != "brew" and os.geteuid() != 0 else ""
+    # A small system has no package lists yet.
+    update = f"{sudo}apt-get update && " if package_manager() == "apt-get" and not apt_packages() else ""
+    return update + sudo + " ".join(commands[0])

@@ -1,0 +1,69 @@
+"""The nearest-neighbour blend: what plain interpolation of the measurements gives."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from wrf_mi.core import InputError
+
+
+class InverseDistance:
+    """Inverse-distance weighting of the nearest training rows.
+
+    A prediction is sum_i w_i y_i / sum_i w_i over the ``k`` nearest training positions with w_i = d_i^-power;
+    where training positions coincide with the one asked for, their mean.
+
+    Args:
+        k: number of neighbours, at least 1; all rows where there are fewer.
+        power: exponent of the distance.
+
+    Source: Shepard, "A two-dimensional interpolation function for irregularly-spaced data" (1968).
+    """
+
+    def __init__(self, k: int = 4, power: float = 2) -> None:
+        if k < 1:
+            raise InputError(f"k = {k}: the blend needs at least one neighbour")
+        self.k = k
+        self.power = power
+
+    def fit(self, tx_pos: ArrayLike, observation: ArrayLike) -> InverseDistance:
+        """Keep the training rows.
+
+        Args:
+            tx_pos: shape [n, 3], metres.
+            observation: shape [n, ...], any unit.
+
+        Raises:
+            InputError: no rows, or two different numbers of them.
+        """
+        positions, values = np.asarray(tx_pos, float), np.asarray(observation)
+        if len(positions) == 0 or len(positions) != len(values):
+            raise InputError(
+                f"{len(positions)} positions and {len(values)} observations: give one per row, at least one"
+            )
+        self._tree, self._values = KDTree(positions), values
+        return self
+
+    def predict(self, tx_pos: ArrayLike) -> NDArray[np.floating]:
+        """Blend the neighbours of each position.
+
+        Args:
+            tx_pos: shape [m, 3], metres.
+
+        Returns:
+            Shape [m, ...], in the observations' unit and type.
+        """
+        positions = np.asarray(tx_pos, float)
+        k = min(self.k, len(self._values))
+        distance, neighbour = self._tree.query(positions, k=list(range(1, k + 1)))
+        nearest = distance[:, :1]
+        # Relative to the nearest, so that tiny distances do not overflow; coincident rows alone count.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = np.where(nearest > 0, (nearest / distance) ** self.power, distance == 0)
+        weight /= weight.sum(axis=1, keepdims=True)
+        blended = np.empty((len(positions), *self._values.shape[1:]), np.result_type(self._values, np.float32))
+        for row, (w, i) in enumerate(zip(weight, neighbour, strict=True)):
+            blended[row] = np.tensordot(w, self._values[i], axes=1)
+        return blended

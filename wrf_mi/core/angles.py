@@ -1,0 +1,70 @@
+"""The one place for directions, pixels and orientations.
+
+Azimuth runs from +x towards +y, elevation from the array's x-y plane towards its normal +z, both in
+the receiver's own frame and in radians. Sample (row r, column c) of an H x W spectrum is the *point*
+at elevation ``r * 90 / H`` degrees and azimuth ``c * 360 / W`` degrees; the azimuth wraps. (The
+WRF-GS+ paper puts column 0 at -180 degrees in its projection formulas and at 0 in its spectrum matrix;
+the measured data have it at 0.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+UNIT_QUATERNION_TOLERANCE = 1e-3
+"""Largest accepted departure of a quaternion's norm from one: files carry five or more digits."""
+
+
+def elevation_rad(height: int) -> FloatArray:
+    """Elevation of each of ``height`` rows over the upper hemisphere, in radians, shape [height]."""
+    return np.arange(height) * (np.pi / 2 / height)
+
+
+def azimuth_rad(width: int) -> FloatArray:
+    """Azimuth of each of ``width`` columns over the full circle, in radians, shape [width]."""
+    return np.arange(width) * (2 * np.pi / width)
+
+
+def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> FloatArray:
+    """Unit vectors of directions in the receiver's frame.
+
+    Args:
+        azimuth: radians, any shape.
+        elevation: radians, a shape that broadcasts with ``azimuth``.
+
+    Returns:
+        The broadcast shape with a last axis (x, y, z).
+    """
+    az, el = np.broadcast_arrays(np.asarray(azimuth, float), np.asarray(elevation, float))
+    return np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
+
+
+def pixel_directions(height: int, width: int) -> FloatArray:
+    """Unit vector of every pixel of a ``height`` x ``width`` spectrum, shape [height, width, 3]."""
+    return unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None])
+
+
+def azimuth_elevation(vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Azimuth in [0, 2 pi) and elevation in [-pi/2, pi/2], in radians, of vectors [..., 3]."""
+    v = np.asarray(vectors, float)
+    azimuth = np.arctan2(v[..., 1], v[..., 0]) % (2 * np.pi)
+    elevation = np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
+    return azimuth, elevation
+
+
+def rotation_matrix(quaternion_xyzw: ArrayLike) -> FloatArray:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] in the order x, y, z, w.
+
+    The quaternions are normalised first. Source: Shuster, "A survey of attitude representations" (1993).
+    """
+    q = np.asarray(quaternion_xyzw, float)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

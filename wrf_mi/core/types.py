@@ -1,0 +1,81 @@
+"""The plain types that the packages hand to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .angles import FloatArray, rotation_matrix
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A receiver's pose: where its array is and how it is turned.
+
+    Attributes:
+        name: as in the measurement files.
+        position_m: shape [3], world frame, metres.
+        orientation_xyzw: unit quaternion, receiver's frame to world.
+    """
+
+    name: str
+    position_m: FloatArray
+    orientation_xyzw: FloatArray
+
+    @property
+    def to_world(self) -> FloatArray:
+        """Rotation [3, 3] from the receiver's frame to the world's."""
+        return rotation_matrix(self.orientation_xyzw)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A set of measurements: transmitter positions, receivers and what each receiver observed.
+
+    Attributes:
+        name: of the data set.
+        task: what ``observation`` holds: ``"spectrum"`` is grey values [n_rx, n, height, width] in 0..1.
+        tx_pos_m: shape [n, 3], world frame, metres.
+        receivers: the ``n_rx`` receivers.
+        observation: float32, first axes [n_rx, n].
+        official: training and test rows (from 0) that came with the data, or None.
+        folds: the spatial block of each row, shape [n], or None.
+        source: where it was read from.
+    """
+
+    name: str
+    task: str
+    tx_pos_m: FloatArray
+    receivers: tuple[Receiver, ...]
+    observation: NDArray[np.float32]
+    official: tuple[IntArray, IntArray] | None = None
+    folds: IntArray | None = None
+    source: str = field(default="", compare=False)
+
+    def __len__(self) -> int:
+        """Number of transmitter positions (rows)."""
+        return len(self.tx_pos_m)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which rows train, which choose settings and which score; rows count from 0.
+
+    ``validation`` rows are part of the training data and are disjoint from ``train`` only while settings
+    are chosen; the final fit uses ``train`` and ``validation`` together (see ``all_train``).
+    """
+
+    name: str
+    seed: int
+    train: IntArray
+    validation: IntArray
+    test: IntArray
+
+    @property
+    def all_train(self) -> IntArray:
+        """Training and validation rows together, sorted."""
+        return np.sort(np.concatenate([self.train, self.validation]))

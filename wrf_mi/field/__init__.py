@@ -1,0 +1,24 @@
+"""The learned fields: Gaussian parameters, starting values, networks."""
+
+from ..backend import init
+
+# Dr.Jit loads an LLVM of its own choice when it is imported: ours must be chosen before.
+init()
+
+from .gaussians import Gaussians
+from .initial import InitialGaussians, gaussians_from_points, random_gaussians
+from .models import Encoding, WrfGs, WrfGsPlus
+
+FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus}
+"""Field classes by the name that `wrf-mi train --model` takes."""
+
+__all__ = [
+    "FIELDS",
+    "Encoding",
+    "Gaussians",
+    "InitialGaussians",
+    "WrfGs",
+    "WrfGsPlus",
+    "gaussians_from_points",
+    "random_gaussians",
+]

@@ -1,0 +1,100 @@
+"""Adaptive density control: clone, split, prune, opacity reset (Kerbl et al. 2023, section 5.2).
+
+Works on parameters as NumPy arrays with the Gaussians in the last axis, between two steps. What it measures is
+how strongly the loss asks a Gaussian to move: the gradient by its centre times its distance from the
+receiver, which is the gradient by its direction. Where the paper is silent, the Gaussians that grow are those
+with the largest such mean, a fixed share of all in a round, so that no threshold depends on the loss's scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import rotation_matrix
+
+Arrays = dict[str, NDArray[np.float32]]
+
+SPLIT_SHRINK = 1.6
+"""A split Gaussian's parts are smaller by this factor (Kerbl et al. 2023)."""
+
+
+@dataclass(frozen=True)
+class DensityChange:
+    """A new set of Gaussians in terms of the old one.
+
+    Attributes:
+        parameters: per-Gaussian parameters of the new set, [k, m].
+        source: the old Gaussian from which each new one comes, [m].
+        fresh: new Gaussians whose optimiser moments start at zero, [m].
+        cloned: how many were cloned.
+        split: how many were split.
+        pruned: how many were removed.
+    """
+
+    parameters: Arrays
+    source: NDArray[np.int64]
+    fresh: NDArray[np.bool_]
+    cloned: int
+    split: int
+    pruned: int
+
+
+def logit(p: float) -> float:
+    """Inverse of the logistic function."""
+    return float(np.log(p / (1 - p)))
+
+
+def adapt(
+    parameters: Arrays,
+    urge: NDArray[np.float32],
+    distance_m: NDArray[np.float64],
+    rng: np.random.Generator,
+    grow: float,
+    most: int,
+    split_rad: float,
+    least_opacity: float,
+) -> DensityChange:
+    """One round of pruning, cloning and splitting.
+
+    Args:
+        parameters: per-Gaussian parameters, [k, n] each; ``position``, ``log_scale`` and ``rotation`` among them.
+            Under alpha blending also ``opacity`` (logits).
+        urge: mean gradient of the loss by each Gaussian's direction since the last round, [n]; zero: no pixel saw it.
+        distance_m: of each Gaussian from the nearest receiver, [n].
+        rng: draws where the parts of a split Gaussian go.
+        grow: share of the Gaussians that are cloned or split.
+        most: number of Gaussians that is never passed.
+        split_rad: angular size from which a Gaussian is split rather than cloned.
+        least_opacity: Gaussians below it are removed.
+    """
+    keep = urge > 0
+    if "opacity" in parameters:
+        keep &= parameters["opacity"][0] >= logit(least_opacity)
+    if not keep.any():
+        # A field without Gaussians could never recover: the strongest stays.
+        keep[np.argmax(parameters["opacity"][0] if "opacity" in parameters else urge)] = True
+    alive = np.flatnonzero(keep)
+    room = max(0, min(int(round(grow * len(alive))), most - len(alive)))
+    growing = alive[np.argsort(-urge[alive], kind="stable")[:room]]
+    size = np.exp(parameters["log_scale"].max(axis=0)) / distance_m
+    split = growing[size[growing] > split_rad]
+    source = np.concatenate([alive, growing])
+    fresh = np.concatenate([np.isin(alive, split), np.ones(len(growing), bool)])
+    new = {name: values[:, source].copy() for name, values in parameters.items()}
+    # Both parts of a split one move, each to a point drawn from the old Gaussian, and shrink.
+    parts = np.flatnonzero(np.isin(source, split))
+    old = source[parts]
+    axes = rotation_matrix(parameters["rotation"][:, old].T)
+    draw = rng.standard_normal((len(parts), 3)) * np.exp(parameters["log_scale"][:, old].T)
+    new["position"][:, parts] += np.einsum("nij,nj->in", axes, draw).astype(np.float32)
+    new["log_scale"][:, parts] -= np.float32(np.log(SPLIT_SHRINK))
+    pruned = len(keep) - len(alive)
+    return DensityChange(new, source, fresh, len(growing) - len(split), len(split), pruned)
+
+
+def reset_opacity(opacity_logits: NDArray[np.float32], at_most: float) -> NDArray[np.float32]:
+    """Opacity logits that leave no Gaussian more opaque than ``at_most``."""
+    return np.minimum(opacity_logits, np.float32(logit(at_most)))

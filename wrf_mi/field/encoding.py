@@ -1,0 +1,43 @@
+"""Positional encoding of coordinates (WRF-GS+ paper, section V-A, after NeRF).
+
+    gamma(t) = (sin(2^0 pi t), cos(2^0 pi t), ..., sin(2^L pi t), cos(2^L pi t)),   L + 1 octaves
+
+The paper sets L = 9, ten octaves, and does not say on what scale of coordinates. Here ``t`` is the
+coordinate in metres divided by ``scale_m``, so the shortest period is ``2 * scale_m / 2^L``: 4 mm for L = 9
+and one metre. A field changes over about half a wavelength, which for 915 MHz is 0.16 m: shorter periods
+let a network memorise its training positions, which is why fewer octaves serve better (see `docs/model.md`).
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import drjit as dr
+
+Tensor = TypeVar("Tensor", bound=dr.ArrayBase)
+
+
+def encoded_size(octaves: int) -> int:
+    """Number of features that `encode` makes of one 3D point."""
+    return 6 * octaves
+
+
+def encode(points: Tensor, octaves: int, scale_m: float) -> Tensor:
+    """Positional encoding of points.
+
+    Args:
+        points: tensor [3, n], metres. Differentiable.
+        octaves: number of octaves, L + 1 in the paper.
+        scale_m: metres that make one unit of ``t``.
+
+    Returns:
+        Tensor [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
+    """
+    if octaves == 0:
+        return dr.zeros(type(points), (0, points.shape[1]))
+    # Whole periods are taken off in each octave before the sine sees it: exact, because the factors are
+    # powers of two, and sin() in float32 loses digits of large arguments.
+    octave = [points * (2.0**k / (2.0 * scale_m)) for k in range(octaves)]
+    turns = dr.concat([t - dr.round(dr.detach(t)) for t in octave], axis=0)
+    sine, cosine = dr.sincos(2 * dr.pi * turns)
+    return dr.concat([sine, cosine], axis=0)

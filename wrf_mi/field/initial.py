@@ -1,0 +1,104 @@
+"""Where Gaussians start: at random around the receivers, or on a point cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..core import InputError, Receiver, unit_vectors
+from .network import Weights
+
+
+@dataclass(frozen=True)
+class InitialGaussians:
+    """Starting values of the static attributes.
+
+    Attributes:
+        position_m: shape [n, 3], world frame.
+        scale_m: standard deviation of each (isotropic) Gaussian, shape [n].
+        opacity: alpha at the centre, the same for all, in (0, 1).
+        signal: deviation of the random starting signals.
+    """
+
+    position_m: NDArray[np.float64]
+    scale_m: NDArray[np.float64]
+    opacity: float = 0.1
+    signal: float = 0.3
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.position_m)
+
+    def geometry(self) -> Weights:
+        """The parameters ``position`` [3, n], ``log_scale`` [3, n] and ``rotation`` [4, n] (identity)."""
+        rotation = np.zeros((4, self.count), np.float32)
+        rotation[3] = 1.0
+        return {
+            "position": np.ascontiguousarray(self.position_m.T, np.float32),
+            "log_scale": np.tile(np.log(self.scale_m), (3, 1)).astype(np.float32),
+            "rotation": rotation,
+        }
+
+    def opacity_logit(self) -> NDArray[np.float32]:
+        """The parameter ``opacity``, shape [1, n], as a logit."""
+        return np.full((1, self.count), np.log(self.opacity / (1 - self.opacity)), np.float32)
+
+
+def random_gaussians(
+    receivers: Sequence[Receiver],
+    count: int,
+    rng: np.random.Generator,
+    distance_m: tuple[float, float] = (1.0, 8.0),
+    size_deg: float = 7.0,
+    opacity: float = 0.1,
+    signal: float = 0.3,
+) -> InitialGaussians:
+    """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere.
+
+    The paper draws points "within a specified range". What a receiver sees is directions, so the range
+    here is one of directions and distances: distances are uniform in ``distance_m`` and scales such that a
+    Gaussian seen from its receiver has the standard deviation ``size_deg``.
+    """
+    share = np.array_split(np.arange(count), len(receivers))
+    position, scale = np.empty((count, 3)), np.empty(count)
+    for receiver, own in zip(receivers, share, strict=True):
+        # A margin below the horizon: footprints of Gaussians there reach above it.
+        elevation = np.arcsin(rng.uniform(-np.sin(np.radians(size_deg)), 1.0, len(own)))
+        direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(own)), elevation)
+        distance = rng.uniform(*distance_m, len(own))
+        position[own] = receiver.position_m + (direction * distance[:, None]) @ receiver.to_world.T
+        scale[own] = distance * np.tan(np.radians(size_deg))
+    return InitialGaussians(position, scale, opacity, signal)
+
+
+def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.random.Generator) -> InitialGaussians:
+    """Gaussians on a point cloud: ``count`` of its points, each as large as the gap to its neighbours.
+
+    The scale is the root mean square distance to the three nearest chosen points (3D Gaussian splatting,
+    Kerbl et al. 2023, section 5.1).
+
+    Args:
+        points_m: shape [m, 3] with m >= count, world frame, metres.
+        count: number of Gaussians, at least 4.
+        rng: chooses the points.
+
+    Raises:
+        InputError: too few points, or a coordinate that is not a number.
+    """
+    points = np.asarray(points_m, float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"point cloud: expected shape [m, 3], got {list(points.shape)}")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"point cloud, row {bad[0] + 1}: not a number; remove that point")
+    if not 4 <= count <= len(points):
+        raise InputError(f"point cloud: {len(points)} points for {count} Gaussians; ask for between 4 and that many")
+    chosen = points[rng.choice(len(points), count, replace=False)]
+    gaps, _ = cKDTree(chosen).query(chosen, k=4)
+    scale = np.sqrt((gaps[:, 1:] ** 2).mean(axis=1))
+    return InitialGaussians(chosen, np.maximum(scale, 1e-3))

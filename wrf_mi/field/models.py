@@ -1,0 +1,169 @@
+"""The two fields of the paper: WRF-GS and WRF-GS+.
+
+A field is a description without arrays: ``init`` makes its parameters as NumPy arrays, ``gaussians`` maps
+parameters (a dictionary of Dr.Jit tensors) and transmitter positions to `Gaussians`. Both work in
+whatever float type the tensors have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from .encoding import encode, encoded_size
+from .gaussians import Gaussians, rows
+from .initial import InitialGaussians
+from .network import Params, Weights, init_layer, linear, linear_of_pairs, relu
+
+GEOMETRY = ("position", "log_scale", "rotation")
+"""Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n]."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """Positional encoding of Gaussians and transmitters.
+
+    The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.field.encoding`.
+    """
+
+    position_octaves: int = 10
+    position_scale_m: float = 1.0
+    tx_octaves: int = 10
+    tx_scale_m: float = 1.0
+
+    def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
+        """Encoded Gaussian centres [6 * octaves, n], detached.
+
+        The network sees where a Gaussian is but does not move it: its gradient through the fast
+        octaves would drown the one through the footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
+        """
+        return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
+
+    def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
+        """Encoded transmitter positions [6 * octaves, batch]."""
+        return encode(points, self.tx_octaves, self.tx_scale_m)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of features of each part."""
+        return {"position": encoded_size(self.position_octaves), "transmitter": encoded_size(self.tx_octaves)}
+
+
+@dataclass(frozen=True)
+class WrfGs:
+    """WRF-GS (paper, section IV-B): attenuation and signal from two networks, product blending (eq. 12, 13).
+
+    The first network, eight layers of 128, sees the Gaussian's centre and gives its complex attenuation and a
+    feature vector; the second, layers of 128 and 64, sees features and transmitter and gives the signal.
+    Where the paper is silent: the feature vector has ``width`` entries; centre, scale and rotation are
+    learned as in 3D Gaussian splatting; delta = z / sqrt(1 + |z|^2) keeps |delta| < 1 and starts at
+    0.9 (nearly transparent), so that Gaussians far away are seen from the first step.
+    """
+
+    encoding: Encoding = Encoding()
+    layers: int = 8
+    width: int = 128
+    signal_widths: tuple[int, int] = (128, 64)
+
+    blending = "product"
+    per_gaussian = GEOMETRY
+
+    def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
+        """Parameters as NumPy arrays: geometry from ``initial``, networks drawn from ``rng``."""
+        sizes, weights = self.encoding.sizes, initial.geometry()
+        weights |= init_layer("attenuation.0", {"position": sizes["position"]}, self.width, rng)
+        for i in range(1, self.layers):
+            weights |= init_layer(f"attenuation.{i}", {"hidden": self.width}, self.width, rng)
+        weights |= init_layer("attenuation.delta", {"hidden": self.width}, 2, rng, gain=0.1)
+        weights["attenuation.delta.bias"][0] = 2.0
+        first, second = self.signal_widths
+        weights |= init_layer("signal.0", {"feature": self.width, "transmitter": sizes["transmitter"]}, first, rng)
+        weights |= init_layer("signal.1", {"hidden": first}, second, rng)
+        return weights | init_layer("signal.out", {"hidden": second}, 2, rng, gain=initial.signal)
+
+    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        batch, n = tx_pos.shape[1], params["position"].shape[1]
+        hidden = relu(linear(params, "attenuation.0", self.encoding.position(params["position"]), "position"))
+        for i in range(1, self.layers):
+            hidden = relu(linear(params, f"attenuation.{i}", hidden))
+        z = linear(params, "attenuation.delta", hidden)
+        re, im = rows(z)
+        norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
+        seen = relu(
+            linear_of_pairs(
+                params, "signal.0", {"feature": hidden}, {"transmitter": self.encoding.transmitter(tx_pos)}
+            )
+        )
+        signal = linear(params, "signal.out", relu(linear(params, "signal.1", seen)))
+        return Gaussians(
+            position=rows(params["position"]),
+            scale=[dr.tile(dr.exp(s), batch) for s in rows(params["log_scale"])],
+            rotation=[dr.tile(q, batch) for q in rows(params["rotation"])],
+            signal=rows(signal),
+            opacity=None,
+            attenuation=[dr.tile(re * norm, batch), dr.tile(im * norm, batch)],
+            batch=batch,
+        )
+
+
+@dataclass(frozen=True)
+class WrfGsPlus:
+    """WRF-GS+ (paper, section V): static attributes and a deformation network, alpha blending (eq. 14).
+
+    The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
+    three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
+    Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
+    rotation's to the quaternion before it is normalised; the heads start small, so that the static
+    field is what training sees first.
+    """
+
+    encoding: Encoding = Encoding()
+    layers: int = 8
+    width: int = 256
+    skip: int = 4
+
+    blending = "alpha"
+    per_gaussian = (*GEOMETRY, "opacity", "signal")
+    heads = (("signal", 2, 0.5), ("rotation", 4, 0.05), ("scale", 3, 0.05))
+
+    def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
+        """Parameters as NumPy arrays: static attributes from ``initial``, network drawn from ``rng``."""
+        sizes, weights = self.encoding.sizes, initial.geometry()
+        weights["opacity"] = initial.opacity_logit()
+        weights["signal"] = (rng.standard_normal((2, initial.count)) * initial.signal).astype(np.float32)
+        for i in range(self.layers):
+            inputs = ({"hidden": self.width} if i else {}) | (sizes if i in (0, self.skip) else {})
+            weights |= init_layer(f"deform.{i}", inputs, self.width, rng)
+        for head, size, gain in self.heads:
+            weights |= init_layer(f"deform.{head}", {"hidden": self.width}, size, rng, gain=gain * initial.signal)
+        return weights
+
+    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        batch = tx_pos.shape[1]
+        position = {"position": self.encoding.position(params["position"])}
+        transmitter = {"transmitter": self.encoding.transmitter(tx_pos)}
+        hidden = None
+        for i in range(self.layers):
+            if i in (0, self.skip):
+                hidden = relu(linear_of_pairs(params, f"deform.{i}", position, transmitter, hidden))
+            else:
+                hidden = relu(linear(params, f"deform.{i}", hidden))
+        offset = {head: rows(linear(params, f"deform.{head}", hidden)) for head, _, _ in self.heads}
+
+        def deformed(name: str, head: str) -> list[dr.ArrayBase]:
+            return [dr.tile(a, batch) + d for a, d in zip(rows(params[name]), offset[head], strict=True)]
+
+        opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
+        return Gaussians(
+            position=rows(params["position"]),
+            scale=[dr.exp(s) for s in deformed("log_scale", "scale")],
+            rotation=deformed("rotation", "rotation"),
+            signal=deformed("signal", "signal"),
+            opacity=dr.tile(opacity, batch),
+            attenuation=None,
+            batch=batch,
+        )

@@ -1,0 +1,256 @@
+"""The settings of a fit: frozen dataclasses, written to and read from ``config.yaml``."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+
+from ..core import InputError
+
+
+@dataclass(frozen=True)
+class InitialConfig:
+    """Where Gaussians start.
+
+    Attributes:
+        gaussians: how many.
+        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres; empty: random.
+        size_deg: standard deviation of a random Gaussian as its receiver sees it, degrees.
+        nearest_m: smallest distance of a random Gaussian from its receiver, metres.
+        farthest_m: largest distance, metres.
+        opacity: alpha at a footprint's centre.
+        signal: deviation of the starting signals.
+    """
+
+    gaussians: int = 300
+    points: str = ""
+    size_deg: float = 7.0
+    nearest_m: float = 1.0
+    farthest_m: float = 8.0
+    opacity: float = 0.1
+    signal: float = 0.3
+
+
+@dataclass(frozen=True)
+class EncodingConfig:
+    """Positional encoding: octaves (L + 1 of the paper) and metres per unit, of Gaussians and transmitter."""
+
+    position_octaves: int = 4
+    position_scale_m: float = 4.0
+    tx_octaves: int = 4
+    tx_scale_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Adam (Kingma and Ba 2015): one rate a parameter group, warm-up, then a cosine to ``final`` of each rate.
+
+    Attributes:
+        network: rate of all networks.
+        position: rate of centres, metres.
+        scale: rate of log scales.
+        rotation: rate of quaternions.
+        opacity: rate of opacity logits.
+        signal: rate of static signals.
+        warm_up: steps over which rates rise from zero.
+        final: share of each rate that is left at the last step.
+        averaging: decay per step of the running mean of the parameters, which is what is evaluated and stored.
+    """
+
+    network: float = 1e-3
+    position: float = 5e-3
+    scale: float = 5e-3
+    rotation: float = 2e-3
+    opacity: float = 2e-2
+    signal: float = 5e-3
+    warm_up: int = 100
+    final: float = 0.01
+    averaging: float = 0.999
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Adaptive density control (Kerbl et al. 2023, section 5.2), see `wrf_mi.field.density`.
+
+    Attributes:
+        every: steps between two rounds; 0 turns it off.
+        start: share of the steps before the first round.
+        stop: share of the steps after the last round.
+        grow: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a round.
+        most: number of Gaussians that is never passed.
+        split_deg: a grown Gaussian larger than this is split, a smaller one cloned, degrees.
+        least_opacity: a Gaussian below this is pruned (alpha blending).
+        reset_every: rounds between two opacity resets; 0 turns them off.
+        reset_opacity: opacity that a reset leaves at most.
+    """
+
+    every: int = 1000
+    start: float = 0.05
+    stop: float = 0.4
+    grow: float = 0.05
+    most: int = 400
+    split_deg: float = 5.0
+    least_opacity: float = 0.005
+    reset_every: int = 0
+    reset_opacity: float = 0.05
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """All settings of a fit.
+
+    Attributes:
+        model: ``"wrf-gs"`` or ``"wrf-gs+"``.
+        steps: optimiser steps.
+        batch: transmitters in a step.
+        seed: of starting values and of the order of rows.
+        deterministic: bit-identical results from run to run, at the price of computing on one thread.
+        hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
+            to the end, as every choice of settings must; less ends with a fit on all training rows.
+        structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
+        checkpoint_every: steps between two checkpoints.
+        log_every: steps between two lines of the log.
+        validate_every: steps between two scores on the validation rows.
+    """
+
+    model: str = "wrf-gs+"
+    steps: int = 24000
+    batch: int = 1
+    seed: int = 0
+    deterministic: bool = False
+    hold_out: float = 0.7
+    structural_weight: float = 0.2
+    checkpoint_every: int = 2000
+    log_every: int = 100
+    validate_every: int = 1000
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    encoding: EncodingConfig = field(default_factory=EncodingConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse values that no fit can use."""
+        for name, value, good in (
+            ("steps", self.steps, self.steps >= 1),
+            ("batch", self.batch, self.batch >= 1),
+            ("log_every", self.log_every, self.log_every >= 1),
+            ("validate_every", self.validate_every, self.validate_every >= 1),
+            ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1),
+            ("hold_out", self.hold_out, 0 <= self.hold_out <= 1),
+            ("structural_weight", self.structural_weight, 0 <= self.structural_weight <= 1),
+            ("initial.gaussians", self.initial.gaussians, self.initial.gaussians >= 1),
+            ("initial.opacity", self.initial.opacity, 0 < self.initial.opacity < 1),
+            ("initial.nearest_m", self.initial.nearest_m, 0 < self.initial.nearest_m <= self.initial.farthest_m),
+            ("encoding.tx_scale_m", self.encoding.tx_scale_m, self.encoding.tx_scale_m > 0),
+            ("encoding.position_scale_m", self.encoding.position_scale_m, self.encoding.position_scale_m > 0),
+            ("optimiser.averaging", self.optimiser.averaging, 0 <= self.optimiser.averaging < 1),
+        ):
+            if not good:
+                raise InputError(f"setting {name}: {value} is out of range; see `wrf-mi train --help-settings`")
+
+
+PAPER = (
+    "encoding.position_octaves=10",
+    "encoding.position_scale_m=1",
+    "encoding.tx_octaves=10",
+    "encoding.tx_scale_m=1",
+)
+"""What the paper states and the defaults depart from: L = 9 for Gaussians and transmitter (section V-A).
+
+It states no scale of coordinates; metres are taken. The loss, the networks and Adam are the paper's anyway.
+"""
+
+QUICK = ("steps=6000", "hold_out=0.7")
+"""The shorter schedule of the demo."""
+
+PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick": QUICK}
+"""Named sets of settings, as ``--set`` takes them."""
+
+
+def to_dict(config: TrainConfig) -> dict[str, Any]:
+    """Nested dictionary of plain values."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: Mapping[str, Any], source: str = "config") -> TrainConfig:
+    """The configuration of a nested dictionary; what is not named keeps its default.
+
+    Raises:
+        InputError: an unknown setting or a value of the wrong type, named with ``source``.
+    """
+    return _build(TrainConfig, values, source, "")
+
+
+def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
+    if not isinstance(values, Mapping):
+        raise InputError(f"{source}, setting {prefix or 'top'}: expected a mapping, got {values!r}")
+    types = typing.get_type_hints(kind)
+    arguments = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if key not in types:
+            known = ", ".join(f"{prefix}{k}" for k in types)
+            raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
+        if dataclasses.is_dataclass(types[key]):
+            arguments[key] = _build(types[key], value, source, f"{name}.")
+        else:
+            arguments[key] = _convert(value, types[key], name, source)
+    return kind(**arguments)
+
+
+def _convert(value: Any, kind: type, name: str, source: str) -> Any:
+    good = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if kind is float and isinstance(value, str):  # YAML reads 1e-3 as text
+        try:
+            return float(value)
+        except ValueError:
+            good = False
+    if not good:
+        raise InputError(f"{source}, setting {name}: expected {kind.__name__}, got {value!r}")
+    return value
+
+
+def with_settings(config: TrainConfig, settings: Iterable[str]) -> TrainConfig:
+    """The configuration with ``key=value`` settings applied in order; keys are dotted, values YAML.
+
+    Raises:
+        InputError: no ``=``, an unknown key, or a value of the wrong type.
+    """
+    values = to_dict(config)
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: expected key=value, e.g. --set steps=2000")
+        *parents, last = key.strip().split(".")
+        node: Any = values
+        for parent in parents:
+            node = node.get(parent) if isinstance(node, dict) else None
+        if not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
+            raise InputError(f"--set {setting}: unknown setting {key.strip()}; see `wrf-mi train --help-settings`")
+        node[last] = yaml.safe_load(text) if text.strip() else ""
+    return from_dict(values, "--set")
+
+
+def dump(config: TrainConfig) -> str:
+    """YAML text of a configuration."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False)
+
+
+def describe() -> str:
+    """One line a setting, with its default, for ``wrf-mi train --help-settings``."""
+
+    def lines(values: Mapping[str, Any], prefix: str) -> Iterable[str]:
+        for key, value in values.items():
+            if isinstance(value, dict):
+                yield from lines(value, f"{prefix}{key}.")
+            else:
+                yield f"{prefix}{key}={value}"
+
+    return "\n".join(lines(to_dict(TrainConfig()), ""))

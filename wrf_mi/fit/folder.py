@@ -1,0 +1,198 @@
+"""The run folder: what `train` writes and everything later reads.
+
+    config.yaml     data set, split, seed, versions and all settings, resolved
+    split.npz       rows that trained, chose and score
+    log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_ssim, held_out, gaussians
+    checkpoint.npz  format version, parameters, optimiser state, receivers; arrays only
+
+Every file appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..backend import init
+from ..core import InputError, Receiver, Record, Split
+from ..core.files import write_atomically
+from ..measure import load_split, save_split
+from .config import TrainConfig, from_dict, to_dict
+from .predictor import Predictor
+from .state import FitState
+from .trainer import Progress, Trainer, final_params, make_field
+
+FORMAT = 1
+"""Version of ``checkpoint.npz``."""
+
+CONFIG, SPLIT, LOG, CHECKPOINT = "config.yaml", "split.npz", "log.jsonl", "checkpoint.npz"
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What ``config.yaml`` says.
+
+    Attributes:
+        dataset: name or folder that was loaded.
+        split: its name; one fold has its own, e.g. ``blocked:2``.
+        n_train: number or fraction of training rows that was asked for; None: all.
+        settings: of the fit.
+    """
+
+    dataset: str
+    split: str
+    n_train: float | None
+    settings: TrainConfig
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes."""
+    packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scikit-image")
+    backend = init()
+    return {
+        "wrf-mi": __version__,
+        **{name: importlib.metadata.version(name) for name in packages},
+        "python": platform.python_version(),
+        "backend": f"{backend.name} {backend.llvm_version or ''}".strip(),
+        "device": backend.device,
+    }
+
+
+def write_config(folder: Path, run: RunConfig) -> None:
+    """Write ``config.yaml``."""
+    content = {
+        "dataset": run.dataset,
+        "split": run.split,
+        "n_train": run.n_train,
+        "seed": run.settings.seed,
+        "versions": versions(),
+        "settings": to_dict(run.settings),
+    }
+    write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
+
+
+def read_config(folder: Path) -> RunConfig:
+    """Read ``config.yaml``.
+
+    Raises:
+        InputError: missing, not YAML, or settings that this version does not know.
+    """
+    path = folder / CONFIG
+    try:
+        content = yaml.safe_load(path.read_text())
+        names = (content["dataset"], content["split"], content.get("n_train"), content["settings"])
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no {CONFIG}, so not a run folder; give one made by train") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not readable ({str(error).splitlines()[0]}); restore it") from None
+    return RunConfig(names[0], names[1], names[2], from_dict(names[3], str(path)))
+
+
+def write_checkpoint(folder: Path, trainer: Trainer) -> None:
+    """Write ``checkpoint.npz``: enough to go on and enough to predict."""
+    receivers = trainer.record.receivers
+    arrays = trainer.state.arrays() | {
+        "format": np.asarray(FORMAT),
+        "seconds": np.asarray(trainer.seconds),
+        "image_size": np.asarray([trainer.height, trainer.width]),
+        "receiver_name": np.asarray([r.name for r in receivers]),
+        "receiver_position_m": np.stack([r.position_m for r in receivers]),
+        "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in receivers]),
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_atomically(folder / CHECKPOINT, buffer.getvalue())
+
+
+def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of ``checkpoint.npz``.
+
+    Raises:
+        InputError: missing, damaged, or of another format version.
+    """
+    path = folder / CHECKPOINT
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        version = int(arrays["format"])
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no {CHECKPOINT}; the run was stopped before its first, train anew") from None
+    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
+        raise InputError(f"{path}: not readable ({error}); restore it or train anew") from None
+    if version != FORMAT:
+        raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    return arrays
+
+
+def append_log(folder: Path, progress: Progress) -> None:
+    """Add a line to ``log.jsonl``."""
+    entry = asdict(progress)
+    del entry["left_s"]
+    with (folder / LOG).open("a") as stream:
+        stream.write(json.dumps(entry) + "\n")
+
+
+def cut_log(folder: Path, step: int) -> None:
+    """Drop lines after ``step``: what was logged after the checkpoint that a run goes on from happens again."""
+    path = folder / LOG
+    if path.is_file():
+        lines = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]
+        write_atomically(path, "".join(f"{line}\n" for line in lines))
+
+
+def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Trainer:
+    """A new run in a new or empty folder.
+
+    Raises:
+        InputError: the folder holds something already.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}")
+    trainer = Trainer(record, split, run.settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_split(folder / SPLIT, split)
+    write_config(folder, run)
+    return trainer
+
+
+def resume_run(folder: Path, record: Record) -> Trainer:
+    """A run as its last checkpoint left it; from the start if it was stopped before the first."""
+    run, split = read_config(folder), load_split(folder / SPLIT)
+    trainer = Trainer(record, split, run.settings)
+    if (folder / CHECKPOINT).exists():
+        arrays = read_checkpoint(folder)
+        trainer.state = FitState.from_arrays(arrays)
+        trainer.record_functions()
+        trainer.seconds = float(arrays["seconds"])
+    cut_log(folder, trainer.state.step)
+    return trainer
+
+
+def load_predictor(folder: str | Path) -> Predictor:
+    """The trained field of a run folder, ready to predict.
+
+    Raises:
+        InputError: not a run folder, or a damaged one.
+    """
+    path = Path(folder)
+    config, arrays = read_config(path), read_checkpoint(path)
+    return Predictor(
+        make_field(config.settings), final_params(arrays), stored_receivers(arrays), *map(int, arrays["image_size"])
+    )
+
+
+def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> list[Receiver]:
+    """The receivers of a checkpoint."""
+    keys = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
+    return [Receiver(str(n), p, q) for n, p, q in zip(*(arrays[k] for k in keys), strict=True)]

@@ -1,0 +1,71 @@
+"""Spectra of a trained field at new transmitter positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core import InputError, Receiver
+from ..splat.tiles import perception_plane
+from .step import Field, Params, device_pose, make_prediction
+
+
+class Predictor:
+    """Evaluates one field for any receiver and image size.
+
+    Args:
+        field: the model.
+        params: its parameters as NumPy arrays.
+        receivers: poses, by which spectra are asked for.
+        height: rows of a spectrum.
+        width: columns.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        params: Mapping[str, NDArray[np.float32]],
+        receivers: Sequence[Receiver],
+        height: int,
+        width: int,
+    ) -> None:
+        self.receivers = tuple(receivers)
+        self._poses = [device_pose(r) for r in receivers]
+        self._plane = perception_plane(height, width, mi.Float)
+        self._predict = make_prediction(field)
+        self.update({name: mi.TensorXf(values) for name, values in params.items()})
+
+    def update(self, params: Params) -> None:
+        """Use other parameters (Dr.Jit tensors) from now on."""
+        self._params = params
+        dr.eval(self._params)
+
+    def __call__(self, tx_pos_m: ArrayLike, receiver: int = 0) -> NDArray[np.float32]:
+        """Spectra of transmitters at one receiver.
+
+        Args:
+            tx_pos_m: positions [m, 3], world frame, metres.
+            receiver: index into ``receivers``.
+
+        Returns:
+            Greys [m, height, width].
+
+        Raises:
+            InputError: positions of another shape or not finite.
+        """
+        positions = np.asarray(tx_pos_m, np.float32)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
+        bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+        if len(bad):
+            raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
+        height, width = self._plane.height, self._plane.width
+        out = np.empty((len(positions), height, width), np.float32)
+        for image, position in zip(out, positions, strict=True):
+            tx = mi.TensorXf(np.ascontiguousarray(position[:, None]))
+            image[:] = self._predict(self._params, tx, self._poses[receiver], self._plane).numpy().reshape(height, width)
+        return out

@@ -1,0 +1,108 @@
+"""The state of a fit between two steps: parameters, Adam's moments, running mean; to and from NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+from numpy.typing import NDArray
+
+from ..field.density import DensityChange
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class FitState:
+    """Parameters under optimisation.
+
+    Attributes:
+        adam: Dr.Jit's optimiser, which owns the current parameters.
+        mean: running mean of the parameters, which is what is evaluated.
+        step: steps taken.
+        urge: sum since the last round of density control of each Gaussian's directional gradient, [n].
+        urge_steps: steps in that sum.
+    """
+
+    def __init__(self, params: Mapping[str, NDArray[np.float32]]) -> None:
+        self.adam = Adam(lr=0.0)
+        self.adam.update({name: mi.TensorXf(values) for name, values in params.items()})
+        self.mean = {name: mi.TensorXf(values) for name, values in params.items()}
+        self.step = 0
+        self._clear_urge()
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians."""
+        return int(self.adam["position"].shape[1])
+
+    def _clear_urge(self) -> None:
+        self.urge, self.urge_steps = dr.zeros(mi.Float, self.gaussians), 0
+        dr.make_opaque(self.urge)
+
+    def params(self) -> Arrays:
+        """Current parameters."""
+        return {name: dr.detach(self.adam[name]).numpy() for name in self.adam}
+
+    def mean_params(self) -> Arrays:
+        """Running mean of the parameters."""
+        return {name: self.mean[name].numpy() for name in self.mean}
+
+    def moments(self) -> tuple[Arrays, Arrays, int]:
+        """Adam's first and second moments in the parameters' shapes, and its step count."""
+        first, second, count = {}, {}, 0
+        for name, (value, _, _, (t, m, v, _)) in self.adam.state.items():
+            first[name], second[name] = m.numpy().reshape(value.shape), v.numpy().reshape(value.shape)
+            count = int(t[0])
+        return first, second, count
+
+    def _set_moments(self, first: Arrays, second: Arrays, count: int) -> None:
+        for name, (value, promoted, rate, _) in list(self.adam.state.items()):
+            moments = (mi.Float(first[name].ravel()), mi.Float(second[name].ravel()))
+            self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
+
+    def change_density(self, change: DensityChange) -> None:
+        """Replace the set of Gaussians; what is fresh starts without momentum."""
+        first, second, count = self.moments()
+        mean = self.mean_params()
+        for name, values in change.parameters.items():
+            fresh = np.broadcast_to(change.fresh, values.shape)
+            first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
+            second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
+            mean[name] = np.where(fresh, values, mean[name][:, change.source]).astype(np.float32)
+            self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
+        self.mean = {name: mi.TensorXf(values) for name, values in mean.items()}
+        self._set_moments(first, second, count)
+        self._clear_urge()
+
+    def set_param(self, name: str, values: NDArray[np.float32]) -> None:
+        """Set one parameter and forget its momentum (opacity reset)."""
+        self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
+        _, _, count = self.moments()
+        value, promoted, rate, (_, m, v, _) = self.adam.state[name]
+        self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
+
+    def arrays(self) -> Arrays:
+        """All of it, for a checkpoint."""
+        first, second, count = self.moments()
+        groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
+        flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
+        scalars = {"step": self.step, "adam_step": count, "urge_steps": self.urge_steps}
+        return flat | {"urge": self.urge.numpy()} | {name: np.asarray(value) for name, value in scalars.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FitState:
+        """The state that `arrays` described."""
+
+        def group(prefix: str) -> Arrays:
+            return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
+
+        state = cls(group("param/"))
+        state.mean = {name: mi.TensorXf(values) for name, values in group("mean/").items()}
+        state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
+        state.step, state.urge_steps = int(arrays["step"]), int(arrays["urge_steps"])
+        state.urge = mi.Float(arrays["urge"])
+        return state

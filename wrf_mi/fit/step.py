@@ -1,0 +1,152 @@
+"""One optimiser step and one prediction, as functions that `dr.freeze` can record.
+
+Everything that changes from step to step comes in as an argument and is opaque, so that Dr.Jit replays the
+recorded kernels; a captured array or a changing Python number would be traced anew each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from drjit.opt import Adam
+
+from ..core import Receiver
+from ..field.models import WrfGs, WrfGsPlus
+from ..loss.spectrum import spectrum_loss
+from ..project.footprint import Pose
+from ..splat.render import splat
+from ..splat.tiles import Plane
+
+Field = WrfGs | WrfGsPlus
+Params = dict[str, Any]
+
+DARK = 1e-8
+"""Added to |R|^2 under the root, whose slope at zero is infinite: greys below 1e-4 are rounded to it."""
+
+
+def device_pose(receiver: Receiver) -> Pose:
+    """A receiver's pose as opaque device arrays."""
+
+    def number(x: float) -> Any:
+        return dr.opaque(mi.Float, float(x))
+
+    return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
+
+
+def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+    """The pixel receiver's spectrum |R| per direction, [batch * height * width], row-major.
+
+    Args:
+        field: the model.
+        params: its parameters.
+        tx_pos: transmitter positions [3, batch], metres.
+        pose: of the receiver.
+        plane: its perception plane.
+    """
+    re, im = splat(field.gaussians(params, tx_pos), pose, plane)
+    return dr.sqrt(re * re + im * im + DARK)
+
+
+@dataclass
+class TrainingData:
+    """Measurements on the device.
+
+    Attributes:
+        tx_pos: positions of all rows, tensor [3, n], metres.
+        truth: greys of all receivers and rows, [n_rx * n * height * width].
+    """
+
+    tx_pos: Any
+    truth: Any
+
+    def select(self, rows: Any, receiver: Any, plane: Plane) -> tuple[Any, Any]:
+        """Transmitter positions [3, batch] and greys [batch * pixels] of some rows at one receiver."""
+        n, batch, index_type = self.tx_pos.shape[1], dr.width(rows), type(rows)
+        flat = self.tx_pos.array
+        tx = type(self.tx_pos)(dr.concat([dr.gather(type(flat), flat, rows + k * n) for k in range(3)]), (3, batch))
+        slot = dr.arange(index_type, batch * plane.pixels)
+        image = dr.gather(index_type, rows, slot // plane.pixels) + receiver * n
+        return tx, dr.gather(type(self.truth), self.truth, image * plane.pixels + slot % plane.pixels)
+
+
+@dataclass
+class StepReport:
+    """What a step tells: arrays of one value, but ``urge`` [n].
+
+    Attributes:
+        loss: of the batch before the step.
+        broken: 1 if the loss or a gradient was not finite (the step was then not taken), else 0.
+        urge: length of the gradient by each Gaussian's direction from the receiver.
+    """
+
+    loss: Any
+    broken: Any
+    urge: Any
+
+
+def watched(name: str) -> bool:
+    """Whether a parameter's gradient shows any NaN or infinity of its group.
+
+    Per-Gaussian attributes are watched themselves, a layer through its bias, whose gradient is the sum
+    of all that reaches the layer.
+    """
+    return "." not in name or name.endswith(".bias")
+
+
+def make_step(field: Field, rates: Mapping[str, float], structural_weight: float) -> Callable[..., Any]:
+    """A recorded optimiser step.
+
+    Args:
+        field: the model.
+        rates: learning rate of each parameter.
+        structural_weight: eta of the loss.
+
+    Returns:
+        ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay) -> (mean, StepReport)``. It takes
+        one step of ``adam`` in place and returns the new running mean of the parameters.
+    """
+
+    @dr.freeze
+    def step(
+        adam: Adam, mean: Params, data: TrainingData, rows: Any, receiver: Any, pose: Pose, plane: Plane,
+        factor: Any, decay: Any,
+    ) -> tuple[Params, StepReport]:
+        # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
+        adam.set_learning_rate({name: factor * rates[name] for name in rates})
+        params = {name: adam[name] for name in rates}
+        tx_pos, truth = data.select(rows, receiver, plane)
+        batch = dr.width(rows)
+        prediction = grey(field, params, tx_pos, pose, plane)
+        loss, _ = spectrum_loss(prediction, truth, batch, plane.height, plane.width, structural_weight)
+        dr.backward(loss)
+        health = dr.detach(loss)
+        for name in params:
+            if watched(name):
+                health = health + dr.sum(dr.abs(dr.grad(params[name]).array))
+        finite = dr.isfinite(health)
+        offset = [dr.detach(params["position"])[k].array - pose.position[k] for k in range(3)]
+        pull = [dr.grad(params["position"])[k].array for k in range(3)]
+        distance = dr.sqrt(sum(c * c for c in offset))
+        urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
+        adam.step(eval=False, active=finite)
+        mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], decay) for name in mean}
+        report = StepReport(dr.detach(loss), dr.select(finite, mi.Float(0), mi.Float(1)), urge)
+        dr.eval(adam, mean, report)
+        return mean, report
+
+    return step
+
+
+def make_prediction(field: Field) -> Callable[..., Any]:
+    """A recorded prediction: ``predict(params, tx_pos, pose, plane) -> greys``, without gradients."""
+
+    @dr.freeze
+    def predict(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+        with dr.suspend_grad():
+            return grey(field, params, tx_pos, pose, plane)
+
+    return predict

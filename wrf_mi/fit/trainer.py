@@ -1,0 +1,262 @@
+"""The training loop."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Record, Split
+from ..field import FIELDS, Encoding, InitialGaussians, gaussians_from_points, random_gaussians
+from ..field.density import adapt, reset_opacity
+from ..loss.ssim import ssim
+from ..splat.tiles import perception_plane
+from .config import TrainConfig
+from .points import read_points
+from .predictor import Predictor
+from .schedule import plan
+from .state import FitState
+from .step import Field, TrainingData, device_pose, make_step, watched
+
+
+class NumericsError(RuntimeError):
+    """A loss or gradient was not finite; names the step and the parameter group."""
+
+    exit_status = 1
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a listener hears at each log line.
+
+    Attributes:
+        step: steps taken.
+        seconds: training time so far, over all sittings.
+        loss: mean over the steps since the last line.
+        validation_ssim: median on the validation rows, where it was just computed.
+        held_out: whether the validation rows are still kept out of training.
+        gaussians: their number.
+        left_s: estimated seconds to the end.
+    """
+
+    step: int
+    seconds: float
+    loss: float
+    validation_ssim: float | None
+    held_out: bool
+    gaussians: int
+    left_s: float
+
+
+def make_field(config: TrainConfig) -> Field:
+    """The model that a configuration names.
+
+    Raises:
+        InputError: no trainable model of that name.
+    """
+    if config.model not in FIELDS:
+        raise InputError(f"model {config.model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
+    e = config.encoding
+    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m)
+    return FIELDS[config.model](encoding=encoding)
+
+
+def _initial(config: TrainConfig, record: Record, rng: np.random.Generator) -> InitialGaussians:
+    i = config.initial
+    if i.points:
+        start = gaussians_from_points(read_points(i.points), i.gaussians, rng)
+        return InitialGaussians(start.position_m, start.scale_m, i.opacity, i.signal)
+    distance = (i.nearest_m, i.farthest_m)
+    return random_gaussians(record.receivers, i.gaussians, rng, distance, i.size_deg, i.opacity, i.signal)
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+class Trainer:
+    """Fits one field to the training rows of one split.
+
+    Args:
+        record: spectra [n_rx, n, height, width].
+        split: which rows train and which choose.
+        config: settings.
+
+    Raises:
+        InputError: settings or data that cannot be trained on.
+    """
+
+    def __init__(self, record: Record, split: Split, config: TrainConfig) -> None:
+        if record.task != "spectrum":
+            raise InputError(f"{record.name}: task {record.task!r}; this trainer fits spectra")
+        self.record, self.split, self.config = record, split, config
+        self.height, self.width = (int(s) for s in record.observation.shape[-2:])
+        self.field = make_field(config)
+        self.schedule = plan(config, split, len(record.receivers))
+        if config.deterministic:
+            # Parallel sums add in the order in which threads finish.
+            dr.set_thread_count(1)
+        self._rng = np.random.default_rng([config.seed, 0])
+        self.state = FitState(self.field.init(_initial(config, record, self._rng), self._rng))
+        self._poses = [device_pose(r) for r in record.receivers]
+        self._plane = perception_plane(self.height, self.width, mi.Float)
+        self._data = TrainingData(
+            mi.TensorXf(np.ascontiguousarray(record.tx_pos_m.T, np.float32)),
+            mi.Float(np.ascontiguousarray(record.observation, np.float32).ravel()),
+        )
+        self.record_functions()
+        self.seconds = 0.0
+
+    def record_functions(self) -> None:
+        """Forget recorded kernels: they hold for one number of Gaussians.
+
+        Dr.Jit replays a recording for arrays of other sizes where it believes that only sizes differ, but the
+        number of Gaussians also stands in the kernels as a constant.
+        """
+        self._step = make_step(self.field, self._rates(), self.config.structural_weight)
+        self._predictor: Predictor | None = None
+
+    def _rates(self) -> dict[str, float]:
+        o = self.config.optimiser
+        own = {
+            "position": o.position,
+            "log_scale": o.scale,
+            "rotation": o.rotation,
+            "opacity": o.opacity,
+            "signal": o.signal,
+        }
+        return {name: own.get(name, o.network) for name in self.state.adam}
+
+    def predictor(self) -> Predictor:
+        """Predictions with the running mean of the parameters as it is now."""
+        if self._predictor is None:
+            self._predictor = Predictor(
+                self.field, self.state.mean_params(), self.record.receivers, self.height, self.width
+            )
+        else:
+            self._predictor.update(self.state.mean)
+        return self._predictor
+
+    def validate(self) -> float:
+        """Median SSIM on the validation rows, all receivers pooled; NaN without such rows."""
+        rows = self.split.validation
+        if len(rows) == 0:
+            return float("nan")
+        scores = []
+        for r in range(len(self.record.receivers)):
+            predicted = mi.Float(self.predictor()(self.record.tx_pos_m[rows], r).ravel())
+            truth = mi.Float(np.ascontiguousarray(self.record.observation[r, rows]).ravel())
+            scores.append(ssim(predicted, truth, len(rows), self.height, self.width).numpy())
+        return float(np.median(np.concatenate(scores)))
+
+    def run(
+        self,
+        listen: Callable[[Progress], None] = lambda progress: None,
+        save: Callable[[], None] = lambda: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train from the current step to the last.
+
+        Args:
+            listen: hears of progress every ``log_every`` steps and at the end.
+            save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
+            stop: asked after each step; True ends the run there.
+
+        Returns:
+            Whether the last step was reached.
+
+        Raises:
+            NumericsError: a loss or gradient that is not finite; parameters are as before that step.
+        """
+        config, state, schedule = self.config, self.state, self.schedule
+        start, before = time.perf_counter(), self.seconds
+        first, losses, broken = state.step, dr.zeros(mi.Float), dr.zeros(mi.Float)
+        since = 0
+        while state.step < config.steps and not (state.step > first and stop()):
+            t = state.step
+            receiver = int(schedule.receiver[t])
+            state.mean, report = self._step(
+                state.adam,
+                state.mean,
+                self._data,
+                mi.UInt32(schedule.rows[t].astype(np.uint32)),
+                dr.opaque(mi.UInt32, receiver),
+                self._poses[receiver],
+                self._plane,
+                dr.opaque(mi.Float, float(schedule.factor[t])),
+                dr.opaque(mi.Float, float(schedule.decay[t])),
+            )
+            losses, broken = losses + report.loss, dr.maximum(broken, report.broken)
+            state.urge += report.urge
+            dr.eval(losses, broken, state.urge)
+            state.step, state.urge_steps, since = t + 1, state.urge_steps + 1, since + 1
+            self.seconds = before + time.perf_counter() - start
+            last = state.step == config.steps
+            if state.step in schedule.density:
+                self._adapt()
+            if state.step % config.log_every == 0 or last:
+                if broken[0] > 0:
+                    raise NumericsError(self._diagnose())
+                score = self.validate() if state.step % config.validate_every == 0 or last else None
+                self.seconds = before + time.perf_counter() - start
+                left = (self.seconds - before) / (state.step - first) * (config.steps - state.step)
+                held_out = state.step <= schedule.joined
+                listen(
+                    Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left)
+                )
+                losses, since = dr.zeros(mi.Float), 0
+            if state.step % config.checkpoint_every == 0 and not last:
+                save()
+        dr.sync_thread()
+        self.seconds = before + time.perf_counter() - start
+        save()
+        return state.step == config.steps
+
+    def _adapt(self) -> None:
+        d, state = self.config.density, self.state
+        names = self.field.per_gaussian
+        params = {name: values for name, values in state.params().items() if name in names}
+        receivers = np.stack([r.position_m for r in self.record.receivers])
+        distance = np.linalg.norm(params["position"].T[:, None].astype(float) - receivers, axis=2).min(axis=1)
+        # Its own generator for each round: a resumed run draws what an uninterrupted one would.
+        rng = np.random.default_rng([self.config.seed, 2, state.step])
+        change = adapt(
+            params,
+            state.urge.numpy() / max(1, state.urge_steps),
+            distance,
+            rng,
+            d.grow,
+            max(d.most, self.config.initial.gaussians),
+            float(np.radians(d.split_deg)),
+            d.least_opacity,
+        )
+        state.change_density(change)
+        self.record_functions()
+        rounds = sorted(self.schedule.density)
+        if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
+            state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
+
+    def _diagnose(self) -> str:
+        """Say which parameter groups are not finite, or which gradients would be at the last good parameters."""
+        bad = [name for name, values in self.state.params().items() if not np.isfinite(values).all()]
+        if bad:
+            return f"step {self.state.step}: parameters not finite: {', '.join(bad)}"
+        groups = ", ".join(name for name in self.state.adam if watched(name))
+        return (
+            f"within the {self.config.log_every} steps before step {self.state.step}: loss or gradient not finite "
+            f"(watched: {groups}); the parameters were left as before; lower the learning rates"
+        )
+
+
+def final_params(arrays: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """The parameters to predict with, from a checkpoint's arrays."""
+    return {key.removeprefix("mean/"): values for key, values in arrays.items() if key.startswith("mean/")}

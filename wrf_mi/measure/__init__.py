@@ -1,0 +1,22 @@
+"""Measurements: records, their files, their public originals and their splits."""
+
+from .fetch import fetch
+from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
+from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
+from .splits import SPLIT_NAMES, load_split, make_splits, save_split
+
+__all__ = [
+    "SPLIT_NAMES",
+    "DataSet",
+    "DataSetStatus",
+    "data_home",
+    "datasets",
+    "fetch",
+    "load",
+    "load_split",
+    "make_splits",
+    "read_spectrum_folder",
+    "save_split",
+    "user_cache",
+    "write_spectrum_folder",
+]

@@ -1,0 +1,259 @@
+"""The NeRF2 spectrum layout: one folder of grey images, positions and receiver poses.
+
+Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
+
+- ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
+  metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world); ``dataset_name`` and other
+  plain values beside them are not used.
+- ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
+- ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
+  row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
+  lie in ``spectrum/<receiver's name>/``.
+- ``train_index.txt``, ``test_index.txt``: row numbers from 1, one per line, as in the images' names. Both or neither.
+- ``blocked_folds.txt``, optional and ours: the spatial fold 0, 1, ... of each row, one per line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..core import InputError, Receiver, Record
+from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.types import IntArray
+from .files import atomic_folder, one_line, text_lines
+
+GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
+"""Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
+
+
+def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
+    """Read and check a folder in the NeRF2 spectrum layout (see this module's head).
+
+    Args:
+        path: the folder.
+        name: the record's name; the folder's own by default.
+
+    Returns:
+        A record with ``task="spectrum"``, positions [n, 3] in metres and ``observation`` [n_rx, n, height, width]
+        in 0..1.
+
+    Raises:
+        InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: not a folder; give one that holds gateway_info.yml, tx_pos.csv and spectrum/")
+    receivers = _read_receivers(folder / "gateway_info.yml")
+    positions = _read_positions(folder / "tx_pos.csv")
+    images = folder / "spectrum"
+    places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
+    return Record(
+        name=name or folder.resolve().name,
+        task="spectrum",
+        tx_pos_m=positions,
+        receivers=receivers,
+        observation=_read_images(places, len(positions)),
+        official=_read_official(folder, len(positions)),
+        folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
+        source=str(folder),
+    )
+
+
+def write_spectrum_folder(
+    path: str | Path, record: Record, bits: int = 8, replace: bool = False, notes: Mapping[str, str] | None = None
+) -> Path:
+    """Write a record in the NeRF2 spectrum layout; the folder appears complete or not at all.
+
+    Args:
+        path: the folder to make.
+        record: its ``observation`` [n_rx, n, height, width] must lie in 0..1; it is rounded to grey levels.
+        bits: 8 or 16 per pixel.
+        replace: take the place of an existing folder.
+        notes: further text files to put into the folder, by name.
+
+    Raises:
+        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1.
+    """
+    if bits not in (8, 16):
+        raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
+    if record.task != "spectrum" or not (record.observation.min() >= 0 and record.observation.max() <= 1):
+        raise InputError(f"{path}: {record.name} holds no spectra within 0..1; scale them first")
+    grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
+    with atomic_folder(Path(path), replace) as part:
+        several = len(record.receivers) > 1
+        for receiver, spectra in zip(record.receivers, grey, strict=True):
+            images = part / "spectrum" / receiver.name if several else part / "spectrum"
+            images.mkdir(parents=True)
+            for row, image in enumerate(spectra, start=1):
+                Image.fromarray(image).save(images / f"{row:05d}.png")
+        poses = {
+            r.name: {"position": r.position_m.tolist(), "orientation": r.orientation_xyzw.tolist()}
+            for r in record.receivers
+        }
+        info = yaml.safe_dump({"dataset_name": record.name, **poses}, sort_keys=False, default_flow_style=None)
+        (part / "gateway_info.yml").write_text(info, encoding="utf-8")
+        rows = [",".join(repr(float(v)) for v in position) for position in record.tx_pos_m]
+        _write_lines(part / "tx_pos.csv", ["x,y,z", *rows])
+        if record.official is not None:
+            for kind, index in zip(("train", "test"), record.official, strict=True):
+                _write_lines(part / f"{kind}_index.txt", [f"{row + 1:05d}" for row in index])
+        if record.folds is not None:
+            _write_lines(part / "blocked_folds.txt", [str(fold) for fold in record.folds])
+        for name, text in (notes or {}).items():
+            (part / name).write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def parse_folds(path: Path, rows: int) -> IntArray:
+    """Read the spatial fold of each of ``rows`` rows from a text file with one number per line, shape [rows].
+
+    Raises:
+        InputError: a line that is no number, a wrong number of lines, or folds that are not 0, 1, ... in full.
+    """
+    folds = np.array([_whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
+    if len(folds) != rows:
+        raise InputError(f"{path}: {len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv")
+    count = int(folds.max(initial=-1)) + 1
+    missing = sorted(set(range(count)) - set(folds.tolist()))
+    if missing or count < 2:
+        what = f"fold {missing[0]} has no row" if missing else "there is one fold only"
+        raise InputError(f"{path}: {what}; number the folds 0, 1, ... without gaps, two at least")
+    return folds
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
+
+
+def _whole_number(path: Path, line: int, text: str) -> int:
+    digits = text.strip()
+    if not (digits.isascii() and digits.isdecimal()):
+        raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
+    return int(digits)
+
+
+def _read_receivers(path: Path) -> tuple[Receiver, ...]:
+    try:
+        info = yaml.safe_load("\n".join(text_lines(path)))
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
+    poses = {key: value for key, value in info.items() if isinstance(value, dict)} if isinstance(info, dict) else {}
+    if not poses:
+        raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
+    receivers = []
+    for name, pose in poses.items():
+        if not isinstance(name, str) or Path(name).name != name:
+            raise InputError(f"{path}: {name!r} cannot name a folder; call receivers gateway1, gateway2, ...")
+        position = _numbers(path, name, pose, "position", 3)
+        orientation = _numbers(path, name, pose, "orientation", 4)
+        norm = float(np.linalg.norm(orientation))
+        if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
+            raise InputError(f"{path}: {name}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w")
+        receivers.append(Receiver(name, position, orientation))
+    return tuple(receivers)
+
+
+def _numbers(path: Path, name: str, pose: dict[str, object], key: str, count: int) -> FloatArray:
+    try:
+        values = np.array(pose.get(key), dtype=float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise InputError(f"{path}: {name}: {key} is {pose.get(key)!r}; give a list of {count} finite numbers")
+    return values
+
+
+def _read_positions(path: Path) -> FloatArray:
+    header, *rows = text_lines(path) or [""]
+    if [column.strip().lower() for column in header.split(",")] != ["x", "y", "z"]:
+        raise InputError(f"{path}: line 1: header is {header[:40]!r}; it must be x,y,z")
+    if not rows:
+        raise InputError(f"{path}: no positions in it; give one row x,y,z in metres per spectrum")
+    positions = np.empty((len(rows), 3))
+    for row, text in enumerate(rows, start=1):
+        try:
+            positions[row - 1] = [float(value) for value in text.split(",", 3)]
+        except ValueError:
+            raise InputError(f"{path}: row {row}: {text[:60]!r}; give three numbers x,y,z in metres") from None
+    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if len(bad):
+        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]]!r} is not finite; correct or remove the row")
+    return positions
+
+
+def _read_images(places: list[Path], rows: int) -> NDArray[np.float32]:
+    names = [f"{row:05d}.png" for row in range(1, rows + 1)]
+    for place in places:
+        if not place.is_dir():
+            raise InputError(
+                f"{place}: missing folder; images lie in spectrum/, or in spectrum/NAME/ for several receivers"
+            )
+        present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
+        lacking = [row for row, name in enumerate(names, start=1) if name not in present]
+        extra = sorted(present - set(names))
+        if lacking:
+            text = f"{len(present)} images for {rows} rows of tx_pos.csv, row {lacking[0]} has none"
+            raise InputError(f"{place / names[lacking[0] - 1]}: missing ({text}); add the image or remove the row")
+        if extra:
+            text = f"{len(present)} images for {rows} rows of tx_pos.csv"
+            raise InputError(f"{place / extra[0]}: no row belongs to it ({text}); add its position or remove the image")
+    observation: NDArray[np.float32] | None = None
+    for receiver, place in enumerate(places):
+        for row, name in enumerate(names):
+            grey = _read_grey(place / name, row + 1)
+            if observation is None:
+                observation = np.empty((len(places), rows, *grey.shape), np.float32)
+            if grey.shape != observation.shape[2:]:
+                (height, width), (first_height, first_width) = grey.shape, observation.shape[2:]
+                text = f"{width} x {height} pixels, but the first image has {first_width} x {first_height}"
+                raise InputError(f"{place / name}: row {row + 1}: {text}; give all images one size")
+            observation[receiver, row] = grey
+    assert observation is not None  # there is one receiver and one row at least
+    return observation
+
+
+def _read_grey(path: Path, row: int) -> NDArray[np.float32]:
+    try:
+        with Image.open(path) as image:
+            mode = image.mode
+            values = np.asarray(image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: row {row}: unreadable ({one_line(error)}); replace the image") from None
+    if mode not in GREY_LEVELS:
+        raise InputError(f"{path}: row {row}: image mode {mode}; give a grey PNG of 8 or 16 bits")
+    return values.astype(np.float32) / np.float32(GREY_LEVELS[mode])
+
+
+def _read_official(folder: Path, rows: int) -> tuple[IntArray, IntArray] | None:
+    paths = folder / "train_index.txt", folder / "test_index.txt"
+    if not any(path.exists() for path in paths):
+        return None
+    train, test = (_read_index(path, rows) for path in paths)
+    both = np.intersect1d(train, test)
+    if len(both):
+        raise InputError(f"{paths[1]}: row {both[0] + 1} is in {paths[0].name} as well; remove it from one of them")
+    return train, test
+
+
+def _read_index(path: Path, rows: int) -> IntArray:
+    seen: dict[int, int] = {}
+    for line, text in enumerate(text_lines(path), start=1):
+        row = _whole_number(path, line, text)
+        if not 1 <= row <= rows:
+            raise InputError(f"{path}: line {line}: row {row} is out of range; tx_pos.csv has rows 1 to {rows}")
+        if row in seen:
+            raise InputError(f"{path}: line {line}: row {row} stands in line {seen[row]} already; remove one of them")
+        seen[row] = line
+    if not seen:
+        raise InputError(f"{path}: no rows in it; give one row number per line")
+    return np.array(list(seen), np.int64) - 1
+
+
+def _read_folds(path: Path, rows: int) -> IntArray | None:
+    return parse_folds(path, rows) if path.exists() else None

@@ -1,0 +1,191 @@
+"""Which rows train, which choose settings and which score: seeded, nested, stored with the run."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from scipy.cluster.vq import ClusterError, kmeans2
+
+from ..core import InputError, Record, Split
+from ..core.types import IntArray
+from .files import atomic_file, one_line
+
+SPLIT_NAMES = ("official", "random", "blocked", "trajectory")
+TRAIN_FRACTION = 0.8
+"""Training share of ``random`` and ``trajectory``: that of the authors' split of rfid-lab (160 of 200)."""
+FOLDS = 5
+"""Number of spatial blocks where the data bring none."""
+FOLD_SEED = 0
+"""Seed of the spatial blocks: they belong to the data, so a run's own seed leaves them as they are."""
+CLUSTER_STARTS = 10
+"""k-means starts, of which the tightest clusters count; a start that leaves a cluster empty does not."""
+SPLIT_FORMAT = 1
+"""Version of the split file."""
+
+
+def make_splits(
+    record: Record,
+    name: str,
+    seed: int = 0,
+    n_train: int | float | None = None,
+    validation_fraction: float = 0.1,
+) -> list[Split]:
+    """Split a record's rows by one of four rules.
+
+    - ``official``: the rows that came with the data.
+    - ``random``: seeded, 80 % train and 20 % test.
+    - ``blocked``: one split per spatial fold, which is its test set; the folds are ``record.folds`` or else five
+      k-means clusters of the positions. ``blocked:2`` is the split of fold 2 alone.
+    - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
+
+    Validation rows are a seeded draw from the training rows. Subsets by ``n_train`` are nested for one seed, and so
+    are their validation rows: a smaller one's are among a larger one's.
+
+    Args:
+        record: any record with n rows.
+        name: ``official``, ``random``, ``blocked``, ``blocked:K`` or ``trajectory``.
+        seed: of the random split, the subset and the validation rows; not of the folds.
+        n_train: training rows to keep, validation rows included: a number, or a fraction (a float up to 1) of what
+            the split has. All by default.
+        validation_fraction: share of the kept training rows that is set aside to choose settings, in [0, 1).
+
+    Returns:
+        One split, or one per fold for ``blocked``; rows are sorted.
+
+    Raises:
+        InputError: an unknown name, a rule that the record cannot follow, or numbers out of range.
+    """
+    if not 0 <= validation_fraction < 1:
+        raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")
+    if seed < 0:
+        raise InputError(f"seed {seed}: choose a whole number from 0")
+    return [
+        _finish(f"{record.name}, split {label}", label, train, test, seed, n_train, validation_fraction)
+        for label, train, test in _train_and_test(record, name, seed)
+    ]
+
+
+def save_split(path: str | Path, split: Split) -> None:
+    """Write a split as an npz file of plain arrays (no pickle), atomically.
+
+    Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0).
+    """
+    with atomic_file(Path(path)) as part, part.open("wb") as file:
+        np.savez(
+            file,
+            format=np.int64(SPLIT_FORMAT),
+            name=np.str_(split.name),
+            seed=np.int64(split.seed),
+            train=split.train,
+            validation=split.validation,
+            test=split.test,
+        )
+
+
+def load_split(path: str | Path) -> Split:
+    """Read what `save_split` wrote.
+
+    Raises:
+        InputError: missing, unreadable, of another version, or with a row in two of its parts.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            content = {key: file[key] for key in ("format", "name", "seed", "train", "validation", "test")}
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing; give a split.npz of a run folder") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a split file ({one_line(error)}); give a split.npz of a run folder") from None
+    if content["format"] != SPLIT_FORMAT:
+        raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
+    parts = [content[key] for key in ("train", "validation", "test")]
+    rows = np.concatenate([part.ravel() for part in parts])
+    if any(part.ndim != 1 or part.dtype.kind != "i" for part in parts) or rows.min(initial=0) < 0:
+        raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
+    if len(np.unique(rows)) != len(rows):
+        raise InputError(f"{path}: a row is in the split twice; make the split again")
+    train, validation, test = (part.astype(np.int64) for part in parts)
+    return Split(str(content["name"]), int(content["seed"]), train, validation, test)
+
+
+def position_folds(record: Record) -> IntArray:
+    """The spatial fold 0, 1, ... of each row, shape [n]: the record's own, or seeded k-means clusters.
+
+    Raises:
+        InputError: there are too few distinct positions for five clusters.
+    """
+    if record.folds is not None:
+        return record.folds
+    distinct = len(np.unique(record.tx_pos_m, axis=0))
+    if distinct < FOLDS:
+        raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")
+    best, folds = np.inf, None
+    for attempt in range(CLUSTER_STARTS):
+        try:
+            rng = np.random.default_rng([FOLD_SEED, attempt])
+            centres, labels = kmeans2(record.tx_pos_m, FOLDS, iter=50, minit="++", missing="raise", rng=rng)
+        except ClusterError:
+            continue
+        spread = float(np.square(record.tx_pos_m - centres[labels]).sum())
+        if spread < best:
+            best, folds = spread, labels.astype(np.int64)
+    if folds is None:
+        raise InputError(f"{record.name}: its positions do not fall into {FOLDS} blocks; give blocked_folds.txt")
+    return folds
+
+
+def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, IntArray, IntArray]]:
+    rows = np.arange(len(record))
+    kind, _, fold = name.partition(":")
+    if kind not in SPLIT_NAMES or (":" in name and kind != "blocked"):
+        raise InputError(f"split {name!r}: unknown; choose official, random, blocked, blocked:K or trajectory")
+    if kind == "official":
+        if record.official is None:
+            raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
+        return [(name, *record.official)]
+    if kind == "blocked":
+        folds = position_folds(record)
+        count = int(folds.max()) + 1
+        chosen = range(count)
+        if ":" in name:
+            if not (fold.isascii() and fold.isdecimal() and int(fold) < count):
+                raise InputError(f"split {name!r}: no such fold; {record.name} has blocked:0 to blocked:{count - 1}")
+            chosen = range(int(fold), int(fold) + 1)
+        return [(f"blocked:{k}", rows[folds != k], rows[folds == k]) for k in chosen]
+    first = round(TRAIN_FRACTION * len(rows))
+    if not 0 < first < len(rows):
+        raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
+    order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
+    return [(name, order[:first], order[first:])]
+
+
+def _finish(
+    what: str,
+    label: str,
+    train: IntArray,
+    test: IntArray,
+    seed: int,
+    n_train: int | float | None,
+    validation_fraction: float,
+) -> Split:
+    # One seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix
+    # of it is nested in a longer one, validation rows included.
+    order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
+    order = order[: _kept(what, len(order), n_train)]
+    # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
+    counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
+    validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
+    return Split(label, seed, np.sort(order[~validates]), np.sort(order[validates]), np.sort(test))
+
+
+def _kept(what: str, available: int, n_train: int | float | None) -> int:
+    if n_train is None:
+        return available
+    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+        count = int(n_train)
+    else:
+        count = round(float(n_train) * available) if 0 < n_train <= 1 else 0
+    if not 1 <= count <= available:
+        raise InputError(f"{what}: n_train {n_train}; choose 1 to {available} rows or a fraction in (0, 1]")
+    return count

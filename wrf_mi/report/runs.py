@@ -1,0 +1,255 @@
+"""Whole runs, from a data set to scores in a run folder: what the command and the Python API call."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import InputError, Record, Split
+from ..core.files import write_atomically
+from ..fit.config import TrainConfig
+from ..fit.folder import (
+    RunConfig,
+    append_log,
+    load_predictor,
+    read_config,
+    resume_run,
+    start_run,
+    write_checkpoint,
+    write_config,
+)
+from ..fit.predictor import Predictor
+from ..fit.trainer import Progress, Trainer, peak_memory_mb
+from ..measure import load_split, make_splits
+from ..trace import load_record
+from .evaluate import evaluate, pool, write_results
+from .run_folder import CONFIG, METRICS
+
+Listen = Callable[[str, int, Progress], None]
+"""Hears of progress: name of the fold ("" where there is one split), steps in all, and the progress."""
+
+FOLDS = "fold*"
+
+
+class Interrupted(Exception):
+    """A run was stopped between two steps; its checkpoint is written."""
+
+    exit_status = 130
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder.
+
+    Attributes:
+        folder: where everything lies.
+    """
+
+    folder: Path
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """Content of ``metrics.json``."""
+        return json.loads((self.folder / METRICS).read_text())
+
+    def predictor(self) -> Predictor:
+        """The trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
+
+        Raises:
+            InputError: a run over all blocks has one field a fold, in its subfolders.
+        """
+        if is_blocked(self.folder):
+            raise InputError(f"{self.folder}: one field for each block; choose one, e.g. {self.folder / 'fold0'}")
+        return load_predictor(self.folder)
+
+
+def is_blocked(folder: Path) -> bool:
+    """Whether a run folder holds one run for each of several folds."""
+    return not (folder / "split.npz").exists() and any(folder.glob(FOLDS))
+
+
+def train(
+    dataset: str | Path | Record,
+    out: str | Path,
+    config: TrainConfig | None = None,
+    split: str | Split = "official",
+    n_train: int | float | None = None,
+    listen: Listen = lambda fold, steps, progress: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Run:
+    """Fit a field and score it.
+
+    Args:
+        dataset: name, folder, or a record that was loaded.
+        out: run folder to make; must not exist or be empty.
+        config: settings; None: the defaults.
+        split: name of a split (``blocked`` fits every fold in turn and pools the scores), or rows of your own.
+        n_train: number or fraction of the training rows to use; None: all.
+        listen: hears of progress.
+        stop: asked after each step; True stops the run at a checkpoint.
+
+    Raises:
+        InputError: data, settings or folder that cannot be used.
+        Interrupted: ``stop`` ended the run; go on with `resume`.
+    """
+    record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
+    source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
+    settings, folder = config or TrainConfig(), Path(out)
+    if isinstance(split, Split):
+        splits, name = [split], split.name
+    else:
+        splits, name = make_splits(record, split, settings.seed, n_train), split
+    run = RunConfig(source, name, n_train, settings)
+    if len(splits) == 1:
+        _fit(start_run(folder, record, splits[0], run), folder, run, "", listen, stop)
+        return Run(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not empty; choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_config(folder, run)
+    return _fit_folds(folder, record, splits, run, listen, stop)
+
+
+def resume(folder: str | Path, listen: Listen = lambda fold, steps, progress: None,
+           stop: Callable[[], bool] = lambda: False) -> Run:
+    """Go on with a run that was stopped, from its last checkpoint to the end; a finished one is only scored again.
+
+    Raises:
+        InputError: not a run folder.
+        Interrupted: ``stop`` ended the run once more.
+    """
+    path = Path(folder)
+    run = read_config(path)
+    record = load_record(run.dataset)
+    if (path / "split.npz").exists():
+        _fit(resume_run(path, record), path, run, "", listen, stop)
+        return Run(path)
+    splits = make_splits(record, run.split, run.settings.seed, run.n_train)
+    return _fit_folds(path, record, splits, run, listen, stop)
+
+
+def _fit_folds(
+    folder: Path, record: Record, splits: list[Split], run: RunConfig, listen: Listen, stop: Callable[[], bool]
+) -> Run:
+    parts, seconds = [], 0.0
+    for k, split in enumerate(splits):
+        part, own = folder / f"fold{k}", replace(run, split=split.name)
+        trainer = resume_run(part, record) if (part / "split.npz").exists() else start_run(part, record, split, own)
+        parts.append(_fit(trainer, part, own, part.name, listen, stop))
+        seconds += trainer.seconds
+    metrics, arrays = pool(parts)
+    write_results(folder, _header(run, seconds) | metrics, arrays)
+    return Run(folder)
+
+
+def _fit(
+    trainer: Trainer, folder: Path, run: RunConfig, fold: str, listen: Listen, stop: Callable[[], bool]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    def heard(progress: Progress) -> None:
+        append_log(folder, progress)
+        listen(fold, run.settings.steps, progress)
+
+    if not trainer.run(heard, lambda: write_checkpoint(folder, trainer), stop):
+        top = folder.parent if fold else folder
+        raise Interrupted(
+            f"stopped after step {trainer.state.step} of {run.settings.steps}; go on with: wrf-mi train --resume {top}"
+        )
+    metrics, arrays = evaluate(trainer.record, trainer.split, trainer.predictor())
+    metrics = _header(run, trainer.seconds) | {"gaussians": trainer.state.gaussians} | metrics
+    write_results(folder, metrics, arrays)
+    return metrics, arrays
+
+
+def _header(run: RunConfig, seconds: float) -> dict[str, Any]:
+    return {
+        "task": "spectrum",
+        "model": run.settings.model,
+        "dataset": run.dataset,
+        "split": run.split,
+        "seed": run.settings.seed,
+        "steps": run.settings.steps,
+        "train_seconds": seconds,
+        "peak_memory_mb": peak_memory_mb(),
+    }
+
+
+def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]:
+    """Score a run again.
+
+    Args:
+        folder: run folder; without ``split`` its ``metrics.json`` and ``predictions.npz`` are written anew.
+        split: score on the test rows of another split instead, without those the run was trained on;
+            nothing is written.
+
+    Returns:
+        The metrics.
+
+    Raises:
+        InputError: not a run folder, or no row of ``split`` is left that the run has not seen.
+    """
+    path = Path(folder)
+    run = read_config(path)
+    record = load_record(run.dataset)
+    if is_blocked(path):
+        if split is not None:
+            raise InputError(f"{path}: every row is held out in one of its folds; leave --split away")
+        parts = []
+        for part in sorted(path.glob(FOLDS)):
+            parts.append(evaluate(record, load_split(part / "split.npz"), load_predictor(part)))
+        metrics, arrays = pool(parts)
+    else:
+        rows = load_split(path / "split.npz")
+        if split is not None:
+            asked = np.unique(np.concatenate([s.test for s in make_splits(record, split, run.settings.seed)]))
+            unseen = np.setdiff1d(asked, rows.all_train)
+            if len(unseen) == 0:
+                raise InputError(f"{path}: trained on all test rows of split {split}; nothing is left to score")
+            rows, run = replace(rows, test=unseen), replace(run, split=f"{split} (rows unseen by {run.split})")
+        metrics, arrays = evaluate(record, rows, load_predictor(path))
+    stored = json.loads((path / METRICS).read_text()) if (path / METRICS).exists() else {}
+    merged = _header(run, stored.get("train_seconds", 0.0)) | stored | metrics | {"split": run.split}
+    if split is None:
+        write_results(path, merged, arrays)
+    return merged
+
+
+def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -> dict[str, tuple[int, ...]]:
+    """Spectra of a run's field at new transmitter positions, as an ``.npz`` file.
+
+    Args:
+        folder: run folder with one field.
+        tx_pos_m: positions [m, 3], metres.
+        out: file to write; keys ``row`` (0..m-1), ``prediction`` [n_rx, m, H, W], ``tx_pos`` [m, 3] and
+            ``receiver_name``, as in ``predictions.npz``.
+
+    Returns:
+        Shape of each array in the file.
+
+    Raises:
+        InputError: a run over several blocks, or positions that are not finite.
+    """
+    import io
+
+    predictor = Run(Path(folder)).predictor()
+    prediction = np.stack([predictor(tx_pos_m, r) for r in range(len(predictor.receivers))])
+    arrays = {
+        "row": np.arange(len(tx_pos_m)),
+        "prediction": prediction,
+        "tx_pos": np.asarray(tx_pos_m, float),
+        "receiver_name": np.asarray([r.name for r in predictor.receivers]),
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, buffer.getvalue())
+    return {key: value.shape for key, value in arrays.items()}
+
+
+__all__ = ["CONFIG", "Interrupted", "Run", "evaluate_run", "predict_to_file", "resume", "train"]

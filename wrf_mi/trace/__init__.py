@@ -1,0 +1,40 @@
+"""Ray tracing by Sionna RT: scenes, paths, spectra, and the embedded default data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..core import Record
+from ..measure import load
+from .laboratory import NAME as LABORATORY
+from .laboratory import laboratory_record
+from .materials import set_frequency
+from .paths import SpecularPaths, open_scene, sionna_orientation, trace_paths
+from .spectra import element_signals, trace_spectra
+
+__all__ = [
+    "SpecularPaths",
+    "element_signals",
+    "laboratory_record",
+    "load_record",
+    "open_scene",
+    "set_frequency",
+    "sionna_orientation",
+    "trace_paths",
+    "trace_spectra",
+]
+
+
+def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
+    """Read any data set as `wrf_mi.measure.load` does, and trace the embedded ``laboratory`` where it is asked for.
+
+    Args:
+        name_or_folder: a folder, or a known data set's name.
+        progress: show a progress bar on standard error where tracing takes time.
+
+    Raises:
+        InputError: as `wrf_mi.measure.load`.
+    """
+    if name_or_folder == LABORATORY and not Path(name_or_folder).is_dir():
+        return laboratory_record(progress=progress)
+    return load(name_or_folder)

@@ -1,0 +1,81 @@
+"""Radio materials at a frequency, where Sionna RT's own table ends too.
+
+ITU-R P.2040 gives relative permittivity a f^b and conductivity c f^d (f in GHz) within a frequency range per
+material, and Sionna RT raises an error outside it. Most building materials begin at 1 GHz, just above the
+868 and 915 MHz bands of RFID and IoT.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from ..core import InputError
+
+logger = logging.getLogger(__name__)
+
+BELOW_1_GHZ: Mapping[str, tuple[float, float]] = {
+    "concrete": (5.24, 0.0462),
+    "brick": (3.91, 0.0238),
+    "plasterboard": (2.73, 0.0085),
+    "ceiling_board": (1.48, 0.0011),
+    "chipboard": (2.58, 0.0217),
+    "plywood": (2.71, 0.33),
+    "marble": (7.074, 0.0055),
+    "vinyl_tile": (3.62, 0.0051),
+    "carpet_tile": (2.08, 0.0009),
+    "metal": (1.0, 1e7),
+}
+"""Relative permittivity and conductivity in S/m for 0.3 to 1 GHz: the values of ITU-R P.2040 at 1 GHz, where its range
+begins. Its permittivities do not change with frequency, and its conductivities by 12 % or less down to 0.87 GHz."""
+
+CONSTANTS_FROM_HZ = 0.3e9
+"""Where the constants end: below, the conductivity would be off by more than a factor of three."""
+
+
+def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, float] | None = None) -> None:
+    """Set a Sionna RT scene's frequency, with explicit constants for ITU materials below their range (logged).
+
+    Args:
+        scene: a ``sionna.rt.Scene``.
+        frequency_hz: of the carrier.
+        thickness_m: slab thickness in metres of materials by their name in the scene (``itu_*``); others keep theirs.
+
+    Raises:
+        InputError: a material has neither a range of ITU-R P.2040 nor a constant at this frequency.
+    """
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    constant = []
+    for name, material in scene.radio_materials.items():
+        if thickness_m and name in thickness_m:
+            material.thickness = thickness_m[name]
+        itu_type = getattr(material, "itu_type", None)
+        if itu_type is None:
+            continue
+        ranges_ghz = ITU_MATERIALS_PROPERTIES[itu_type]
+        if any(low <= frequency_hz / 1e9 <= high for low, high in ranges_ghz):
+            continue
+        if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
+            where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in sorted(ranges_ghz))
+            text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
+            raise InputError(f"{text}; choose another material or give it explicit constants")
+        material.frequency_update_callback = _constants(*BELOW_1_GHZ[itu_type])
+        constant.append(itu_type)
+    if constant:
+        logger.info(
+            "%g MHz is below the range of ITU-R P.2040 for %s: constant values of 1 GHz used",
+            frequency_hz / 1e6,
+            ", ".join(sorted(constant)),
+        )
+    scene.frequency = frequency_hz
+
+
+def _constants(permittivity: float, conductivity: float) -> Any:
+    import mitsuba as mi
+
+    def constants(_: Any) -> tuple[Any, Any]:
+        return mi.Float(permittivity), mi.Float(conductivity)
+
+    return constants
