@@ -181,7 +181,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("name", metavar="NAME")
 
     sub = command("train", _train, "fit a field to measured spectra and score it")
-    sub.add_argument("dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder")
+    sub.add_argument(
+        "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
+    )
     sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+"), help="default: wrf-gs+")
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
     sub.add_argument(

@@ -20,12 +20,12 @@ UNIT_QUATERNION_TOLERANCE = 1e-3
 
 def elevation_rad(height: int) -> FloatArray:
     """Elevation of each of ``height`` rows over the upper hemisphere, in radians, shape [height]."""
-    return np.arange(height) * (np.pi / 2 / height)
+    return np.arange(height, dtype=float) * (np.pi / 2 / height)
 
 
 def azimuth_rad(width: int) -> FloatArray:
     """Azimuth of each of ``width`` columns over the full circle, in radians, shape [width]."""
-    return np.arange(width) * (2 * np.pi / width)
+    return np.arange(width, dtype=float) * (2 * np.pi / width)
 
 
 def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> FloatArray:

@@ -1,17 +1,91 @@
-"""Writing a file whole or not at all."""
+"""Writing so that a reader never sees half of it, and reading text with errors that name the line."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+
+
+def one_line(error: object) -> str:
+    """The message of an error of another library, on one line."""
+    return " ".join(str(error).split())
+
+
+def text_lines(path: Path) -> list[str]:
+    """The lines of a UTF-8 text file without line ends, trailing blank lines left out.
+
+    Raises:
+        InputError: the file is missing or not text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing; the folder is not complete") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({one_line(error)}); give a UTF-8 text file") from None
+    return text.rstrip().splitlines()
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that replaces it when the block ends well and vanishes otherwise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
+    """A temporary folder beside ``path`` that takes its name when the block ends well and vanishes otherwise.
+
+    Args:
+        path: the folder to make.
+        replace: let it take the place of an existing one.
+
+    Raises:
+        InputError: ``path`` exists and may not be replaced, or cannot be written.
+    """
+    if path.exists() and not replace:
+        raise InputError(f"{path}: exists; remove it or choose another folder")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({one_line(error)}); choose another folder") from None
+    try:
+        yield part
+        if replace and path.exists():
+            os.replace(path, old)
+        os.replace(part, path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def write_atomically(path: Path, content: bytes | str) -> Path:
-    """Write beside the file and then rename, so that a reader never sees half of it."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        beside.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    """Write a small file whole or not at all."""
+    with atomic_file(path) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> Path:
+    """Write an ``.npz`` file of plain arrays whole or not at all."""
+    with atomic_file(path) as part, part.open("wb") as stream:
+        save: Any = np.savez_compressed if compressed else np.savez
+        save(stream, **arrays)
     return path

@@ -49,7 +49,7 @@ def logit(p: float) -> float:
 
 def adapt(
     parameters: Arrays,
-    urge: NDArray[np.float32],
+    urge: NDArray[np.floating],
     distance_m: NDArray[np.float64],
     rng: np.random.Generator,
     grow: float,
@@ -77,7 +77,7 @@ def adapt(
         # A field without Gaussians could never recover: the strongest stays.
         keep[np.argmax(parameters["opacity"][0] if "opacity" in parameters else urge)] = True
     alive = np.flatnonzero(keep)
-    room = max(0, min(int(round(grow * len(alive))), most - len(alive)))
+    room = max(0, min(round(grow * len(alive)), most - len(alive)))
     growing = alive[np.argsort(-urge[alive], kind="stable")[:room]]
     size = np.exp(parameters["log_scale"].max(axis=0)) / distance_m
     split = growing[size[growing] > split_rad]

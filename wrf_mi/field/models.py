@@ -85,7 +85,7 @@ class WrfGs:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
-        batch, n = tx_pos.shape[1], params["position"].shape[1]
+        batch = tx_pos.shape[1]
         hidden = relu(linear(params, "attenuation.0", self.encoding.position(params["position"]), "position"))
         for i in range(1, self.layers):
             hidden = relu(linear(params, f"attenuation.{i}", hidden))
@@ -93,9 +93,7 @@ class WrfGs:
         re, im = rows(z)
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
         seen = relu(
-            linear_of_pairs(
-                params, "signal.0", {"feature": hidden}, {"transmitter": self.encoding.transmitter(tx_pos)}
-            )
+            linear_of_pairs(params, "signal.0", {"feature": hidden}, {"transmitter": self.encoding.transmitter(tx_pos)})
         )
         signal = linear(params, "signal.out", relu(linear(params, "signal.1", seen)))
         return Gaussians(
@@ -146,9 +144,9 @@ class WrfGsPlus:
         batch = tx_pos.shape[1]
         position = {"position": self.encoding.position(params["position"])}
         transmitter = {"transmitter": self.encoding.transmitter(tx_pos)}
-        hidden = None
-        for i in range(self.layers):
-            if i in (0, self.skip):
+        hidden = relu(linear_of_pairs(params, "deform.0", position, transmitter))
+        for i in range(1, self.layers):
+            if i == self.skip:
                 hidden = relu(linear_of_pairs(params, f"deform.{i}", position, transmitter, hidden))
             else:
                 hidden = relu(linear(params, f"deform.{i}", hidden))

@@ -37,7 +37,10 @@ def linear(params: Params, name: str, x: dr.ArrayBase, part: str = "hidden") -> 
 
 
 def linear_of_pairs(
-    params: Params, name: str, per_gaussian: Mapping[str, dr.ArrayBase], per_transmitter: Mapping[str, dr.ArrayBase],
+    params: Params,
+    name: str,
+    per_gaussian: Mapping[str, dr.ArrayBase],
+    per_transmitter: Mapping[str, dr.ArrayBase],
     hidden: dr.ArrayBase | None = None,
 ) -> dr.ArrayBase:
     """Affine map of the concatenation of parts, for every pair of a transmitter and a Gaussian.
@@ -62,7 +65,7 @@ def linear_of_pairs(
     transmitter = [params[f"{name}.{k}"] @ v for k, v in per_transmitter.items() if v.shape[0]]
     n = next(iter(per_gaussian.values())).shape[1]
     batch = next(iter(per_transmitter.values())).shape[1]
-    total = dr.reshape(sum(gaussian[1:], gaussian[0]) + bias, (outputs, 1, n))
+    total: dr.ArrayBase = dr.reshape(sum(gaussian[1:], gaussian[0]) + bias, (outputs, 1, n))
     if transmitter:
         total = total + dr.reshape(sum(transmitter[1:], transmitter[0]), (outputs, batch, 1))
     total = dr.reshape(total, (outputs, batch * n))

@@ -11,7 +11,6 @@ Every file appears whole or not at all.
 from __future__ import annotations
 
 import importlib.metadata
-import io
 import json
 import platform
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..backend import init
 from ..core import InputError, Receiver, Record, Split
-from ..core.files import write_atomically
+from ..core.files import write_arrays, write_atomically
 from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
 from .predictor import Predictor
@@ -110,9 +109,7 @@ def write_checkpoint(folder: Path, trainer: Trainer) -> None:
         "receiver_position_m": np.stack([r.position_m for r in receivers]),
         "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in receivers]),
     }
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    write_atomically(folder / CHECKPOINT, buffer.getvalue())
+    write_arrays(folder / CHECKPOINT, arrays)
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
@@ -158,7 +155,9 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
         InputError: the folder holds something already.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}")
+        raise InputError(
+            f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}"
+        )
     trainer = Trainer(record, split, run.settings)
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)

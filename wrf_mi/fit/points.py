@@ -28,7 +28,7 @@ def read_points(path: str | Path) -> NDArray[np.float64]:
             with np.load(file, allow_pickle=False) as arrays:
                 points = arrays["points"]
         else:
-            points = trimesh.load(file).vertices
+            points = getattr(trimesh.load(file), "vertices", np.empty((0, 3)))
     except (ValueError, KeyError, AttributeError, OSError, NotImplementedError) as error:
         raise InputError(f"{file}: no points to be read ({error}); give .ply, .xyz, or .npz with points") from None
     points = np.asarray(points, float)

@@ -67,5 +67,7 @@ class Predictor:
         out = np.empty((len(positions), height, width), np.float32)
         for image, position in zip(out, positions, strict=True):
             tx = mi.TensorXf(np.ascontiguousarray(position[:, None]))
-            image[:] = self._predict(self._params, tx, self._poses[receiver], self._plane).numpy().reshape(height, width)
+            image[:] = (
+                self._predict(self._params, tx, self._poses[receiver], self._plane).numpy().reshape(height, width)
+            )
         return out

@@ -42,7 +42,7 @@ def plan(config: TrainConfig, split: Split, receivers: int) -> Schedule:
         InputError: fewer training rows than a batch needs.
     """
     steps, batch = config.steps, config.batch
-    joined = steps if config.hold_out >= 1 else int(round(config.hold_out * steps))
+    joined = steps if config.hold_out >= 1 else round(config.hold_out * steps)
     for rows in (split.train, split.all_train):
         if len(rows) < batch:
             raise InputError(f"{len(rows)} training rows for batches of {batch}: choose a smaller batch")

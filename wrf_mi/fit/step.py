@@ -112,8 +112,15 @@ def make_step(field: Field, rates: Mapping[str, float], structural_weight: float
 
     @dr.freeze
     def step(
-        adam: Adam, mean: Params, data: TrainingData, rows: Any, receiver: Any, pose: Pose, plane: Plane,
-        factor: Any, decay: Any,
+        adam: Adam,
+        mean: Params,
+        data: TrainingData,
+        rows: Any,
+        receiver: Any,
+        pose: Pose,
+        plane: Plane,
+        factor: Any,
+        decay: Any,
     ) -> tuple[Params, StepReport]:
         # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
         adam.set_learning_rate({name: factor * rates[name] for name in rates})

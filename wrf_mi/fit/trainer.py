@@ -210,9 +210,7 @@ class Trainer:
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / (state.step - first) * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
-                listen(
-                    Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left)
-                )
+                listen(Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left))
                 losses, since = dr.zeros(mi.Float), 0
             if state.step % config.checkpoint_every == 0 and not last:
                 save()

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..core import InputError
-from .files import atomic_folder, one_line
+from ..core.files import atomic_folder, one_line
 from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, remote_files
 
 THREADS = 8

@@ -25,8 +25,8 @@ from PIL import Image
 
 from ..core import InputError, Receiver, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.files import atomic_folder, one_line, text_lines
 from ..core.types import IntArray
-from .files import atomic_folder, one_line, text_lines
 
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""

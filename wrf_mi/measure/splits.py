@@ -9,8 +9,8 @@ import numpy as np
 from scipy.cluster.vq import ClusterError, kmeans2
 
 from ..core import InputError, Record, Split
+from ..core.files import one_line, write_arrays
 from ..core.types import IntArray
-from .files import atomic_file, one_line
 
 SPLIT_NAMES = ("official", "random", "blocked", "trajectory")
 TRAIN_FRACTION = 0.8
@@ -72,16 +72,15 @@ def save_split(path: str | Path, split: Split) -> None:
 
     Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0).
     """
-    with atomic_file(Path(path)) as part, part.open("wb") as file:
-        np.savez(
-            file,
-            format=np.int64(SPLIT_FORMAT),
-            name=np.str_(split.name),
-            seed=np.int64(split.seed),
-            train=split.train,
-            validation=split.validation,
-            test=split.test,
-        )
+    arrays = {
+        "format": np.int64(SPLIT_FORMAT),
+        "name": np.str_(split.name),
+        "seed": np.int64(split.seed),
+        "train": split.train,
+        "validation": split.validation,
+        "test": split.test,
+    }
+    write_arrays(Path(path), arrays)
 
 
 def load_split(path: str | Path) -> Split:

@@ -13,6 +13,7 @@ which equals the paper's form to first order at low elevation and knows neither 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 
@@ -58,7 +59,7 @@ def _dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
 def _tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
     """Two unit vectors perpendicular to n and to each other (Duff et al. 2017, J. Comput. Graph. Techn. 6)."""
     x, y, z = n
-    sign = dr.copysign(type(z)(1), dr.detach(z))
+    sign: Any = dr.copysign(type(z)(1), dr.detach(z))
     a = -dr.rcp(sign + z)
     b = x * y * a
     return [dr.fma(sign * x * x, a, 1), sign * b, -sign * x], [b, dr.fma(y * y, a, sign), -y]

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from . import figures
 from wrf_mi.core.files import write_atomically
+
+from . import figures
 from .run_folder import Run, read_runs
 
 QUANTILES = (0.1, 0.5, 0.9)

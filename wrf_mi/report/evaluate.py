@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import numpy as np
 from ..baselines.idw import InverseDistance
 from ..core import Record, Split
 from ..core.angles import FloatArray
-from ..core.files import write_atomically
+from ..core.files import write_arrays, write_atomically
 from .metrics import ssim, summary
 from .run_folder import METRICS, PREDICTIONS, Spectra
 
@@ -99,7 +98,7 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
     arrays["receiver_name"] = every[0]["receiver_name"]
     blocks = [metrics for metrics, _ in parts]
     metrics = score(arrays) | {
-        "n_train": int(round(np.mean([m["n_train"] for m in blocks]))),
+        "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
     return metrics, arrays
@@ -107,7 +106,5 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
     """Write ``predictions.npz`` and then ``metrics.json``, which marks the run as finished."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_atomically(folder / PREDICTIONS, buffer.getvalue())
+    write_arrays(folder / PREDICTIONS, arrays, compressed=True)
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")

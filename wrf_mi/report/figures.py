@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from wrf_mi.core.angles import azimuth_rad, elevation_rad
-
 from wrf_mi.core.files import write_atomically
 
 PANEL_IN = 2.3

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core import InputError, Record, Split
-from ..core.files import write_atomically
+from ..core.files import write_arrays
 from ..fit.config import TrainConfig
 from ..fit.folder import (
     RunConfig,
@@ -116,8 +116,9 @@ def train(
     return _fit_folds(folder, record, splits, run, listen, stop)
 
 
-def resume(folder: str | Path, listen: Listen = lambda fold, steps, progress: None,
-           stop: Callable[[], bool] = lambda: False) -> Run:
+def resume(
+    folder: str | Path, listen: Listen = lambda fold, steps, progress: None, stop: Callable[[], bool] = lambda: False
+) -> Run:
     """Go on with a run that was stopped, from its last checkpoint to the end; a finished one is only scored again.
 
     Raises:
@@ -234,21 +235,15 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
     Raises:
         InputError: a run over several blocks, or positions that are not finite.
     """
-    import io
-
     predictor = Run(Path(folder)).predictor()
     prediction = np.stack([predictor(tx_pos_m, r) for r in range(len(predictor.receivers))])
-    arrays = {
+    arrays: dict[str, Any] = {
         "row": np.arange(len(tx_pos_m)),
         "prediction": prediction,
         "tx_pos": np.asarray(tx_pos_m, float),
         "receiver_name": np.asarray([r.name for r in predictor.receivers]),
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    path = Path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, buffer.getvalue())
+    write_arrays(Path(out), arrays, compressed=True)
     return {key: value.shape for key, value in arrays.items()}
 
 

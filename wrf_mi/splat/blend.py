@@ -15,13 +15,14 @@ does not grow with the number of layers.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ..project.footprint import Footprints
 from ..project.footprint_constants import CUTOFF, MIN_COSINE
-from .tiles import Plane, TileLists
+from .tiles import LANE_ROWS, Plane, TileLists
 
 RECORD = 16
 """Floats per Gaussian in the packed table: n, a, b (3 each), then blending attributes; one cache line."""
@@ -45,121 +46,224 @@ def _pack(columns: list[Any]) -> Any:
     return table
 
 
-def _footprint(record: list[Any], u: list[Any]) -> tuple[Any, Any, Any, Any]:
-    """Footprint G' at unit vectors ``u``, the whitened coordinates p, q and 1 / (n . u)."""
-    nx, ny, nz, ax, ay, az, bx, by, bz = record[:9]
-    cosine = dr.fma(nx, u[0], dr.fma(ny, u[1], nz * u[2]))
-    inverse = dr.rcp(cosine)
-    p = dr.fma(ax, u[0], dr.fma(ay, u[1], az * u[2])) * inverse
-    q = dr.fma(bx, u[0], dr.fma(by, u[1], bz * u[2])) * inverse
+def _read(table: Any, i: Any, count: int) -> list[Any]:
+    return [dr.gather(type(table), table, i * RECORD + k) for k in range(count)]
+
+
+def _along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
+    """What n . u, a . u and b . u are in terms of elevation: pairs (factor of its cosine, factor of its sine).
+
+    All pixels of a lane share their azimuth.
+    """
+    cosine, sine = azimuth
+    return [[dr.fma(x, cosine, y * sine), z] for x, y, z in (record[0:3], record[3:6], record[6:9])]
+
+
+def _footprint(along: list[Any], elevation: list[Any]) -> tuple[Any, Any, Any, Any]:
+    """Footprint G' at one elevation, the whitened coordinates p, q and 1 / (n . u)."""
+    cosine, sine = elevation
+    facing, p, q = (dr.fma(h, cosine, z * sine) for h, z in along)
+    inverse = dr.rcp(facing)
+    p, q = p * inverse, q * inverse
     square = dr.fma(p, p, q * q)
-    inside = (cosine > MIN_COSINE) & (square < CUTOFF * CUTOFF)
+    inside = (facing > MIN_COSINE) & (square < CUTOFF * CUTOFF)
     return dr.select(inside, dr.exp2(-0.5 * LOG2_E * square), 0), p, q, inverse
 
 
-def _read(table: Any, i: Any, count: int) -> list[Any]:
-    return [dr.gather(type(table), table, i * RECORD + k) for k in range(count)]
+@dataclass
+class _Lanes:
+    """The pixels of all transmitters, in lanes."""
+
+    azimuth: list[Any]
+    elevation: list[list[Any]]
+    pixel: list[Any]
+    active: list[Any]
+    start: Any
+    end: Any
+
+
+def _lanes(plane: Plane, lists: TileLists, n: int, batch: int) -> _Lanes:
+    index_type = type(lists.index)
+    lane = dr.arange(index_type, batch * plane.lanes)
+    inner, b = lane % plane.lanes, lane // plane.lanes
+
+    def of(array: Any) -> Any:
+        return dr.gather(type(array), array, inner)
+
+    tile = b * plane.tiles + of(plane.tile)
+    return _Lanes(
+        azimuth=[of(a) for a in plane.azimuth],
+        elevation=[[of(c) for c in e] for e in plane.elevation],
+        pixel=[b * plane.pixels + of(p) for p in plane.pixel],
+        active=[of(a) for a in plane.active],
+        start=tile * n,
+        end=dr.gather(index_type, lists.length, tile),
+    )
+
+
+@dataclass
+class _Sum:
+    """Blending so far, for each pixel of a lane: sum (re, im) and transmittance (t_re, t_im)."""
+
+    re: list[Any]
+    im: list[Any]
+    t_re: list[Any]
+    t_im: list[Any]
+
+
+def _add(record: list[Any], weights: list[Any], so_far: _Sum, product: bool) -> _Sum:
+    """One more Gaussian, behind all before it."""
+    pixels = list(zip(weights, so_far.re, so_far.im, so_far.t_re, so_far.t_im, strict=True))
+    if product:
+        s_re, s_im, d_re, d_im = record[9:]
+        factors = [(1 - g * (1 - d_re), g * d_im) for g in weights]
+        return _Sum(
+            re=[re + g * (s_re * x - s_im * y) for g, re, _, x, y in pixels],
+            im=[im + g * (s_re * y + s_im * x) for g, _, im, x, y in pixels],
+            t_re=[x * u - y * v for (u, v), (_, _, _, x, y) in zip(factors, pixels, strict=True)],
+            t_im=[x * v + y * u for (u, v), (_, _, _, x, y) in zip(factors, pixels, strict=True)],
+        )
+    s_re, s_im, opacity = record[9:]
+    return _Sum(
+        re=[dr.fma(t * opacity * g, s_re, re) for g, re, _, t, _ in pixels],
+        im=[dr.fma(t * opacity * g, s_im, im) for g, _, im, t, _ in pixels],
+        t_re=[dr.fma(-t, opacity * g, t) for g, _, _, t, _ in pixels],
+        t_im=so_far.t_im,
+    )
 
 
 @dr.syntax
 def _forward(table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int) -> tuple[Any, Any]:
     float_type, index_type = type(table), type(lists.index)
-    slots = dr.width(plane.tile)
-    slot = dr.arange(index_type, batch * slots)
-    inner, b = slot % slots, slot // slots
-    u = [dr.gather(float_type, d, inner) for d in plane.direction]
-    tile = b * plane.tiles + dr.gather(index_type, plane.tile, inner)
-    end, start, j = dr.gather(index_type, lists.length, tile), tile * n, index_type(0)
-    re, im = float_type(0), float_type(0)
-    t_re, t_im = float_type(1), float_type(0)
-    while j < end:
-        i = dr.gather(index_type, lists.index, start + j)
-        record = _read(table, i, 13 if product else 12)
-        g, _, _, _ = _footprint(record, u)
-        if dr.hint(product, mode="scalar"):
-            s_re, s_im, d_re, d_im = record[9:]
-            re += g * (s_re * t_re - s_im * t_im)
-            im += g * (s_re * t_im + s_im * t_re)
-            b_re, b_im = 1 - g * (1 - d_re), g * d_im
-            next_re = t_re * b_re - t_im * b_im
-            t_im = t_re * b_im + t_im * b_re
-            t_re = next_re
-        else:
-            s_re, s_im, opacity = record[9:]
-            alpha = opacity * g
-            weight = t_re * alpha
-            re += weight * s_re
-            im += weight * s_im
-            t_re *= 1 - alpha
+    lanes = _lanes(plane, lists, n, batch)
+    fields = 13 if product else 12
+    state = _start(float_type)
+    j = index_type(0)
+    while j < lanes.end:
+        record = _read(table, dr.gather(index_type, lists.index, lanes.start + j), fields)
+        along = _along_azimuth(record, lanes.azimuth)
+        state = _add(record, [_footprint(along, e)[0] for e in lanes.elevation], state, product)
         j += 1
-    target = b * plane.pixels + dr.gather(index_type, plane.pixel, inner)
-    active = dr.gather(dr.mask_t(float_type), plane.active, inner)
-    out_re, out_im = (dr.zeros(float_type, batch * plane.pixels) for _ in range(2))
-    dr.scatter(out_re, re, target, active)
-    dr.scatter(out_im, im, target, active)
+    out_re, out_im = dr.zeros(float_type, batch * plane.pixels), dr.zeros(float_type, batch * plane.pixels)
+    for k in range(LANE_ROWS):
+        dr.scatter(out_re, state.re[k], lanes.pixel[k], lanes.active[k])
+        dr.scatter(out_im, state.im[k], lanes.pixel[k], lanes.active[k])
     return out_re, out_im
+
+
+def _start(float_type: Any) -> _Sum:
+    def each(value: float) -> list[Any]:
+        return [float_type(value) for _ in range(LANE_ROWS)]
+
+    return _Sum(each(0), each(0), each(1), each(0))
+
+
+def _behind_product(
+    record: list[Any], g: Any, t: tuple[Any, Any], q: tuple[Any, Any], gradient: tuple[Any, Any]
+) -> tuple[Any, list[Any], tuple[Any, Any], tuple[Any, Any]]:
+    """One pixel's derivatives under product blending: by G', by (S, delta), and the next T and Q."""
+    (t_re, t_im), (q_re, q_im), (g_re, g_im) = t, q, gradient
+    s_re, s_im, d_re, d_im = record[9:]
+    # c = conj(gradient) S T, so that Re(c) is the derivative by a real weight.
+    a_re, a_im = g_re * t_re + g_im * t_im, g_re * t_im - g_im * t_re
+    c_re, c_im = s_re * a_re - s_im * a_im, s_re * a_im + s_im * a_re
+    q_re, q_im = q_re - g * c_re, q_im - g * c_im
+    b_re, b_im = 1 - g * (1 - d_re), g * d_im
+    scale = dr.rcp(dr.maximum(b_re * b_re + b_im * b_im, SMALLEST_FACTOR**2))
+    # conj(gradient) Q / b
+    f_re, f_im = (q_re * b_re + q_im * b_im) * scale, (q_im * b_re - q_re * b_im) * scale
+    d_g = c_re - f_re * (1 - d_re) - f_im * d_im
+    following = (t_re * b_re - t_im * b_im, t_re * b_im + t_im * b_re)
+    return d_g, [g * a_re, -g * a_im, g * f_re, -g * f_im], following, (q_re, q_im)
+
+
+def _behind_alpha(
+    record: list[Any], g: Any, t: tuple[Any, Any], q: tuple[Any, Any], gradient: tuple[Any, Any]
+) -> tuple[Any, list[Any], tuple[Any, Any], tuple[Any, Any]]:
+    """One pixel's derivatives under alpha blending: by G', by (S, o), and the next T and Q (real parts)."""
+    t_re, q_re = t[0], q[0]
+    s_re, s_im, opacity = record[9:]
+    alpha = opacity * g
+    weight = t_re * alpha
+    c = gradient[0] * s_re + gradient[1] * s_im
+    q_re = q_re - weight * c
+    d_alpha = t_re * c - q_re * dr.rcp(dr.maximum(1 - alpha, SMALLEST_FACTOR))
+    extra = [weight * gradient[0], weight * gradient[1], d_alpha * g]
+    return d_alpha * opacity, extra, (dr.fma(-t_re, alpha, t_re), t[1]), (q_re, q[1])
+
+
+@dataclass
+class _Rest:
+    """The reverse pass so far, for each pixel of a lane: transmittance and what lies behind, as pairs (re, im)."""
+
+    t: list[tuple[Any, Any]]
+    q: list[tuple[Any, Any]]
+
+
+def _before(
+    lanes: _Lanes, total: tuple[Any, Any], gradient: tuple[Any, Any], float_type: Any
+) -> tuple[list[tuple[Any, Any]], _Rest]:
+    """Gradient of each pixel, and the rest before the first Gaussian."""
+    slope, t, q = [], [], []
+    for pixel, active in zip(lanes.pixel, lanes.active, strict=True):
+        # Pixels that pad the plane have no gradient and so add nothing.
+        g_re, g_im, r_re, r_im = (dr.gather(float_type, a, pixel, active) for a in (*gradient, *total))
+        slope.append((g_re, g_im))
+        # What lies behind, times the conjugate of the gradient; alpha blending needs its real part alone.
+        q.append((g_re * r_re + g_im * r_im, g_re * r_im - g_im * r_re))
+        t.append((float_type(1), float_type(0)))
+    return slope, _Rest(t, q)
+
+
+def _take_away(
+    record: list[Any], lanes: _Lanes, rest: _Rest, slope: list[tuple[Any, Any]], product: bool
+) -> tuple[list[Any], Any, _Rest]:
+    """One Gaussian's derivatives by its record, summed over the lane's pixels; whether any pixel sees it; the rest."""
+    behind = _behind_product if product else _behind_alpha
+    along = _along_azimuth(record, lanes.azimuth)
+    sums: list[list[Any]] = [[0, 0] for _ in range(3)]
+    extra: list[Any] = [0 for _ in record[9:]]
+    t, q, seen = [], [], False
+    for k, elevation in enumerate(lanes.elevation):
+        g, x, y, inverse = _footprint(along, elevation)
+        d_g, own, next_t, next_q = behind(record, g, rest.t[k], rest.q[k], slope[k])
+        t.append(next_t)
+        q.append(next_q)
+        f = dr.select(g > 0, -d_g * g * inverse, 0)
+        d_x, d_y = f * x, f * y
+        for pair, d in zip(sums, (-(d_x * x + d_y * y), d_x, d_y), strict=True):
+            pair[0], pair[1] = dr.fma(d, elevation[0], pair[0]), dr.fma(d, elevation[1], pair[1])
+        extra = [e + o for e, o in zip(extra, own, strict=True)]
+        seen |= g > 0
+    cosine, sine = lanes.azimuth
+    vectors = [c for level, up in sums for c in (level * cosine, level * sine, up)]
+    return [*vectors, *extra], seen, _Rest(t, q)
 
 
 @dr.syntax
 def _backward(
-    table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int,
-    total: tuple[Any, Any], gradient: tuple[Any, Any],
+    table: Any,
+    lists: TileLists,
+    plane: Plane,
+    n: int,
+    product: bool,
+    batch: int,
+    total: tuple[Any, Any],
+    gradient: tuple[Any, Any],
 ) -> Any:
     """Gradient table [batch * n * RECORD] in the layout of ``table``."""
     float_type, index_type = type(table), type(lists.index)
-    slots = dr.width(plane.tile)
-    slot = dr.arange(index_type, batch * slots)
-    inner, b = slot % slots, slot // slots
-    u = [dr.gather(float_type, d, inner) for d in plane.direction]
-    tile = b * plane.tiles + dr.gather(index_type, plane.tile, inner)
-    end, start, j = dr.gather(index_type, lists.length, tile), tile * n, index_type(0)
-    pixel = b * plane.pixels + dr.gather(index_type, plane.pixel, inner)
-    active = dr.gather(dr.mask_t(float_type), plane.active, inner)
-    # Slots that pad the plane have no gradient and so add nothing.
-    g_re = dr.gather(float_type, gradient[0], pixel, active)
-    g_im = dr.gather(float_type, gradient[1], pixel, active)
-    # What lies behind, times the conjugate of the gradient: real for alpha blending, complex for product.
-    r_re, r_im = dr.gather(float_type, total[0], pixel, active), dr.gather(float_type, total[1], pixel, active)
-    q_re, q_im = g_re * r_re + g_im * r_im, g_re * r_im - g_im * r_re
-    t_re, t_im = float_type(1), float_type(0)
+    lanes = _lanes(plane, lists, n, batch)
+    slope, rest = _before(lanes, total, gradient, float_type)
+    fields = 13 if product else 12
     out = dr.zeros(float_type, dr.width(table))
     dr.eval(out)
-    while j < end:
-        i = dr.gather(index_type, lists.index, start + j)
-        record = _read(table, i, 13 if product else 12)
-        g, p, q, inverse = _footprint(record, u)
-        if dr.hint(product, mode="scalar"):
-            s_re, s_im, d_re, d_im = record[9:]
-            # c = conj(gradient) S T, so that Re(c) is the derivative by a real weight.
-            a_re, a_im = g_re * t_re + g_im * t_im, g_re * t_im - g_im * t_re
-            c_re, c_im = s_re * a_re - s_im * a_im, s_re * a_im + s_im * a_re
-            q_re -= g * c_re
-            q_im -= g * c_im
-            b_re, b_im = 1 - g * (1 - d_re), g * d_im
-            scale = dr.rcp(dr.maximum(b_re * b_re + b_im * b_im, SMALLEST_FACTOR**2))
-            # conj(gradient) Q / b
-            f_re, f_im = (q_re * b_re + q_im * b_im) * scale, (q_im * b_re - q_re * b_im) * scale
-            d_g = c_re - f_re * (1 - d_re) - f_im * d_im
-            extra = [g * a_re, -g * a_im, g * f_re, -g * f_im]
-            next_re = t_re * b_re - t_im * b_im
-            t_im = t_re * b_im + t_im * b_re
-            t_re = next_re
-        else:
-            s_re, s_im, opacity = record[9:]
-            alpha = opacity * g
-            weight = t_re * alpha
-            c_re = g_re * s_re + g_im * s_im
-            q_re -= weight * c_re
-            d_alpha = t_re * c_re - q_re * dr.rcp(dr.maximum(1 - alpha, SMALLEST_FACTOR))
-            d_g = d_alpha * opacity
-            extra = [weight * g_re, weight * g_im, d_alpha * g]
-            t_re *= 1 - alpha
-        f = -d_g * g * inverse
-        d_p, d_q = f * p, f * q
-        d_n = -(d_p * p + d_q * q)
-        hit = active & (g > 0)
-        for k, value in enumerate([d * c for d in (d_n, d_p, d_q) for c in u] + extra):
-            dr.scatter_reduce(dr.ReduceOp.Add, out, value, i * RECORD + k, hit, mode=dr.ReduceMode.Local)
+    j = index_type(0)
+    while j < lanes.end:
+        i = dr.gather(index_type, lists.index, lanes.start + j)
+        values, seen, rest = _take_away(_read(table, i, fields), lanes, rest, slope, product)
+        for k in range(fields):
+            dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=dr.ReduceMode.Local)
         j += 1
     return out
 
@@ -177,7 +281,7 @@ class _Blend(dr.CustomOp):
         return self.total
 
     def backward(self) -> None:
-        gradient = tuple(self.grad_out())
+        gradient: Any = self.grad_out()
         dr.eval(gradient)
         out = _backward(self.table, *self.parts, self.total, gradient)
         dr.eval(out)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
-
 from ..field.gaussians import Gaussians
 from ..project.footprint import Pose, depth_order, project
 from .blend import blend
@@ -26,6 +24,4 @@ def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
     footprints = project(gaussians, pose)
     order = depth_order(footprints.depth, gaussians.position)
     lists = build_lists(footprints, order, plane, gaussians.batch)
-    return blend(
-        footprints, gaussians.signal, lists, plane, gaussians.batch, gaussians.opacity, gaussians.attenuation
-    )
+    return blend(footprints, gaussians.signal, lists, plane, gaussians.batch, gaussians.opacity, gaussians.attenuation)
