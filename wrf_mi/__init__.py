@@ -1,3 +1,73 @@
-"""wrf_mi: learned wireless radiation fields and ray tracing in one differentiable program."""
+"""wrf_mi: learned wireless radiation fields and ray tracing in one differentiable program.
+
+The names below are the library in short; everything else is in the packages. They are imported when first
+used, so that ``import wrf_mi`` costs nothing and the backend can be chosen before (`wrf_mi.backend.init`).
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .core import BackendError, InputError, Receiver, Record, Split
+    from .fit.config import TrainConfig, with_settings
+    from .fit.trainer import Trainer
+    from .measure import fetch, make_splits
+    from .report.compare import compare
+    from .report.figures import spectrum_table
+    from .report.runs import Run, evaluate_run, resume, train
+    from .trace import load_record as load
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "BackendError": "core",
+    "InputError": "core",
+    "Receiver": "core",
+    "Record": "core",
+    "Run": "report.runs",
+    "Split": "core",
+    "TrainConfig": "fit.config",
+    "Trainer": "fit.trainer",
+    "compare": "report.compare",
+    "evaluate_run": "report.runs",
+    "fetch": "measure",
+    "load": "trace:load_record",
+    "make_splits": "measure",
+    "resume": "report.runs",
+    "spectrum_table": "report.figures",
+    "train": "report.runs",
+    "with_settings": "fit.config",
+}
+
+__all__ = [
+    "BackendError",
+    "InputError",
+    "Receiver",
+    "Record",
+    "Run",
+    "Split",
+    "TrainConfig",
+    "Trainer",
+    "compare",
+    "evaluate_run",
+    "fetch",
+    "load",
+    "make_splits",
+    "resume",
+    "spectrum_table",
+    "train",
+    "with_settings",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _HOME[name].partition(":")
+    return getattr(importlib.import_module(f".{module}", __name__), attribute or name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -16,12 +16,13 @@ from drjit.opt import Adam
 
 from ..core import Receiver
 from ..field.models import WrfGs, WrfGsPlus
-from ..loss.spectrum import spectrum_loss
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.tiles import Plane
 
 Field = WrfGs | WrfGsPlus
+Loss = Callable[[Any, Any, int, int, int], Any]
+"""``loss(prediction, truth, batch, height, width)`` of flat arrays, a Dr.Jit float of one value."""
 Params = dict[str, Any]
 
 DARK = 1e-8
@@ -97,13 +98,13 @@ def watched(name: str) -> bool:
     return "." not in name or name.endswith(".bias")
 
 
-def make_step(field: Field, rates: Mapping[str, float], structural_weight: float) -> Callable[..., Any]:
+def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callable[..., Any]:
     """A recorded optimiser step.
 
     Args:
         field: the model.
         rates: learning rate of each parameter.
-        structural_weight: eta of the loss.
+        loss_of: loss of a batch.
 
     Returns:
         ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay) -> (mean, StepReport)``. It takes
@@ -128,7 +129,7 @@ def make_step(field: Field, rates: Mapping[str, float], structural_weight: float
         tx_pos, truth = data.select(rows, receiver, plane)
         batch = dr.width(rows)
         prediction = grey(field, params, tx_pos, pose, plane)
-        loss, _ = spectrum_loss(prediction, truth, batch, plane.height, plane.width, structural_weight)
+        loss = loss_of(prediction, truth, batch, plane.height, plane.width)
         dr.backward(loss)
         health = dr.detach(loss)
         for name in params:

@@ -7,6 +7,8 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians, gaussians_from_points, random_gaussians
 from ..field.density import adapt, reset_opacity
+from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
 from ..splat.tiles import perception_plane
 from .config import TrainConfig
@@ -23,7 +26,7 @@ from .points import read_points
 from .predictor import Predictor
 from .schedule import plan
 from .state import FitState
-from .step import Field, TrainingData, device_pose, make_step, watched
+from .step import Field, Loss, TrainingData, device_pose, make_step, watched
 
 
 class NumericsError(RuntimeError):
@@ -68,6 +71,10 @@ def make_field(config: TrainConfig) -> Field:
     return FIELDS[config.model](encoding=encoding)
 
 
+def _paper_loss(prediction: Any, truth: Any, batch: int, height: int, width: int, eta: float) -> Any:
+    return spectrum_loss(prediction, truth, batch, height, width, eta)[0]
+
+
 def _initial(config: TrainConfig, record: Record, rng: np.random.Generator) -> InitialGaussians:
     i = config.initial
     if i.points:
@@ -90,23 +97,36 @@ class Trainer:
         record: spectra [n_rx, n, height, width].
         split: which rows train and which choose.
         config: settings.
+        field: a model of your own in place of the one that ``config.model`` names.
+        initial: starting values in place of those that ``config.initial`` describes.
+        loss: in place of the paper's: ``loss(prediction, truth, batch, height, width)`` of flat Dr.Jit arrays.
 
     Raises:
         InputError: settings or data that cannot be trained on.
     """
 
-    def __init__(self, record: Record, split: Split, config: TrainConfig) -> None:
+    def __init__(
+        self,
+        record: Record,
+        split: Split,
+        config: TrainConfig,
+        *,
+        field: Field | None = None,
+        initial: InitialGaussians | None = None,
+        loss: Loss | None = None,
+    ) -> None:
         if record.task != "spectrum":
             raise InputError(f"{record.name}: task {record.task!r}; this trainer fits spectra")
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
-        self.field = make_field(config)
+        self.field = field or make_field(config)
+        self._loss = loss or partial(_paper_loss, eta=config.structural_weight)
         self.schedule = plan(config, split, len(record.receivers))
         if config.deterministic:
             # Parallel sums add in the order in which threads finish.
             dr.set_thread_count(1)
-        self._rng = np.random.default_rng([config.seed, 0])
-        self.state = FitState(self.field.init(_initial(config, record, self._rng), self._rng))
+        rng = np.random.default_rng([config.seed, 0])
+        self.state = FitState(self.field.init(initial or _initial(config, record, rng), rng))
         self._poses = [device_pose(r) for r in record.receivers]
         self._plane = perception_plane(self.height, self.width, mi.Float)
         self._data = TrainingData(
@@ -122,7 +142,7 @@ class Trainer:
         Dr.Jit replays a recording for arrays of other sizes where it believes that only sizes differ, but the
         number of Gaussians also stands in the kernels as a constant.
         """
-        self._step = make_step(self.field, self._rates(), self.config.structural_weight)
+        self._step = make_step(self.field, self._rates(), self._loss)
         self._predictor: Predictor | None = None
 
     def _rates(self) -> dict[str, float]:
