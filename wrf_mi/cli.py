@@ -135,8 +135,7 @@ def _compare(a: Arguments) -> int:
 def _bench(a: Arguments) -> int:
     from .report.bench import CASES, bench
 
-    with _watch() as watch:
-        rows = bench(a.names or list(CASES), Path(a.out), Path(a.runs), watch.listen, watch.stop)
+    rows = bench(a.names or list(CASES), Path(a.out), Path(a.runs))
     if a.json:
         _print_json(rows)
     return 0

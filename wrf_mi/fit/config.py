@@ -113,6 +113,8 @@ class TrainConfig:
         hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
             to the end, as every choice of settings must; less ends with a fit on all training rows.
         structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
+        jitter_m: deviation of a random offset added to each transmitter position in training, metres: a field
+            that is asked for the same spectrum within it cannot memorise positions.
         checkpoint_every: steps between two checkpoints.
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
@@ -125,6 +127,7 @@ class TrainConfig:
     deterministic: bool = False
     hold_out: float = 0.7
     structural_weight: float = 0.2
+    jitter_m: float = 0.0
     checkpoint_every: int = 2000
     log_every: int = 100
     validate_every: int = 1000
@@ -142,6 +145,7 @@ class TrainConfig:
             ("validate_every", self.validate_every, self.validate_every >= 1),
             ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1),
             ("hold_out", self.hold_out, 0 <= self.hold_out <= 1),
+            ("jitter_m", self.jitter_m, 0 <= self.jitter_m < float("inf")),
             ("structural_weight", self.structural_weight, 0 <= self.structural_weight <= 1),
             ("initial.gaussians", self.initial.gaussians, self.initial.gaussians >= 1),
             ("initial.opacity", self.initial.opacity, 0 < self.initial.opacity < 1),

@@ -36,11 +36,14 @@ class Predictor:
         self.receivers = tuple(receivers)
         self._poses = [device_pose(r) for r in receivers]
         self._plane = perception_plane(height, width, mi.Float)
-        self._predict = make_prediction(field)
+        self._field, self._count = field, -1
         self.update({name: mi.TensorXf(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
         """Use other parameters (Dr.Jit tensors) from now on."""
+        if params["position"].shape[1] != self._count:
+            # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
+            self._predict, self._count = make_prediction(self._field), params["position"].shape[1]
         self._params = params
         dr.eval(self._params)
 

@@ -43,19 +43,22 @@ class FitState:
         self.urge, self.urge_steps = dr.zeros(mi.Float, self.gaussians), 0
         dr.make_opaque(self.urge)
 
+    # Copies: what `numpy()` gives shares Dr.Jit's memory, and a tensor made of that, freed by one of Dr.Jit's
+    # threads while another function is recorded, ends the process.
+
     def params(self) -> Arrays:
         """Current parameters."""
-        return {name: dr.detach(self.adam[name]).numpy() for name in self.adam}
+        return {name: dr.detach(self.adam[name]).numpy().copy() for name in self.adam}
 
     def mean_params(self) -> Arrays:
         """Running mean of the parameters."""
-        return {name: self.mean[name].numpy() for name in self.mean}
+        return {name: self.mean[name].numpy().copy() for name in self.mean}
 
     def moments(self) -> tuple[Arrays, Arrays, int]:
         """Adam's first and second moments in the parameters' shapes, and its step count."""
         first, second, count = {}, {}, 0
         for name, (value, _, _, (t, m, v, _)) in self.adam.state.items():
-            first[name], second[name] = m.numpy().reshape(value.shape), v.numpy().reshape(value.shape)
+            first[name], second[name] = (a.numpy().copy().reshape(value.shape) for a in (m, v))
             count = int(t[0])
         return first, second, count
 

@@ -209,6 +209,7 @@ class Trainer:
                 state.mean,
                 self._data,
                 mi.UInt32(schedule.rows[t].astype(np.uint32)),
+                self._jitter(t),
                 dr.opaque(mi.UInt32, receiver),
                 self._poses[receiver],
                 self._plane,
@@ -238,6 +239,12 @@ class Trainer:
         self.seconds = before + time.perf_counter() - start
         save()
         return state.step == config.steps
+
+    def _jitter(self, step: int) -> Any:
+        """Random offsets [3, batch] of the transmitters of a step, metres."""
+        # Its own generator for each step: a resumed run draws what an uninterrupted one would.
+        rng = np.random.default_rng([self.config.seed, 3, step])
+        return mi.TensorXf((rng.standard_normal((3, self.config.batch)) * self.config.jitter_m).astype(np.float32))
 
     def _adapt(self) -> None:
         d, state = self.config.density, self.state

@@ -106,5 +106,15 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
     """Write ``predictions.npz`` and then ``metrics.json``, which marks the run as finished."""
-    write_arrays(folder / PREDICTIONS, arrays, compressed=True)
+    write_predictions(folder / PREDICTIONS, arrays)
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")
+
+
+def write_predictions(path: Path, arrays: dict[str, Any]) -> None:
+    """Write spectra as ``.npz``: greys in 0..1, float32, [m, H, W] for one receiver, else [n_rx, m, H, W].
+
+    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx].
+    """
+    single = len(arrays["receiver_name"]) == 1
+    spectra = ("prediction", "truth", "reference_idw4")
+    write_arrays(path, {k: v[0] if single and k in spectra else v for k, v in arrays.items()}, compressed=True)

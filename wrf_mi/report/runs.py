@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ..core import InputError, Record, Split
-from ..core.files import write_arrays
 from ..fit.config import TrainConfig
 from ..fit.folder import (
     RunConfig,
@@ -28,7 +27,7 @@ from ..fit.predictor import Predictor
 from ..fit.trainer import Progress, Trainer, peak_memory_mb
 from ..measure import load_split, make_splits
 from ..trace import load_record
-from .evaluate import evaluate, pool, write_results
+from .evaluate import evaluate, pool, write_predictions, write_results
 from .run_folder import CONFIG, METRICS
 
 Listen = Callable[[str, int, Progress], None]
@@ -226,8 +225,8 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
     Args:
         folder: run folder with one field.
         tx_pos_m: positions [m, 3], metres.
-        out: file to write; keys ``row`` (0..m-1), ``prediction`` [n_rx, m, H, W], ``tx_pos`` [m, 3] and
-            ``receiver_name``, as in ``predictions.npz``.
+        out: file to write; keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
+            [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``.
 
     Returns:
         Shape of each array in the file.
@@ -243,7 +242,7 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
         "tx_pos": np.asarray(tx_pos_m, float),
         "receiver_name": np.asarray([r.name for r in predictor.receivers]),
     }
-    write_arrays(Path(out), arrays, compressed=True)
+    write_predictions(Path(out), arrays)
     return {key: value.shape for key, value in arrays.items()}
 
 
