@@ -66,8 +66,8 @@ def linear_of_pairs(
     n = next(iter(per_gaussian.values())).shape[1]
     batch = next(iter(per_transmitter.values())).shape[1]
     total: dr.ArrayBase = dr.reshape(sum(gaussian[1:], gaussian[0]) + bias, (outputs, 1, n))
-    if transmitter:
-        total = total + dr.reshape(sum(transmitter[1:], transmitter[0]), (outputs, batch, 1))
+    own = sum(transmitter[1:], transmitter[0]) if transmitter else dr.zeros(type(bias), (outputs, batch))
+    total = total + dr.reshape(own, (outputs, batch, 1))
     total = dr.reshape(total, (outputs, batch * n))
     return total if hidden is None else total + params[f"{name}.hidden"] @ hidden
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Receiver
 from ..splat.tiles import perception_plane
+from .device import to_tensor
 from .step import Field, Params, device_pose, make_prediction
 
 
@@ -37,7 +38,7 @@ class Predictor:
         self._poses = [device_pose(r) for r in receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._count = field, -1
-        self.update({name: mi.TensorXf(values) for name, values in params.items()})
+        self.update({name: to_tensor(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
         """Use other parameters (Dr.Jit tensors) from now on."""
@@ -69,7 +70,7 @@ class Predictor:
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
         for image, position in zip(out, positions, strict=True):
-            tx = mi.TensorXf(np.ascontiguousarray(position[:, None]))
+            tx = to_tensor(position[:, None])
             image[:] = (
                 self._predict(self._params, tx, self._poses[receiver], self._plane).numpy().reshape(height, width)
             )

@@ -12,6 +12,7 @@ from drjit.opt import Adam
 from numpy.typing import NDArray
 
 from ..field.density import DensityChange
+from .device import to_float, to_tensor
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -29,8 +30,8 @@ class FitState:
 
     def __init__(self, params: Mapping[str, NDArray[np.float32]]) -> None:
         self.adam = Adam(lr=0.0)
-        self.adam.update({name: mi.TensorXf(values) for name, values in params.items()})
-        self.mean = {name: mi.TensorXf(values) for name, values in params.items()}
+        self.adam.update({name: to_tensor(values) for name, values in params.items()})
+        self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = 0
         self._clear_urge()
 
@@ -42,9 +43,6 @@ class FitState:
     def _clear_urge(self) -> None:
         self.urge, self.urge_steps = dr.zeros(mi.Float, self.gaussians), 0
         dr.make_opaque(self.urge)
-
-    # Copies: what `numpy()` gives shares Dr.Jit's memory, and a tensor made of that, freed by one of Dr.Jit's
-    # threads while another function is recorded, ends the process.
 
     def params(self) -> Arrays:
         """Current parameters."""
@@ -64,7 +62,7 @@ class FitState:
 
     def _set_moments(self, first: Arrays, second: Arrays, count: int) -> None:
         for name, (value, promoted, rate, _) in list(self.adam.state.items()):
-            moments = (mi.Float(first[name].ravel()), mi.Float(second[name].ravel()))
+            moments = (to_float(first[name]), to_float(second[name]))
             self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
 
     def change_density(self, change: DensityChange) -> None:
@@ -76,15 +74,15 @@ class FitState:
             first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
             second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
             mean[name] = np.where(fresh, values, mean[name][:, change.source]).astype(np.float32)
-            self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
-        self.mean = {name: mi.TensorXf(values) for name, values in mean.items()}
+            self.adam[name] = to_tensor(values)
+        self.mean = {name: to_tensor(values) for name, values in mean.items()}
         self._set_moments(first, second, count)
         self._clear_urge()
 
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and forget its momentum (opacity reset)."""
-        self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
         _, _, count = self.moments()
+        self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
         value, promoted, rate, (_, m, v, _) = self.adam.state[name]
         self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
 
@@ -104,8 +102,8 @@ class FitState:
             return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
 
         state = cls(group("param/"))
-        state.mean = {name: mi.TensorXf(values) for name, values in group("mean/").items()}
+        state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.urge_steps = int(arrays["step"]), int(arrays["urge_steps"])
-        state.urge = mi.Float(arrays["urge"])
+        state.urge = to_float(arrays["urge"])
         return state

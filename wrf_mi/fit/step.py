@@ -107,7 +107,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         loss_of: loss of a batch.
 
     Returns:
-        ``step(adam, mean, data, rows, jitter, receiver, pose, plane, factor, decay) -> (mean, StepReport)``. It takes
+        ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay) -> (mean, StepReport)``. It takes
         one step of ``adam`` in place and returns the new running mean of the parameters.
     """
 
@@ -117,7 +117,6 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         mean: Params,
         data: TrainingData,
         rows: Any,
-        jitter: Any,
         receiver: Any,
         pose: Pose,
         plane: Plane,
@@ -129,7 +128,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         params = {name: adam[name] for name in rates}
         tx_pos, truth = data.select(rows, receiver, plane)
         batch = dr.width(rows)
-        prediction = grey(field, params, tx_pos + jitter, pose, plane)
+        prediction = grey(field, params, tx_pos, pose, plane)
         loss = loss_of(prediction, truth, batch, plane.height, plane.width)
         dr.backward(loss)
         health = dr.detach(loss)

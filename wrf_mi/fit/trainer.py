@@ -22,6 +22,7 @@ from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
 from ..splat.tiles import perception_plane
 from .config import TrainConfig
+from .device import to_float, to_tensor
 from .points import read_points
 from .predictor import Predictor
 from .schedule import plan
@@ -130,8 +131,8 @@ class Trainer:
         self._poses = [device_pose(r) for r in record.receivers]
         self._plane = perception_plane(self.height, self.width, mi.Float)
         self._data = TrainingData(
-            mi.TensorXf(np.ascontiguousarray(record.tx_pos_m.T, np.float32)),
-            mi.Float(np.ascontiguousarray(record.observation, np.float32).ravel()),
+            to_tensor(record.tx_pos_m.T),
+            to_float(record.observation),
         )
         self.record_functions()
         self.seconds = 0.0
@@ -173,8 +174,8 @@ class Trainer:
             return float("nan")
         scores = []
         for r in range(len(self.record.receivers)):
-            predicted = mi.Float(self.predictor()(self.record.tx_pos_m[rows], r).ravel())
-            truth = mi.Float(np.ascontiguousarray(self.record.observation[r, rows]).ravel())
+            predicted = to_float(self.predictor()(self.record.tx_pos_m[rows], r))
+            truth = to_float(self.record.observation[r, rows])
             scores.append(ssim(predicted, truth, len(rows), self.height, self.width).numpy())
         return float(np.median(np.concatenate(scores)))
 
@@ -208,8 +209,7 @@ class Trainer:
                 state.adam,
                 state.mean,
                 self._data,
-                mi.UInt32(schedule.rows[t].astype(np.uint32)),
-                self._jitter(t),
+                mi.UInt32(schedule.rows[t].tolist()),
                 dr.opaque(mi.UInt32, receiver),
                 self._poses[receiver],
                 self._plane,
@@ -239,12 +239,6 @@ class Trainer:
         self.seconds = before + time.perf_counter() - start
         save()
         return state.step == config.steps
-
-    def _jitter(self, step: int) -> Any:
-        """Random offsets [3, batch] of the transmitters of a step, metres."""
-        # Its own generator for each step: a resumed run draws what an uninterrupted one would.
-        rng = np.random.default_rng([self.config.seed, 3, step])
-        return mi.TensorXf((rng.standard_normal((3, self.config.batch)) * self.config.jitter_m).astype(np.float32))
 
     def _adapt(self) -> None:
         d, state = self.config.density, self.state

@@ -11,14 +11,19 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from wrf_mi.core.angles import azimuth_rad, elevation_rad
+from wrf_mi.core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
 from wrf_mi.core.files import write_atomically
+from wrf_mi.splat.oracle import Projection
 
 PANEL_IN = 2.3
 """Side of one polar picture in inches."""
+
+OUTLINE_POINTS = 64
+"""Corners of the polygon that stands for a footprint's outline."""
 
 
 def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
@@ -33,8 +38,13 @@ def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
     height, width = values.shape
     radius_deg = 90 - np.degrees(elevation_rad(height))
     axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap="viridis", vmin=0, vmax=1)
+    _sky(axes, title, ring_labels="white")
+
+
+def _sky(axes: Axes, title: str, ring_labels: str) -> None:
+    """Rings of elevation and spokes of azimuth."""
     axes.set_rlim(0, 90)  # type: ignore[attr-defined]
-    axes.set_yticks([30, 60, 90], ["60°", "30°", ""], fontsize=6, color="white")
+    axes.set_yticks([30, 60, 90], ["60°", "30°", ""], fontsize=6, color=ring_labels)
     axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"], fontsize=6)
     axes.tick_params(pad=-2)
     axes.grid(alpha=0.3, linewidth=0.5)
@@ -63,6 +73,42 @@ def spectrum_table(rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], colum
             if c == 0:
                 axes.text(-0.25, 0.5, name, transform=axes.transAxes, rotation=90, va="center", fontsize=7)
     return figure
+
+
+def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
+    """A spectrum beside the Gaussians that make it, each as the receiver sees it.
+
+    An outline is where a footprint has fallen to exp(-1/2), one standard deviation from its centre.
+
+    Args:
+        spectrum: grey values [H, W].
+        gaussians: n of them, projected by `wrf_mi.splat.oracle.project`; those without a footprint are left out.
+        weight: colours the outlines, the largest on top, shape [n]; for example the magnitude of opacity times signal.
+        label: of the weight.
+
+    Returns:
+        The figure.
+    """
+    drawn = gaussians.order[np.argsort(np.asarray(weight, float)[gaussians.order], kind="stable")]
+    figure = Figure(figsize=(2 * 1.6 * PANEL_IN, 1.5 * PANEL_IN), layout="constrained")
+    left, right = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
+    polar_spectrum(left, spectrum, "spectrum")
+    lines = LineCollection(list(_outlines(gaussians)[drawn]), cmap="viridis_r", linewidths=0.8)
+    lines.set_array(np.asarray(weight, float)[drawn])
+    right.add_collection(lines)
+    _sky(right, f"footprints of {len(drawn)} Gaussians", ring_labels="black")
+    figure.colorbar(lines, ax=right, label=label, shrink=0.8)
+    return figure
+
+
+def _outlines(gaussians: Projection) -> FloatArray:
+    """Azimuth in radians and 90 degrees - elevation in degrees along each footprint's outline, [n, points, 2]."""
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    # A point v of the tangent plane lies in the direction n + v_1 e_1 + v_2 e_2.
+    in_plane = np.swapaxes(np.linalg.cholesky(gaussians.covariance) @ circle, -1, -2)
+    azimuth, elevation = azimuth_elevation(gaussians.direction[:, None] + in_plane @ gaussians.basis)
+    return np.stack([azimuth, 90 - np.degrees(elevation)], axis=-1)
 
 
 def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLike], label: str = "SSIM") -> Figure:
