@@ -91,6 +91,12 @@ def adapt(
     draw = rng.standard_normal((len(parts), 3)) * np.exp(parameters["log_scale"][:, old].T)
     new["position"][:, parts] += np.einsum("nij,nj->in", axes, draw).astype(np.float32)
     new["log_scale"][:, parts] -= np.float32(np.log(SPLIT_SHRINK))
+    if "opacity" in parameters:
+        # Two copies of this opacity blend to what one was (Rota Bulo et al. 2024, "Revising densification").
+        doubled = np.isin(source, growing)
+        alpha = 1 / (1 + np.exp(-parameters["opacity"][0, source[doubled]].astype(float)))
+        each = np.clip(1 - np.sqrt(1 - alpha), 1e-6, 1 - 1e-6)
+        new["opacity"][0, doubled] = np.log(each / (1 - each))
     pruned = len(keep) - len(alive)
     return DensityChange(new, source, fresh, len(growing) - len(split), len(split), pruned)
 

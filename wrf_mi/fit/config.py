@@ -27,7 +27,7 @@ class InitialConfig:
         signal: deviation of the starting signals.
     """
 
-    gaussians: int = 300
+    gaussians: int = 270
     points: str = ""
     size_deg: float = 7.0
     nearest_m: float = 1.0
@@ -93,7 +93,7 @@ class DensityConfig:
     start: float = 0.05
     stop: float = 0.4
     grow: float = 0.05
-    most: int = 400
+    most: int = 320
     split_deg: float = 5.0
     least_opacity: float = 0.005
     reset_every: int = 0
@@ -119,7 +119,7 @@ class TrainConfig:
     """
 
     model: str = "wrf-gs+"
-    steps: int = 12000
+    steps: int = 15000
     batch: int = 1
     seed: int = 0
     deterministic: bool = False

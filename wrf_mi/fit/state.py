@@ -82,7 +82,7 @@ class FitState:
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and forget its momentum (opacity reset)."""
         _, _, count = self.moments()
-        self.adam[name] = mi.TensorXf(np.ascontiguousarray(values))
+        self.adam[name] = to_tensor(values)
         value, promoted, rate, (_, m, v, _) = self.adam.state[name]
         self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
 
