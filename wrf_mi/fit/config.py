@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -135,23 +136,61 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
-        for name, value, good in (
-            ("steps", self.steps, self.steps >= 1),
-            ("batch", self.batch, self.batch >= 1),
-            ("log_every", self.log_every, self.log_every >= 1),
-            ("validate_every", self.validate_every, self.validate_every >= 1),
-            ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1),
-            ("hold_out", self.hold_out, 0 <= self.hold_out <= 1),
-            ("structural_weight", self.structural_weight, 0 <= self.structural_weight <= 1),
-            ("initial.gaussians", self.initial.gaussians, self.initial.gaussians >= 1),
-            ("initial.opacity", self.initial.opacity, 0 < self.initial.opacity < 1),
-            ("initial.nearest_m", self.initial.nearest_m, 0 < self.initial.nearest_m <= self.initial.farthest_m),
-            ("encoding.tx_scale_m", self.encoding.tx_scale_m, self.encoding.tx_scale_m > 0),
-            ("encoding.position_scale_m", self.encoding.position_scale_m, self.encoding.position_scale_m > 0),
-            ("optimiser.averaging", self.optimiser.averaging, 0 <= self.optimiser.averaging < 1),
-        ):
-            if not good:
-                raise InputError(f"setting {name}: {value} is out of range; see `wrf-mi train --help-settings`")
+        values = dict(_flat(to_dict(self), ""))
+        for name, value in values.items():
+            if not isinstance(value, int | float):
+                continue
+            good, words = _RANGES.get(name, _NOT_NEGATIVE)
+            if not math.isfinite(value) or not good(value):
+                raise InputError(f"setting {name}: {value} is out of range, choose {words}")
+        nearest, farthest = values["initial.nearest_m"], values["initial.farthest_m"]
+        if nearest > farthest:
+            raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
+
+
+_Range = tuple[Callable[[float], bool], str]
+_COUNT: _Range = (lambda x: x >= 1, "1 or more")
+_POSITIVE: _Range = (lambda x: x > 0, "more than 0")
+_INSIDE: _Range = (lambda x: 0 < x < 1, "more than 0 and less than 1")
+_SHARE: _Range = (lambda x: 0 <= x <= 1, "0 to 1")
+_NOT_NEGATIVE: _Range = (lambda x: x >= 0, "0 or more")
+
+_RANGES: Mapping[str, _Range] = {
+    "steps": _COUNT,
+    "batch": _COUNT,
+    "hold_out": _SHARE,
+    "structural_weight": _SHARE,
+    "checkpoint_every": _COUNT,
+    "log_every": _COUNT,
+    "validate_every": _COUNT,
+    "initial.gaussians": _COUNT,
+    "initial.size_deg": (lambda x: 0 < x < 90, "more than 0 and less than 90"),
+    "initial.nearest_m": _POSITIVE,
+    "initial.farthest_m": _POSITIVE,
+    "initial.opacity": _INSIDE,
+    "encoding.position_octaves": _COUNT,
+    "encoding.position_scale_m": _POSITIVE,
+    "encoding.tx_scale_m": _POSITIVE,
+    "optimiser.final": _SHARE,
+    "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
+    "density.start": _SHARE,
+    "density.stop": _SHARE,
+    "density.grow": _SHARE,
+    "density.most": _COUNT,
+    "density.split_deg": _POSITIVE,
+    "density.least_opacity": _INSIDE,
+    "density.reset_opacity": _INSIDE,
+}
+"""What numbers may be, and words for it; `_NOT_NEGATIVE` where nothing is said here."""
+
+
+def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of a nested dictionary."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 PAPER = (
@@ -188,7 +227,7 @@ def from_dict(values: Mapping[str, Any], source: str = "config") -> TrainConfig:
 
 def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
-        raise InputError(f"{source}, setting {prefix or 'top'}: expected a mapping, got {values!r}")
+        raise InputError(f"{source}, setting {prefix[:-1] or 'top'}: expected a mapping, got {values!r}")
     types = typing.get_type_hints(kind)
     arguments = {}
     for key, value in values.items():
@@ -205,12 +244,11 @@ def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
 
 def _convert(value: Any, kind: type, name: str, source: str) -> Any:
     good = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if kind is float and isinstance(value, str):  # YAML reads 1e-3 as text
+    # YAML reads 1e-3 as text.
+    if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
             return float(value)
-        except ValueError:
+        except (ValueError, OverflowError):
             good = False
     if not good:
         raise InputError(f"{source}, setting {name}: expected {kind.__name__}, got {value!r}")
@@ -234,7 +272,10 @@ def with_settings(config: TrainConfig, settings: Iterable[str]) -> TrainConfig:
             node = node.get(parent) if isinstance(node, dict) else None
         if not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
             raise InputError(f"--set {setting}: unknown setting {key.strip()}; see `wrf-mi train --help-settings`")
-        node[last] = yaml.safe_load(text) if text.strip() else ""
+        try:
+            node[last] = yaml.safe_load(text) if text.strip() else ""
+        except (yaml.YAMLError, ValueError):  # the latter from dates that are none
+            raise InputError(f"--set {setting}: {text!r} is no YAML value; quote text that is none") from None
     return from_dict(values, "--set")
 
 
@@ -245,12 +286,4 @@ def dump(config: TrainConfig) -> str:
 
 def describe() -> str:
     """One line a setting, with its default, for ``wrf-mi train --help-settings``."""
-
-    def lines(values: Mapping[str, Any], prefix: str) -> Iterable[str]:
-        for key, value in values.items():
-            if isinstance(value, dict):
-                yield from lines(value, f"{prefix}{key}.")
-            else:
-                yield f"{prefix}{key}={value}"
-
-    return "\n".join(lines(to_dict(TrainConfig()), ""))
+    return "\n".join(f"{name}={value}" for name, value in _flat(to_dict(TrainConfig()), ""))

@@ -37,15 +37,17 @@ def plan(config: TrainConfig, split: Split, receivers: int) -> Schedule:
     """The plan of a fit, a function of settings, split and seed alone: a resumed run goes on with the same.
 
     Each epoch visits every row at every receiver once, in random order; a batch belongs to one receiver.
+    Where the batch does not divide the rows, each epoch leaves out others at random.
 
     Raises:
         InputError: fewer training rows than a batch needs.
     """
     steps, batch = config.steps, config.batch
     joined = steps if config.hold_out >= 1 else round(config.hold_out * steps)
-    for rows in (split.train, split.all_train):
-        if len(rows) < batch:
-            raise InputError(f"{len(rows)} training rows for batches of {batch}: choose a smaller batch")
+    rows = split.train if joined else split.all_train
+    if len(rows) < batch:
+        beside = f" beside {len(split.validation)} validation rows" if joined else ""
+        raise InputError(f"{len(rows)} training rows{beside}, batches need {batch}: use more rows or a smaller batch")
     rng = np.random.default_rng([config.seed, 1])
     plans = [_epochs(split.train, joined, batch, receivers, rng)]
     plans.append(_epochs(split.all_train, steps - joined, batch, receivers, rng))
@@ -69,6 +71,8 @@ def plan(config: TrainConfig, split: Split, receivers: int) -> Schedule:
 def _epochs(
     rows: IntArray, steps: int, batch: int, receivers: int, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
+    if steps == 0:
+        return np.empty((0, batch), np.int64), np.empty(0, np.int64)
     per_receiver = len(rows) // batch
     epochs = -(-steps // (per_receiver * receivers))
     batches, owners = [], []
@@ -79,6 +83,4 @@ def _epochs(
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])
         owners.append(np.repeat(np.arange(receivers), per_receiver)[order])
-    if not batches:
-        return np.empty((0, batch), np.int64), np.empty(0, np.int64)
     return np.concatenate(batches)[:steps], np.concatenate(owners)[:steps]

@@ -83,6 +83,7 @@ class FitState:
         """Set one parameter and forget its momentum (opacity reset)."""
         _, _, count = self.moments()
         self.adam[name] = to_tensor(values)
+        self.adam.reset(name)
         value, promoted, rate, (_, m, v, _) = self.adam.state[name]
         self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
 

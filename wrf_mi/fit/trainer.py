@@ -224,10 +224,11 @@ class Trainer:
             last = state.step == config.steps
             if state.step in schedule.density:
                 self._adapt()
-            if state.step % config.log_every == 0 or last:
+            scored = state.step % config.validate_every == 0 or last
+            if state.step % config.log_every == 0 or scored:
                 if broken[0] > 0:
                     raise NumericsError(self._diagnose())
-                score = self.validate() if state.step % config.validate_every == 0 or last else None
+                score = self.validate() if scored else None
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / (state.step - first) * (config.steps - state.step)
                 held_out = state.step <= schedule.joined

@@ -98,7 +98,9 @@ def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike,
     lines.set_clim(0, None)
     right.add_collection(lines)
     _sky(right, f"footprints of {len(drawn)} Gaussians", ring_labels="black")
-    figure.colorbar(lines, ax=right, label=label, shrink=0.8)
+    bar = figure.colorbar(lines, ax=right, shrink=0.8)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
     return figure
 
 
