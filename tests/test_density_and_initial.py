@@ -307,7 +307,8 @@ def test_chosen_points_are_points_of_the_cloud() -> None:
     first = gaussians_from_points(cloud, 10, np.random.default_rng(4))
     assert len({tuple(p) for p in first.position_m} & {tuple(p) for p in cloud}) == 10
     # The gap is that between chosen points, which is wider than between all.
-    assert first.scale_m.mean() > gaussians_from_points(cloud, 50, np.random.default_rng(4)).scale_m.mean()
+    apart = np.sort(np.linalg.norm(first.position_m[:, None] - first.position_m, axis=2), axis=1)[:, 1:4]
+    np.testing.assert_allclose(first.scale_m, np.sqrt((apart**2).mean(axis=1)))
     # Points on top of each other still have a size.
     assert (gaussians_from_points(np.zeros((6, 3)), 6, np.random.default_rng(0)).scale_m > 0).all()
 

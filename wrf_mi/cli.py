@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from . import __version__
 from .core import BackendError, InputError
@@ -74,7 +74,8 @@ def _train(a: Arguments) -> int:
         return 0
     with _watch() as watch:
         if a.resume:
-            if a.dataset or a.out or a.set or a.n_train or a.preset or a.model:
+            given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset)
+            if any(value is not None for value in given) or a.set or a.deterministic:
                 raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
             folder = Path(a.resume)
             run = resume(folder, watch.listen, watch.stop)
@@ -85,7 +86,15 @@ def _train(a: Arguments) -> int:
             config = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
             own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
             config = with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
-            run = train(a.dataset, folder, config, a.split or "official", a.n_train, watch.listen, watch.stop)
+            run = train(
+                a.dataset,
+                folder,
+                config,
+                "official" if a.split is None else a.split,
+                a.n_train,
+                watch.listen,
+                watch.stop,
+            )
     return _show_metrics(run.metrics, folder, a.json)
 
 
@@ -157,8 +166,15 @@ def _watch() -> Any:
     return Watch()
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="wrf-mi", description="Learned wireless radiation fields and ray tracing.")
+    parser = _Parser(prog="wrf-mi", description="Learned wireless radiation fields and ray tracing.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -222,7 +238,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _number(text: str) -> int | float:
-    return float(text) if "." in text else int(text)
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -236,6 +259,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return a.call(a)
     except InputError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        # A file or folder that cannot be written, in nearly all cases one that was named on the command line.
+        print(f"wrf-mi: {error}; choose another place", file=sys.stderr)
         return 2
     except BackendError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)

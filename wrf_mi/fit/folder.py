@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..backend import init
 from ..core import InputError, Receiver, Record, Split
-from ..core.files import write_arrays, write_atomically
+from ..core.files import one_line, write_arrays, write_atomically
 from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
 from .predictor import Predictor
@@ -120,13 +121,13 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
     """
     path = folder / CHECKPOINT
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         version = int(arrays["format"])
     except FileNotFoundError:
-        raise InputError(f"{folder}: no {CHECKPOINT}; the run was stopped before its first, train anew") from None
+        raise InputError(f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume") from None
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{path}: not readable ({error}); restore it or train anew") from None
+        raise InputError(f"{path}: not readable ({one_line(error)}); restore it or train anew") from None
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
     return arrays
@@ -136,6 +137,8 @@ def append_log(folder: Path, progress: Progress) -> None:
     """Add a line to ``log.jsonl``."""
     entry = asdict(progress)
     del entry["left_s"]
+    if progress.validation_ssim is not None and math.isnan(progress.validation_ssim):
+        entry["validation_ssim"] = None  # there are no validation rows, and JSON has no NaN
     with (folder / LOG).open("a") as stream:
         stream.write(json.dumps(entry) + "\n")
 
@@ -152,8 +155,9 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     """A new run in a new or empty folder.
 
     Raises:
-        InputError: the folder holds something already.
+        InputError: the folder holds something already, or the split has rows that the record has not.
     """
+    _check_rows(split, record, f"split {split.name}")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}"
@@ -165,9 +169,27 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     return trainer
 
 
+def _check_rows(split: Split, record: Record, source: str) -> None:
+    rows = np.concatenate([split.train, split.validation, split.test])
+    bad = rows[(rows < 0) | (rows >= len(record))]
+    if len(bad):
+        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
+
+
+def load_rows(folder: Path, record: Record) -> Split:
+    """The rows of a run.
+
+    Raises:
+        InputError: no split file, a damaged one, or one with rows that the record has not.
+    """
+    split = load_split(folder / SPLIT)
+    _check_rows(split, record, str(folder / SPLIT))
+    return split
+
+
 def resume_run(folder: Path, record: Record) -> Trainer:
     """A run as its last checkpoint left it; from the start if it was stopped before the first."""
-    run, split = read_config(folder), load_split(folder / SPLIT)
+    run, split = read_config(folder), load_rows(folder, record)
     trainer = Trainer(record, split, run.settings)
     if (folder / CHECKPOINT).exists():
         arrays = read_checkpoint(folder)

@@ -26,7 +26,7 @@ def read_points(path: str | Path) -> NDArray[np.float64]:
         raise InputError(f"{file}: no such file; give a point cloud (.ply, .xyz, .npz)")
     try:
         if file.suffix == ".npz":
-            with np.load(file, allow_pickle=False) as arrays:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
                 points = np.asarray(arrays["points"], float)
         else:
             points = np.asarray(getattr(trimesh.load(file), "vertices", np.empty((0, 3))), float)

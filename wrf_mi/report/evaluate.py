@@ -110,11 +110,13 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 
-def write_predictions(path: Path, arrays: dict[str, Any]) -> None:
+def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     """Write spectra as ``.npz``: greys in 0..1, float32, [m, H, W] for one receiver, else [n_rx, m, H, W].
 
-    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx].
+    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. Returns the arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
     spectra = ("prediction", "truth", "reference_idw4")
-    write_arrays(path, {k: v[0] if single and k in spectra else v for k, v in arrays.items()}, compressed=True)
+    written = {k: v[0] if single and k in spectra else v for k, v in arrays.items()}
+    write_arrays(path, written, compressed=True)
+    return written

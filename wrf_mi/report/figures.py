@@ -36,7 +36,9 @@ def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
     """
     values = np.asarray(spectrum)
     height, width = values.shape
-    radius_deg = 90 - np.degrees(elevation_rad(height))
+    # The zenith is no sample; the mean of the ring around it closes the picture there.
+    values = np.vstack([values, np.full(width, values[-1].mean())])
+    radius_deg = np.append(90 - np.degrees(elevation_rad(height)), 0.0)
     axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap="viridis", vmin=0, vmax=1)
     _sky(axes, title, ring_labels="white")
 

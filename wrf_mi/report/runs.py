@@ -17,6 +17,8 @@ from ..fit.folder import (
     RunConfig,
     append_log,
     load_predictor,
+    load_rows,
+    read_checkpoint,
     read_config,
     resume_run,
     start_run,
@@ -25,7 +27,7 @@ from ..fit.folder import (
 )
 from ..fit.predictor import Predictor
 from ..fit.trainer import Progress, Trainer, peak_memory_mb
-from ..measure import load_split, make_splits
+from ..measure import make_splits
 from ..trace import load_record
 from .evaluate import evaluate, pool, write_predictions, write_results
 from .run_folder import CONFIG, METRICS
@@ -110,7 +112,8 @@ def train(
         return Run(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists and is not empty; choose another --out")
-    folder.mkdir(parents=True, exist_ok=True)
+    # What cannot be trained is refused here, before anything is written.
+    start_run(folder / "fold0", record, splits[0], replace(run, split=splits[0].name))
     write_config(folder, run)
     return _fit_folds(folder, record, splits, run, listen, stop)
 
@@ -191,7 +194,7 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
         The metrics.
 
     Raises:
-        InputError: not a run folder, or no row of ``split`` is left that the run has not seen.
+        InputError: not a run folder, one that was stopped, or no row of ``split`` is left that the run has not seen.
     """
     path = Path(folder)
     run = read_config(path)
@@ -199,12 +202,15 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
     if is_blocked(path):
         if split is not None:
             raise InputError(f"{path}: every row is held out in one of its folds; leave --split away")
-        parts = []
-        for part in sorted(path.glob(FOLDS)):
-            parts.append(evaluate(record, load_split(part / "split.npz"), load_predictor(part)))
+        parts, done = [], {"train_seconds": 0.0}
+        for k in range(len(make_splits(record, run.split, run.settings.seed, run.n_train))):
+            part = path / f"fold{k}"
+            done["train_seconds"] += _finished(part, run)["train_seconds"]
+            parts.append(evaluate(record, load_rows(part, record), load_predictor(part)))
         metrics, arrays = pool(parts)
     else:
-        rows = load_split(path / "split.npz")
+        done = _finished(path, run)
+        rows = load_rows(path, record)
         if split is not None:
             asked = np.unique(np.concatenate([s.test for s in make_splits(record, split, run.settings.seed)]))
             unseen = np.setdiff1d(asked, rows.all_train)
@@ -212,11 +218,28 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
                 raise InputError(f"{path}: trained on all test rows of split {split}; nothing is left to score")
             rows, run = replace(rows, test=unseen), replace(run, split=f"{split} (rows unseen by {run.split})")
         metrics, arrays = evaluate(record, rows, load_predictor(path))
-    stored = json.loads((path / METRICS).read_text()) if (path / METRICS).exists() else {}
-    merged = _header(run, stored.get("train_seconds", 0.0)) | stored | metrics | {"split": run.split}
+    merged = _header(run, 0.0) | _stored_metrics(path) | done | metrics | {"split": run.split}
     if split is None:
         write_results(path, merged, arrays)
     return merged
+
+
+def _finished(folder: Path, run: RunConfig) -> dict[str, Any]:
+    """What the checkpoint of a finished run knows of its training."""
+    arrays = read_checkpoint(folder)
+    if int(arrays["step"]) < run.settings.steps:
+        where = f"{folder}: stopped after step {int(arrays['step'])} of {run.settings.steps}"
+        raise InputError(f"{where}; finish it with train --resume")
+    return {"train_seconds": float(arrays["seconds"]), "gaussians": arrays["mean/position"].shape[1]}
+
+
+def _stored_metrics(folder: Path) -> dict[str, Any]:
+    """The last ``metrics.json``; nothing where it is missing or damaged, since scoring writes it anew."""
+    try:
+        stored = json.loads((folder / METRICS).read_text())
+    except (OSError, ValueError):
+        return {}
+    return stored if isinstance(stored, dict) else {}
 
 
 def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -> dict[str, tuple[int, ...]]:
@@ -242,8 +265,7 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
         "tx_pos": np.asarray(tx_pos_m, float),
         "receiver_name": np.asarray([r.name for r in predictor.receivers]),
     }
-    write_predictions(Path(out), arrays)
-    return {key: value.shape for key, value in arrays.items()}
+    return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
 
 
 __all__ = ["CONFIG", "Interrupted", "Run", "evaluate_run", "predict_to_file", "resume", "train"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 from types import FrameType, TracebackType
@@ -56,13 +57,15 @@ class Watch:
 
     def listen(self, fold: str, steps: int, p: FitProgress) -> None:
         """Show one progress report."""
-        if p.validation_ssim is not None:
+        if fold != self._fold:
+            self._fold, self._task, self._score = fold, None, ""
+        if p.validation_ssim is not None and not math.isnan(p.validation_ssim):  # it is without validation rows
             rows = "validation rows" if p.held_out else "validation rows, now trained on"
             self._score = f"SSIM {p.validation_ssim:.3f} ({rows})"
         text = f"loss {p.loss:.4f}  {self._score}  {p.gaussians} Gaussians  {_clock(p.left_s)} left"
         if self._console.is_terminal:
-            if self._task is None or fold != self._fold:
-                self._task, self._fold = self._bar.add_task(fold or "training", total=steps, text=text), fold
+            if self._task is None:
+                self._task = self._bar.add_task(fold or "training", total=steps, text=text)
             self._bar.update(self._task, completed=p.step, text=text)
         elif p.validation_ssim is not None:
             print(f"{fold or 'training'} {p.step}/{steps}  {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,522 @@
+"""The command: what it prints where, its exit status, and one line for whatever is wrong with its input."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from made_spectra import SIZE, spectra
+
+from wrf_mi.cli import _parser, main
+from wrf_mi.core import InputError
+from wrf_mi.fit.folder import load_predictor, read_checkpoint
+from wrf_mi.fit.trainer import Progress
+from wrf_mi.measure import write_spectrum_folder
+from wrf_mi.report import demo, runs
+from wrf_mi.report.tx_file import read_tx_positions
+from wrf_mi.report.watch import Watch
+
+ROWS = 24
+SMALL = ["initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "log_every=2", "validate_every=4", "steps=4"]
+SET = [part for setting in SMALL for part in ("--set", setting)]
+SECONDS_TO_START = 120
+"""Importing, compiling and a first step take some 3 s; a busy machine needs much longer."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    record, _, _ = spectra(rows=ROWS)
+    return write_spectrum_folder(tmp_path_factory.mktemp("data") / "made-here", record)
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["train", str(folder), "--out", str(out), *SET]) == 0
+    return out
+
+
+def call(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of the command."""
+    capsys.readouterr()
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as end:  # argparse
+        status = int(end.code or 0)
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+def refused(arguments: list[Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command says in one line what is wrong, and nothing else."""
+    status, out, err = call(arguments, capsys)
+    assert status == 2
+    assert out == ""
+    assert err.startswith("wrf-mi")
+    assert err.endswith("\n")
+    assert err.count("\n") == 1, err
+    assert re.search(message, err), err
+
+
+def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The command and all its subcommands."""
+    yield name
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for key, sub in action.choices.items():
+                yield from commands(sub, (*name, key))
+
+
+def test_the_subcommands() -> None:
+    expected = {"doctor", "data", "train", "evaluate", "predict", "compare", "bench", "demo"}
+    assert {name[0] for name in commands(_parser()) if name} == expected
+
+
+@pytest.mark.parametrize("name", list(commands(_parser())), ids=" ".join)
+def test_help(name: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = call([*name, "--help"], capsys)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"usage: {' '.join(('wrf-mi', *name))} ")
+
+
+def test_help_and_bad_arguments_start_nothing() -> None:
+    """They answer at once: neither Dr.Jit nor Mitsuba is loaded."""
+    code = """
+import sys
+from wrf_mi.cli import main
+for arguments in (["train", "--help"], ["train", "--seed", "x"]):
+    try:
+        main(arguments)
+    except SystemExit:
+        pass
+print("drjit" in sys.modules, "mitsuba" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False False"
+
+
+def test_version_and_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = call(["--version"], capsys)
+    assert status == 0
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", out)
+    status, out, _ = call(["train", "--help-settings"], capsys)
+    assert status == 0
+    assert "optimiser.network=0.001\n" in out
+
+
+def test_train_prints_a_table_and_progress_elsewhere(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out_folder = tmp_path / "run"
+    status, out, err = call(["train", folder, "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys)
+    assert status == 0
+    head, own, blend, facts, where = out.splitlines()
+    assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
+    metrics = json.loads((out_folder / "metrics.json").read_text())
+    for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw4"])):
+        assert line.split()[-4:] == [f"{block[k]:.3f}" for k in ("median", "mean", "p10", "p90")]
+    assert own.startswith("wrf-gs ")
+    assert facts.startswith("split official, 19 training rows,")
+    assert where == f"results: {out_folder}"
+    assert (metrics["model"], metrics["seed"], metrics["steps"]) == ("wrf-gs", 3, 4)
+    assert re.fullmatch(
+        r"training 4/4  loss 0\.\d+  SSIM -?\d\.\d+ \(validation rows, now trained on\)  8 Gaussians  0:00 left\n", err
+    )
+
+
+def test_train_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own = ["--split", "random", "--n-train", "0.5", "--deterministic", "--json"]
+    status, out, _ = call(["train", folder, "--out", tmp_path / "run", *own, *SET], capsys)
+    assert status == 0
+    printed = json.loads(out)
+    assert printed == json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (printed["split"], printed["n_train"], printed["n_test"]) == ("random", 10, 5)
+    assert "deterministic: true" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+def test_train_on_one_row(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """There is no row left for validation: no score meanwhile, and none that is not a number."""
+    status, _, err = call(["train", folder, "--out", tmp_path / "run", "--n-train", 1, *SET], capsys)
+    assert status == 0
+    assert "4/4" in err
+    assert "nan" not in err
+    for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines():
+        assert json.loads(line, parse_constant=pytest.fail)["validation_ssim"] is None
+
+
+def test_preset_model_and_settings_in_that_order(folder: Path, tmp_path: Path) -> None:
+    """What is set by hand wins."""
+    arguments = [
+        "train",
+        folder,
+        "--out",
+        tmp_path / "run",
+        "--preset",
+        "paper",
+        *SET,
+        "--set",
+        "encoding.tx_octaves=3",
+    ]
+    assert main([str(a) for a in arguments]) == 0
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    assert "position_octaves: 10" in config
+    assert "tx_octaves: 3" in config
+
+
+def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, table, _ = call(["evaluate", run], capsys)
+    assert status == 0
+    assert table.splitlines()[-1] == f"results: {run}"
+    status, out, err = call(["evaluate", run, "--json"], capsys)
+    assert (status, err) == (0, "")
+    assert json.loads(out) == json.loads((run / "metrics.json").read_text())
+
+
+def test_evaluate_on_other_rows(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "metrics.json").read_bytes()
+    status, out, _ = call(["evaluate", run, "--split", "blocked", "--json"], capsys)
+    assert status == 0
+    assert json.loads(out)["n_test"] == 5  # every row is in a block; five of them were not trained on
+    assert (run / "metrics.json").read_bytes() == before
+
+
+def test_predict(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    positions = np.array([[0.1, -0.2, 0.3], [0.5, 0.5, -0.5], [0.0, 0.0, 0.0]])
+    rows = "\n".join(f"{z},{x},tag,{y}" for x, y, z in positions)
+    (tmp_path / "tx.csv").write_text(f"Z, X,name,Y\n{rows}\n\n")
+    np.savez(tmp_path / "tx.npz", tx_pos=positions)
+    status, out, err = call(["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "a.npz"], capsys)
+    assert (status, out, err) == (0, f"3 spectra: {tmp_path / 'a.npz'}\n", "")
+    arguments = ["predict", run, "--input", tmp_path / "tx.npz", "--out", tmp_path / "new" / "b.npz", "--json"]
+    status, out, _ = call(arguments, capsys)
+    assert status == 0
+    printed = json.loads(out)
+    with np.load(tmp_path / "a.npz") as a, np.load(tmp_path / "new" / "b.npz") as b:
+        assert printed == {"out": str(tmp_path / "new" / "b.npz"), "arrays": {k: list(b[k].shape) for k in b.files}}
+        for key in a.files:
+            np.testing.assert_array_equal(a[key], b[key])
+        np.testing.assert_array_equal(a["row"], [0, 1, 2])
+        np.testing.assert_array_equal(a["tx_pos"], positions)
+        np.testing.assert_array_equal(a["receiver_name"], ["gateway1"])
+        assert a["prediction"].shape == (3, *SIZE)
+        np.testing.assert_allclose(a["prediction"], load_predictor(run)(positions), atol=1e-6)
+
+
+def test_compare(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = call(["compare", run, "--out", tmp_path / "page"], capsys)
+    assert (status, out) == (0, f"comparison: {tmp_path / 'page' / 'index.html'}\n")
+    assert (tmp_path / "page" / "compare.csv").is_file()
+
+
+def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("WRF_MI_DATA", str(folder.parent))
+    status, out, _ = call(["data", "list", "--json"], capsys)
+    assert status == 0
+    assert {"rfid-lab", "laboratory"} <= {entry["name"] for entry in json.loads(out)}
+    status, table, _ = call(["data", "list"], capsys)
+    assert status == 0
+    assert "rfid-lab" in table
+
+
+def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """By the parser of arguments: one line too, which names the command."""
+    for arguments, message in (
+        ([], "wrf-mi: the following arguments are required: COMMAND; see wrf-mi --help"),
+        (["fly"], "argument COMMAND: invalid choice: 'fly'"),
+        (["data"], "wrf-mi data: the following arguments are required: COMMAND"),
+        (["predict", "run"], "wrf-mi predict: .*required"),
+        (["predict", "run", "--tx", "a", "--input", "b", "--out", "c"], "not allowed with argument"),
+        (["evaluate"], "required: RUN"),
+        (["compare", "run"], "required: --out"),
+        (["train", "x", "--model", "nerf2", "--out", "y"], "invalid choice: 'nerf2'"),
+        (["train", "x", "--seed", "one", "--out", "y"], "invalid int value: 'one'"),
+        (["train", "x", "--n-train", "many", "--out", "y"], "argument --n-train: 'many' is no number"),
+        (["train", "x", "--preset", "best", "--out", "y"], "invalid choice: 'best'"),
+    ):
+        refused(arguments, message, capsys)
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (["--set", "steps"], "--set steps: expected key=value"),
+        (["--set", "stepz=3"], "unknown setting stepz"),
+        (["--set", "steps=many"], "setting steps: expected int, got 'many'"),
+        (["--set", "steps=[1"], "is no YAML value"),
+        (["--set", "hold_out=2"], "setting hold_out: 2.0 is out of range, choose 0 to 1"),
+        (["--set", "initial.points=none.ply"], "none.ply: no such file"),
+        (["--set", "batch=100"], "training rows.*batches need 100"),
+        (["--set", "model=nerf2"], "model 'nerf2' cannot be trained here"),
+        (["--seed", "-1"], "setting seed: -1 is out of range"),
+        (["--split", "nowhere"], "split 'nowhere'"),
+        (["--split", ""], "split ''"),
+        (["--split", "blocked:3"], "no such fold"),
+        (["--n-train", "0"], "n_train 0; choose 1 to 19 rows"),
+        (["--n-train", "20"], "n_train 20; choose 1 to 19 rows"),
+        (["--n-train", "1.5"], "n_train 1.5; choose"),
+        (["--n-train", "-0.5"], "n_train -0.5; choose"),
+        (["--n-train", "nan"], "n_train nan; choose"),
+    ],
+)
+def test_training_that_is_refused(
+    own: list[str], message: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for split in ([], ["--split", "blocked"]):
+        if split and ("--split" in own or "--n-train" in own):
+            continue
+        refused(["train", folder, "--out", tmp_path / "run", *SET, *split, *own], message, capsys)
+        assert not (tmp_path / "run").exists()  # nothing is half written
+
+
+def test_data_and_folders_that_are_refused(
+    folder: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "nothing"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nothing"))
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    for arguments, message in (
+        (["train"], "train needs DATASET and --out RUN"),
+        (["train", folder], "train needs DATASET and --out RUN"),
+        (["train", "nowhere", "--out", tmp_path / "out"], "nowhere"),
+        (["train", "rfid-lab", "--out", tmp_path / "out"], "wrf-mi data fetch rfid-lab"),
+        (["train", tmp_path / "empty", "--out", tmp_path / "out"], "gateway_info.yml: missing"),
+        (["train", folder, "--out", folder], "exists and is not empty; choose another --out"),
+        (["train", folder, "--out", tmp_path / "file", *SET], "file: exists and is not empty"),
+        (["train", folder, "--out", tmp_path / "file" / "out", *SET], r"file.*; choose another place"),
+        (["train", "--resume", tmp_path / "empty"], "no config.yaml, so not a run folder"),
+        (["train", "--resume", tmp_path / "none"], "no config.yaml, so not a run folder"),
+        (["evaluate", tmp_path / "empty"], "no config.yaml, so not a run folder"),
+        (["evaluate", run, "--split", "nowhere"], "split 'nowhere'"),
+        (["compare", tmp_path / "empty", "--out", tmp_path / "out"], "no metrics.json"),
+        (["compare", run, run, "--out", tmp_path / "out"], "given twice"),
+        (["compare", run, "--out", tmp_path / "file"], "file.*; choose another place"),
+        (["data", "fetch", "nowhere"], "nowhere"),
+        (["bench", "nowhere", "--out", tmp_path / "out", "--runs", tmp_path / "runs"], "nowhere"),
+    ):
+        refused(arguments, message, capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        ["--set", "steps=9"],
+        ["--seed", "0"],
+        ["--split", "random"],
+        ["--n-train", "0"],
+        ["--deterministic"],
+        ["--model", "wrf-gs"],
+        ["--preset", "quick"],
+        ["--out", "elsewhere"],
+        ["data"],
+    ],
+)
+def test_resume_takes_no_settings(own: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They would be left aside."""
+    refused(["train", "--resume", run, *own], "leave data set and settings away", capsys)
+
+
+BAD_POSITIONS = {
+    "row.csv": (b"x,y,z\n1,2,3\n1,two,3\n", "row.csv, row 2: '1,two,3' is not three numbers"),
+    "short.csv": (b"x,y,z\n1,2\n", "short.csv, row 1: '1,2' is not three numbers"),
+    "nan.csv": (b"x,y,z\n1,2,3\n\n4,nan,6\n", "nan.csv, row 2: not a finite number"),
+    "header.csv": (b"a,b,c\n1,2,3\n", "header.csv: header 'a,b,c' lacks x, y, z"),
+    "empty.csv": (b"", "empty.csv: header '' lacks x, y, z"),
+    "none.csv": (b"x,y,z\n", "none.csv: no positions"),
+    "binary.csv": (b"\xff\xfe\x00\x80", "binary.csv: cannot be read"),
+    "junk.npz": (b"no archive", "junk.npz: not readable as .npz"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_POSITIONS)
+def test_positions_that_are_refused(name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content, message = BAD_POSITIONS[name]
+    (tmp_path / name).write_bytes(content)
+    option = "--input" if name.endswith(".npz") else "--tx"
+    refused(["predict", run, option, tmp_path / name, "--out", tmp_path / "out.npz"], message, capsys)
+    assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"other": np.zeros((2, 3))}, "no array tx_pos"),
+        ({"tx_pos": np.zeros((2, 2))}, r"tx_pos has shape \[2, 2\], expected \[m, 3\]"),
+        ({"tx_pos": np.zeros((0, 3))}, "no positions"),
+        ({"tx_pos": np.array([[0, 0, np.inf]])}, "row 1: not a finite number"),
+        ({"tx_pos": np.array([["a", "b", "c"]])}, "not readable as .npz"),
+    ],
+)
+def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "tx.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_tx_positions(None, tmp_path / "tx.npz")
+
+
+def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
+    good, out = ["--tx", tmp_path / "tx.csv"], ["--out", tmp_path / "out.npz"]
+    refused(["predict", run, "--tx", tmp_path / "no.csv", *out], "no.csv: no such file", capsys)
+    refused(["predict", tmp_path, *good, *out], "no config.yaml, so not a run folder", capsys)
+    refused(["predict", run, *good, "--out", tmp_path], "choose another place", capsys)
+    refused(["predict", run, *good, "--out", tmp_path / "tx.csv" / "out.npz"], "choose another place", capsys)
+
+
+def test_a_fit_that_breaks_ends_with_one(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not bad input, but one line all the same."""
+    own = [*SET, "--set", "optimiser.signal=1e38", "--set", "steps=20"]
+    status, out, err = call(["train", folder, "--out", tmp_path / "run", *own], capsys)
+    assert (status, out) == (1, "")
+    assert re.fullmatch(r"wrf-mi: .*not finite.*\n", err.splitlines(keepends=True)[-1])
+    assert "Traceback" not in err
+
+
+def test_a_stopped_run_ends_with_130(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Watch, "stop", lambda self: True)
+    status, out, err = call(["train", folder, "--out", tmp_path / "run", *SET], capsys)
+    assert (status, out) == (130, "")
+    assert err == f"wrf-mi: stopped after step 1 of 4; go on with: wrf-mi train --resume {tmp_path / 'run'}\n"
+    refused(["evaluate", tmp_path / "run"], "stopped after step 1 of 4; finish it with train --resume", capsys)
+    refused(["compare", tmp_path / "run", "--out", tmp_path / "out"], "finish it with train --resume", capsys)
+    monkeypatch.undo()
+    status, out, _ = call(["train", "--resume", tmp_path / "run", "--json"], capsys)
+    assert status == 0
+    assert json.loads(out)["steps"] == 4
+
+
+def test_ctrl_c_loses_nothing(folder: Path, tmp_path: Path) -> None:
+    """A training process gets the signal that Ctrl-C sends."""
+    out = tmp_path / "run"
+    own = [*SET, "--set", "steps=800", "--set", "log_every=1", "--set", "validate_every=800"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "wrf_mi.cli", "train", str(folder), "--out", str(out), *own],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    with process:
+        end = time.monotonic() + SECONDS_TO_START
+        while not (out / "log.jsonl").exists() and process.poll() is None and time.monotonic() < end:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=SECONDS_TO_START)
+    assert process.returncode == 130, stderr
+    assert stdout == ""
+    assert stderr.splitlines()[0] == "stopping after this step; Ctrl-C again ends at once"
+    step = int(read_checkpoint(out)["step"])
+    assert 0 < step < 800
+    assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 800; go on with:")
+    assert main(["train", "--resume", str(out)]) == 0
+    lines = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
+    assert lines == list(range(1, 801))
+    assert (out / "metrics.json").exists()
+
+
+def test_watch_stops_at_the_first_and_ends_at_the_second_signal(capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with Watch() as watch:
+        assert not watch.stop()
+        signal.raise_signal(signal.SIGINT)
+        assert watch.stop()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def progress(**values: Any) -> Progress:
+    return Progress(**({"step": 10, "seconds": 1.0, "loss": 0.25, "validation_ssim": None, "held_out": True,
+                        "gaussians": 8, "left_s": 61.0} | values))  # fmt: skip
+
+
+def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with Watch() as watch:
+        watch.listen("", 40, progress())
+        watch.listen("", 40, progress(step=20, validation_ssim=0.5))
+        watch.listen("fold1", 40, progress(step=20, validation_ssim=0.75, held_out=False))
+        watch.listen("fold2", 40, progress(step=20, validation_ssim=float("nan")))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
+        "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
+        "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
+    ]
+
+
+def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "150")
+    with Watch() as watch:
+        for fold in ("fold0", "fold1"):
+            for step in (20, 40):
+                watch.listen(fold, 40, progress(step=step, validation_ssim=0.5))
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
+    assert "fold0" in shown
+    assert "fold1" in shown
+    assert "SSIM 0.500 (validation rows)  8 Gaussians  1:01 left" in shown
+
+
+def test_demo_takes_real_spectra_where_it_can(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "locate", lambda name: folder)
+    assert demo.demo_dataset() == "rfid-lab"
+    monkeypatch.setattr(demo, "locate", lambda name: None)
+    monkeypatch.setattr(demo, "fetch", lambda name: folder)
+    assert demo.demo_dataset() == "rfid-lab"
+    assert capsys.readouterr().err == ""
+
+    def offline(name: str) -> Path:
+        raise InputError("no network")
+
+    monkeypatch.setattr(demo, "fetch", offline)
+    assert demo.demo_dataset() == "laboratory"
+    err = capsys.readouterr().err
+    assert "no network" in err
+    assert err.count("\n") == 1
+
+
+def test_demo(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "demo_dataset", lambda: str(folder))
+    monkeypatch.setattr(demo, "PRESETS", {"quick": tuple(SMALL)})
+    status, out, err = call(["demo", "--out", tmp_path / "run", "--json"], capsys)
+    assert status == 0
+    assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert f"pictures: {tmp_path / 'run' / 'compare' / 'index.html'}" in err
+    assert (tmp_path / "run" / "compare" / "index.html").is_file()
+
+
+def test_errors_that_are_ours_to_mend_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: Any) -> None:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(runs, "evaluate_run", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(["evaluate", "run"])
+
+
+def test_ctrl_c_before_training_starts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*arguments: Any) -> SimpleNamespace:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "evaluate_run", interrupted)
+    assert call(["evaluate", "run"], capsys) == (130, "", "wrf-mi: interrupted\n")
