@@ -66,14 +66,16 @@ class FitState:
             self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
 
     def change_density(self, change: DensityChange) -> None:
-        """Replace the set of Gaussians; what is fresh starts without momentum."""
+        """Replace the set of Gaussians; what is fresh starts without momentum, what is new without a past mean."""
         first, second, count = self.moments()
-        mean = self.mean_params()
+        before, mean = self.params(), self.mean_params()
         for name, values in change.parameters.items():
             fresh = np.broadcast_to(change.fresh, values.shape)
             first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
             second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
-            mean[name] = np.where(fresh, values, mean[name][:, change.source]).astype(np.float32)
+            # A clone's original has a new opacity: the old one's mean beside the clone would count it twice.
+            new = fresh | (values != before[name][:, change.source])
+            mean[name] = np.where(new, values, mean[name][:, change.source]).astype(np.float32)
             self.adam[name] = to_tensor(values)
         self.mean = {name: to_tensor(values) for name, values in mean.items()}
         self._set_moments(first, second, count)

@@ -41,7 +41,7 @@ class Case:
     arguments: tuple[str, ...]
 
 
-SHORT = ("--set", "steps=4000", "--set", "hold_out=0")
+SHORT = ("--set", "steps=3000", "--set", "hold_out=0")
 """The schedule of the blocked split, whose five folds are fitted in turn."""
 
 

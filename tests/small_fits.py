@@ -1,0 +1,34 @@
+"""Short fits of few Gaussians to the spectra of `made_spectra`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from wrf_mi.core import Record, Split
+from wrf_mi.fit.config import TrainConfig, with_settings
+from wrf_mi.measure import make_splits
+
+QUICK = (
+    "initial.gaussians=8",
+    "initial.size_deg=15",
+    "optimiser.warm_up=5",
+    "optimiser.averaging=0.9",
+    "density.every=0",
+    "log_every=5",
+    "validate_every=20",
+)
+"""Eight Gaussians in all tests, so that most find their kernels compiled."""
+
+
+def settings(*own: str, model: str = "wrf-gs+") -> TrainConfig:
+    return with_settings(TrainConfig(model=model), [*QUICK, *own])
+
+
+def official(record: Record) -> Split:
+    return make_splits(record, "official")[0]
+
+
+def stop_after(steps: int) -> Callable[[], bool]:
+    """A ``stop``, which is asked after each step but a run's last, that says yes when asked so often."""
+    asked = iter(range(1, steps + 1))
+    return lambda: next(asked) >= steps
