@@ -31,7 +31,7 @@ from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
 from .predictor import Predictor
 from .state import FitState
-from .trainer import Progress, Trainer, final_params, make_field
+from .trainer import Progress, Trainer, check_rows, final_params, make_field
 
 FORMAT = 1
 """Version of ``checkpoint.npz``."""
@@ -157,7 +157,6 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     Raises:
         InputError: the folder holds something already, or the split has rows that the record has not.
     """
-    _check_rows(split, record, f"split {split.name}")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}"
@@ -169,13 +168,6 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     return trainer
 
 
-def _check_rows(split: Split, record: Record, source: str) -> None:
-    rows = np.concatenate([split.train, split.validation, split.test])
-    bad = rows[(rows < 0) | (rows >= len(record))]
-    if len(bad):
-        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
-
-
 def load_rows(folder: Path, record: Record) -> Split:
     """The rows of a run.
 
@@ -183,7 +175,7 @@ def load_rows(folder: Path, record: Record) -> Split:
         InputError: no split file, a damaged one, or one with rows that the record has not.
     """
     split = load_split(folder / SPLIT)
-    _check_rows(split, record, str(folder / SPLIT))
+    check_rows(split, record, str(folder / SPLIT))
     return split
 
 

@@ -19,6 +19,7 @@ from ..field.models import WrfGs, WrfGsPlus
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.tiles import Plane
+from .device import Recorded
 
 Field = WrfGs | WrfGsPlus
 Loss = Callable[[Any, Any, int, int, int], Any]
@@ -111,7 +112,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         one step of ``adam`` in place and returns the new running mean of the parameters.
     """
 
-    @dr.freeze
+    @Recorded
     def step(
         adam: Adam,
         mean: Params,
@@ -152,7 +153,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
 def make_prediction(field: Field) -> Callable[..., Any]:
     """A recorded prediction: ``predict(params, tx_pos, pose, plane) -> greys``, without gradients."""
 
-    @dr.freeze
+    @Recorded
     def predict(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
         with dr.suspend_grad():
             return grey(field, params, tx_pos, pose, plane)

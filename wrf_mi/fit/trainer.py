@@ -91,6 +91,18 @@ def peak_memory_mb() -> float:
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 
 
+def check_rows(split: Split, record: Record, source: str) -> None:
+    """Refuse a split with rows that the record has not; ``source`` says where the split comes from.
+
+    Raises:
+        InputError: such a row.
+    """
+    rows = np.concatenate([split.train, split.validation, split.test])
+    bad = rows[(rows < 0) | (rows >= len(record))]
+    if len(bad):
+        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
+
+
 class Trainer:
     """Fits one field to the training rows of one split.
 
@@ -118,6 +130,7 @@ class Trainer:
     ) -> None:
         if record.task != "spectrum":
             raise InputError(f"{record.name}: task {record.task!r}; this trainer fits spectra")
+        check_rows(split, record, f"split {split.name}")
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
         self.field = field or make_field(config)
@@ -138,11 +151,7 @@ class Trainer:
         self.seconds = 0.0
 
     def record_functions(self) -> None:
-        """Forget recorded kernels: they hold for one number of Gaussians.
-
-        Dr.Jit replays a recording for arrays of other sizes where it believes that only sizes differ, but the
-        number of Gaussians also stands in the kernels as a constant.
-        """
+        """Forget recorded kernels: the number of Gaussians stands in them as a constant."""
         self._step = make_step(self.field, self._rates(), self._loss)
         self._predictor: Predictor | None = None
 
