@@ -60,9 +60,11 @@ def make_run(
 def write_log(path):
     path.mkdir(exist_ok=True)
     with (path / "log.jsonl").open("w") as file:
-        for step in range(4):
+        # The last score is of rows that are trained on by then: it belongs in no picture.
+        for step in range(5):
             score = 0.2 * step if step else None
             entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "validation_ssim": score, "gaussians": 5}
+            entry["held_out"] = step < 4
             file.write(json.dumps(entry) + "\n")
 
 
@@ -212,7 +214,10 @@ def cut_truth(run):
         (remove("predictions.npz"), "predictions.npz: missing"),
         (replace("metrics.json", "{"), "not readable as JSON"),
         (replace("predictions.npz", "not a zip"), "predictions.npz: not readable"),
-        (replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_ssim": 1}\n{"st'), "line 2 is no log entry"),
+        (
+            replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_ssim": 1, "held_out": true}\n{"st'),
+            "line 2 is no log entry",
+        ),
         (replace("config.yaml", "seed: [1"), "not readable as YAML"),
         (edit_metrics(task="rssi"), "only runs on spectra"),
         (edit_metrics(n_test=...), "no n_test"),

@@ -127,6 +127,18 @@ def test_a_gradient_that_is_not_a_number_changes_nothing(one_gateway: Record) ->
     assert not trainer.state.urge.numpy().any()
 
 
+def test_a_run_that_is_stopped_reports_what_broke_since_the_last_line(one_gateway: Record) -> None:
+    def broken(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return dr.sum(prediction) * float("nan")
+
+    saved: list[bool] = []
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"), loss=broken)
+    with pytest.raises(NumericsError, match="loss or gradient not finite"):
+        trainer.run(save=lambda: saved.append(True), stop=stop_after(2))
+    assert trainer.state.step == 2
+    assert not saved
+
+
 def test_parameters_that_are_not_numbers_are_named(one_gateway: Record) -> None:
     trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"))
     params = trainer.state.params()

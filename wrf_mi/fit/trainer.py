@@ -31,7 +31,7 @@ from .step import Field, Loss, TrainingData, device_pose, make_step, watched
 
 
 class NumericsError(RuntimeError):
-    """A loss or gradient was not finite; names the step and the parameter group."""
+    """A loss or gradient was not finite; says within which steps and which groups were watched."""
 
     exit_status = 1
 
@@ -247,6 +247,8 @@ class Trainer:
                 save()
         dr.sync_thread()
         self.seconds = before + time.perf_counter() - start
+        if broken[0] > 0:  # stopped between two lines of the log
+            raise NumericsError(self._diagnose())
         save()
         return state.step == config.steps
 
@@ -275,7 +277,7 @@ class Trainer:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
 
     def _diagnose(self) -> str:
-        """Say which parameter groups are not finite, or which gradients would be at the last good parameters."""
+        """Say which parameters are not finite or, as a broken step is not taken, which groups were watched."""
         bad = [name for name, values in self.state.params().items() if not np.isfinite(values).all()]
         if bad:
             return f"step {self.state.step}: parameters not finite: {', '.join(bad)}"

@@ -108,14 +108,15 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
             raise BenchFailed(f"bench {name}: `wrf-mi {' '.join(call)}` ended with status {status}")
         # The time of the whole process means something only where it ran in one go.
         wall = None if resumed else time.perf_counter() - start
-        write_atomically(folder / "bench.json", json.dumps({"wall_seconds": wall, "date": time.strftime("%Y-%m-%d")}))
+        # Written when it is measured: the table may be made again elsewhere.
+        measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine()}
+        write_atomically(folder / "bench.json", json.dumps(measured))
     config = yaml.safe_load((folder / CONFIG).read_text())
     return {
         "case": name,
         "title": case.title,
         "command": "wrf-mi " + " ".join(arguments),
         **json.loads((folder / "bench.json").read_text()),
-        "machine": machine(),
         "versions": config["versions"],
         "metrics": json.loads((folder / METRICS).read_text()),
     }

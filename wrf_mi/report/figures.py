@@ -137,7 +137,7 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
 
 
 def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
-    """Score on validation rows over training time.
+    """Score on validation rows, while they are held out, over training time.
 
     Args:
         curves: pairs (seconds, SSIM) of each run by its name.
@@ -148,7 +148,7 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figu
         seconds, score = zip(*points, strict=True)
         axes.plot(seconds, score, marker=".", label=name)
     axes.set_xlabel("training time (s)")
-    axes.set_ylabel("SSIM on validation rows")
+    axes.set_ylabel("SSIM on held-out validation rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -41,7 +41,7 @@ class Run:
         prediction: grey values, shape [n_rx, m, H, W].
         truth: the same shape.
         reference: the blend of the four nearest training spectra, the same shape.
-        validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows).
+        validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
     """
 
     path: Path
@@ -164,14 +164,15 @@ def _read_seed(folder: Path, metrics: dict[str, Any]) -> int | None:
 
 
 def _read_log(path: Path) -> list[tuple[float, float]]:
-    """Pairs (seconds, validation SSIM); methods without training leave no log."""
+    """Pairs (seconds, SSIM on held-out validation rows); methods without training leave no log."""
     if not path.is_file():
         return []
     points = []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         try:
             entry = json.loads(line)
-            if entry.get("validation_ssim") is not None:
+            # Once the fit trains on the validation rows, their score says nothing about rows it has not seen.
+            if entry["validation_ssim"] is not None and entry["held_out"]:
                 points.append((float(entry["seconds"]), float(entry["validation_ssim"])))
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
