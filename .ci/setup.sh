@@ -49,4 +49,10 @@ if ! { new_enough "$venv/bin/python" && "$venv/bin/python" -m pip --version >/de
 fi
 echo "set-up: installing the package and its dependencies into $venv (a minute or two)" >&2
 "$venv/bin/python" -m pip install -q -e '.[dev]'
+# Open3D, which `wrf-mi mesh` uses, is linked against libusb for the sake of depth cameras.
+if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
+    apt_install libusb-1.0-0 || true
+    "$venv/bin/python" -c 'import open3d' 2>/dev/null ||
+        stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y libusb-1.0-0"
+fi
 "$venv/bin/python" -m wrf_mi.doctor --install-llvm

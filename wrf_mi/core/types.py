@@ -38,12 +38,17 @@ class Record:
 
     Attributes:
         name: of the data set.
-        task: what ``observation`` holds: ``"spectrum"`` is grey values [n_rx, n, height, width] in 0..1.
-        tx_pos_m: shape [n, 3], world frame, metres.
-        receivers: the ``n_rx`` receivers.
-        observation: float32, first axes [n_rx, n].
+        task: what ``observation`` holds. ``"spectrum"``: grey values [n_rx, n, height, width] in 0..1, float32.
+            ``"rssi"``: received power [n_rx, n] in dBm, float32, NaN where nothing was received.
+            ``"csi"``: channel coefficients [n_rx, n, subcarriers], complex64.
+        tx_pos_m: positions of the moving end [n, 3], world frame, metres; by reciprocity it is the transmitter.
+        receivers: the ``n_rx`` receivers, which stand still.
+        observation: first axes [n_rx, n].
         official: training and test rows (from 0) that came with the data, or None.
         folds: the spatial block of each row, shape [n], or None.
+        frequencies_hz: of the carrier, shape [1], or of each subcarrier; None where the data do not tell.
+        array_m: elements of the antenna array behind a spectrum [m, 3], receiver's frame, metres, or None.
+        tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         source: where it was read from.
     """
 
@@ -51,9 +56,12 @@ class Record:
     task: str
     tx_pos_m: FloatArray
     receivers: tuple[Receiver, ...]
-    observation: NDArray[np.float32]
+    observation: NDArray[np.float32] | NDArray[np.complex64]
     official: tuple[IntArray, IntArray] | None = None
     folds: IntArray | None = None
+    frequencies_hz: FloatArray | None = None
+    array_m: FloatArray | None = None
+    tx_heading_rad: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:

@@ -1,0 +1,1 @@
+"""Traced and learned fields combined at a receiver, in one differentiable graph."""

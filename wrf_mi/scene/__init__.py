@@ -1,0 +1,1 @@
+"""From LiDAR to a scene that Mitsuba and Sionna RT both open."""
