@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from made_flat import write_flat
 
 if TYPE_CHECKING:
     from wrf_mi.core import Record
@@ -44,3 +45,9 @@ def folder(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Pat
     from wrf_mi.measure import write_spectrum_folder
 
     return write_spectrum_folder(tmp_path_factory.mktemp("data") / "made-here", one_gateway, bits=16)
+
+
+@pytest.fixture(scope="session")
+def flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Signal strengths in a flat of one room."""
+    return write_flat(tmp_path_factory.mktemp("data") / "flat")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
 import pytest
 
 from wrf_mi.core import InputError
-from wrf_mi.report.bench import CASES, bench, read_results, table
+from wrf_mi.report import bench_plan
+from wrf_mi.report.bench import CASES, CHECKS, bench, check_table, read_results, table
+from wrf_mi.report.check import main
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 RESULTS = CHECKOUT / "benchmarks" / "results"
@@ -38,7 +41,7 @@ def test_table_has_a_line_for_each_result() -> None:
 def test_results_come_in_the_order_of_the_cases(tmp_path: Path) -> None:
     for case in ("demo", "wrf-gs-official"):
         (tmp_path / f"{case}.json").write_text(json.dumps(result(case, 0.9)))
-    assert [r["case"] for r in read_results(tmp_path)] == ["wrf-gs-official", "demo"]
+    assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs-official", "demo"]
 
 
 def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
@@ -47,15 +50,43 @@ def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", CHECKS)
+def test_checks_say_what_data_they_lack(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The function is there; without data it is one line, exit status 2 and no file."""
+    module, _, function = CHECKS[name].function.partition(":")
+    assert callable(getattr(importlib.import_module(f"wrf_mi.report.{module}"), function))
+    if name == "traced-and-splatted":
+        return  # needs no data
+    monkeypatch.setenv("WRF_MI_DATA", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(CHECKS[name].function, str(tmp_path / "out.json")) == 2
+    assert "not on this machine" in capsys.readouterr().err
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
+    monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
+    assert main("bench_plan:flat_plan", str(tmp_path / "out.json")) == 0
+    assert json.loads((tmp_path / "out.json").read_text()) == figures
+    line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
+    assert line == "| mesh: walls | **0.9** | 0.8 |"
+
+
 def test_readme_shows_the_stored_results() -> None:
     readme = (CHECKOUT / "README.md").read_text()
-    shown = readme.split("<!-- figures -->")[1].split("<!-- /figures -->")[0]
-    assert table(read_results(RESULTS)) in shown
+    trained, checked = read_results(RESULTS)
+    for name, text in (("figures", table(trained)), ("checks", check_table(checked))):
+        assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
 
 
 def test_stored_results_are_complete() -> None:
-    stored = read_results(RESULTS)
-    assert [r["case"] for r in stored] == list(CASES)
-    for r in stored:
+    trained, checked = read_results(RESULTS)
+    assert [r["case"] for r in trained] == list(CASES)
+    assert [r["case"] for r in checked] == list(CHECKS)
+    for r in [*trained, *checked]:
         assert r["command"].startswith("wrf-mi ")
-        assert {"machine", "versions", "date", "metrics"} <= set(r)
+        assert {"machine", "versions", "date"} <= set(r)
+        assert "metrics" in r or r["figures"]["rows"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import re
@@ -48,7 +49,7 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
 
 
 def test_the_subcommands() -> None:
-    expected = {"doctor", "data", "train", "evaluate", "predict", "compare", "bench", "demo"}
+    expected = {"doctor", "data", "mesh", "train", "trace", "evaluate", "predict", "compare", "bench", "demo"}
     assert {name[0] for name in commands(_parser()) if name} == expected
 
 
@@ -296,36 +297,55 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     assert "SSIM 0.500 (validation rows)  8 Gaussians  1:01 left" in shown
 
 
-def test_demo_takes_real_spectra_where_it_can(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_demo_takes_real_data_where_it_can(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(demo, "locate", lambda name: folder)
-    assert demo.demo_dataset() == "rfid-lab"
+    assert demo.here("rfid-lab") == folder
     monkeypatch.setattr(demo, "locate", lambda name: None)
     monkeypatch.setattr(demo, "fetch", lambda name: folder)
-    assert demo.demo_dataset() == "rfid-lab"
+    assert demo.here("rfid-lab") == folder
     assert capsys.readouterr().err == ""
 
     def offline(name: str) -> Path:
         raise InputError("no network")
 
     monkeypatch.setattr(demo, "fetch", offline)
-    assert demo.demo_dataset() == "laboratory"
-    err = capsys.readouterr().err
-    assert "no network" in err
-    assert err.count("\n") == 1
+    assert demo.here("rfid-lab") is None
+    assert capsys.readouterr().err == "no rfid-lab (no network)\n"
 
 
-def test_demo(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_demo_on_real_data(
+    folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo, "demo_dataset", lambda: str(folder))
+    """A field on spectra and a traced flat, here of data made up in the same layouts."""
+    monkeypatch.setattr(demo, "REAL", str(folder))
+    monkeypatch.setattr(demo, "FLAT", str(flat_folder))
+    monkeypatch.setattr(demo, "locate", Path)
     monkeypatch.setattr(demo, "PRESETS", {"quick": tuple(SMALL)})
     status, out, err = call(["demo", "--out", tmp_path / "run", "--json"], capsys)
-    assert status == 0
+    assert status == 0, err
     assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert f"pictures: {tmp_path / 'run' / 'compare' / 'index.html'}" in err
-    assert (tmp_path / "run" / "compare" / "index.html").is_file()
+    page = (tmp_path / "run" / "compare" / "index.html").read_text()
+    for row in ("wrf-gs+", "ray-tracing", "blend of 4 nearest", "blend of 100 nearest"):
+        assert row in page
+    assert json.loads((tmp_path / "run" / "traced" / "metrics.json").read_text())["task"] == "rssi"
+
+
+def test_demo_in_the_embedded_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without real data: the field and the ray tracer, on the mesh of the room's scan, on the same rows."""
+    monkeypatch.setattr(demo, "here", lambda name: None)
+    monkeypatch.setattr(demo, "PRESETS", {"quick": tuple(SMALL)})
+    status, _, err = call(["demo", "--out", tmp_path / "run"], capsys)
+    assert status == 0, err
+    with (tmp_path / "run" / "compare" / "compare.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["model"] for row in rows] == ["wrf-gs+", "ray-tracing", "idw4"]
+    assert {row["dataset"] for row in rows} == {"laboratory"}
+    assert (tmp_path / "run" / "scene" / "preview.png").is_file()
 
 
 def test_errors_that_are_ours_to_mend_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ import mitsuba as mi  # noqa: E402
 from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix  # noqa: E402
 from wrf_mi.field import gaussians_from_points, random_gaussians  # noqa: E402
 from wrf_mi.field.density import SPLIT_SHRINK, DensityChange, adapt, logit, reset_opacity  # noqa: E402
-from wrf_mi.fit.points import read_points  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
+from wrf_mi.scene.points import read_points  # noqa: E402
 
 SPLIT_RAD = np.radians(5.0)
 LEAST_OPACITY = 0.005

@@ -14,6 +14,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import read_spectrum_folder, write_spectrum_folder
 
 READ_SECONDS = 0.5
@@ -107,6 +108,49 @@ def test_positions_survive_exactly(tmp_path_factory: pytest.TempPathFactory, pos
     read = read_spectrum_folder(write_spectrum_folder(tmp_path_factory.mktemp("p") / "a", record))
     np.testing.assert_array_equal(read.tx_pos_m, positions)
     assert read.official is None
+
+
+def test_carrier_and_array_are_optional(folder: Path, tmp_path: Path):
+    record = read_spectrum_folder(folder)
+    assert (record.frequencies_hz, record.array_m) == (None, None)
+    elements = np.random.default_rng(3).normal(size=(5, 3))
+    told = replace(record, frequencies_hz=np.array([915.25e6]), array_m=elements)
+    read = read_spectrum_folder(write_spectrum_folder(tmp_path / "told", told))
+    assert_same(read, told)
+    np.testing.assert_array_equal(read.frequencies_hz, [915.25e6])
+    np.testing.assert_array_equal(read.array_m, elements)
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write("frequency_hz: 920e6\narray: {rows: 2, columns: 3, spacing_m: 0.16}\n")
+    read = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(read.frequencies_hz, [920e6])
+    np.testing.assert_array_equal(read.array_m, planar_array(2, 3, 0.16))
+    assert [r.name for r in read.receivers] == ["gateway1"]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
+        ("frequency_hz: .inf", "frequency_hz is inf"),
+        ("frequency_hz: fast", "frequency_hz is 'fast'"),
+        ("frequency_hz: [1, 2]", r"frequency_hz is \[1, 2\]"),
+        ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
+        ("array: {rows: 4, columns: 4}", "array is .*; give rows, columns and spacing_m"),
+        ("array: {rows: 4.5, columns: 4, spacing_m: 1}", "array is"),
+        ("array: {rows: 0, columns: 4, spacing_m: 1}", "array is"),
+        ("array: {rows: 4, columns: 4, spacing_m: .nan}", "array is"),
+        ("array: {elements_m: [[0, 1], [0, 2]]}", "array is"),
+        ("array: {elements_m: [[0, 1, .nan]]}", "array is"),
+        ("array: {elements_m: []}", "array is"),
+    ],
+)
+def test_wrong_carrier_or_array_is_one_line(folder: Path, line: str, message: str):
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(InputError, match=message) as error:
+        read_spectrum_folder(folder)
+    assert str(error.value).startswith(f"{folder / 'gateway_info.yml'}: ")
+    assert "\n" not in str(error.value)
 
 
 def text(name: str, old: str, new: str):

@@ -89,6 +89,33 @@ def test_blocks_are_the_tightest_of_several_starts():
     assert spread(position_folds(record)) <= np.percentile(starts, 25)
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_rows_that_no_receiver_received_are_left_out(rule: str):
+    record = make_record()
+    observation = np.repeat(record.observation, 2, axis=0)
+    observation[:, [3, 17, 40]] = np.nan
+    observation[0, 20:30] = np.nan  # received by the other
+    heard = replace(record, receivers=record.receivers * 2, observation=observation)
+    used = [np.concatenate([split.all_train, split.test]) for split in make_splits(heard, rule)]
+    for rows in used:
+        assert sorted(rows.tolist()) == [row for row in range(50) if row not in (3, 17, 40)]
+
+
+def test_a_part_that_was_not_received_at_all_is_refused():
+    record = make_record()
+    observation = record.observation.copy()
+    observation[:, record.folds == 2] = np.nan
+    deaf = replace(record, observation=observation)
+    with pytest.raises(InputError, match="split blocked:2: no row that was received scores; use another split"):
+        make_splits(deaf, "blocked")
+    assert len(make_splits(deaf, "blocked:1")[0].test) == 10
+    observation[:] = np.nan
+    with pytest.raises(InputError, match="0 rows"):
+        make_splits(deaf, "random")
+    with pytest.raises(InputError, match="split official: no row that was received trains"):
+        make_splits(deaf, "official")
+
+
 def test_seed_decides():
     record = make_record(200, folds=False)
     for rule in ("random", "trajectory"):

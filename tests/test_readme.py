@@ -17,7 +17,7 @@ from wrf_mi.cli import _parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.fit.config import TrainConfig, describe, with_settings
 from wrf_mi.measure import write_spectrum_folder
-from wrf_mi.report.bench import CASES
+from wrf_mi.report.bench import CASES, CHECKS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 README = CHECKOUT / "README.md"
@@ -101,12 +101,12 @@ def test_commands_parse(path: Path) -> None:
             pytest.fail(f"{path.name}: {line}")
         with_settings(TrainConfig(), getattr(parsed, "set", []))
         for name in getattr(parsed, "names", []):
-            assert name in CASES, line
+            assert name in {**CASES, **CHECKS}, line
 
 
 def test_readme_shows_every_step_of_the_way() -> None:
     shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
-    assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo"}
+    assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace"}
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 
@@ -137,7 +137,7 @@ def test_model_page_states_the_defaults_and_constants() -> None:
 
 def test_results_page_names_every_case() -> None:
     rows = cell_rows((CHECKOUT / "docs" / "results.md").read_text(encoding="utf-8"))
-    assert [name for name, *_ in rows] == list(CASES)
+    assert [name for name, *_ in rows] == [*CASES, *CHECKS]
 
 
 def test_notebooks_are_stored_without_output() -> None:

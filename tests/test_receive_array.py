@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 
 from wrf_mi.core import pixel_directions, unit_vectors
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import load
-from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale, planar_array
+from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16

@@ -14,18 +14,19 @@ from wrf_mi_scenes.build_laboratory import build, sheet
 
 from wrf_mi import backend
 from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import make_splits, registry
-from wrf_mi.receive.array import planar_array
+from wrf_mi.receive import element_signals
 from wrf_mi.trace import (
-    element_signals,
+    TraceOptions,
     laboratory_record,
     load_record,
     open_scene,
     set_frequency,
-    sionna_orientation,
     trace_paths,
     trace_spectra,
 )
+from wrf_mi.trace.fields import sionna_orientation
 from wrf_mi.trace.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.trace.materials import BELOW_1_GHZ
 
@@ -90,18 +91,18 @@ def test_free_space(empty: Any, turn_deg: float):
     receiver = upright(turn_deg, (1.0, 2.0, 3.0))
     towards = receiver.to_world @ np.array([0.2, 0.1, 1.0])
     positions = receiver.position_m + np.array([4.0, 40.0])[:, None] * towards
-    paths = trace_paths(empty, positions, receiver)
+    paths = trace_paths(empty, positions, receiver).paths
     length = np.linalg.norm(positions - receiver.position_m, axis=-1)
-    assert paths.transmitter.tolist() == [0, 1]
+    assert paths.tx.tolist() == [0, 1]
     assert paths.bounces.tolist() == [0, 0]
     np.testing.assert_allclose(paths.length_m, length, rtol=1e-12)
-    np.testing.assert_allclose(paths.direction, (positions - receiver.position_m) / length[:, None], atol=1e-12)
+    np.testing.assert_allclose(paths.arrival, (positions - receiver.position_m) / length[:, None], atol=1e-12)
     np.testing.assert_allclose(np.abs(paths.gain), WAVELENGTH_M / (4 * np.pi * length), rtol=SINGLE)
 
     elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
     distance = np.linalg.norm(positions[:, None] - elements, axis=-1)
     expected = WAVELENGTH_M / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / WAVELENGTH_M)
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)
+    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0]
     np.testing.assert_allclose(signals, expected, rtol=SINGLE)
 
     spectrum = trace_spectra(empty, positions, receiver, ARRAY_M, FREQUENCY_HZ)
@@ -119,7 +120,7 @@ def test_two_paths_over_a_metal_floor(ground: Any):
     """The reflected wave comes from the image below the floor; a vertical field keeps its sign."""
     receiver = upright(10, (0.0, 0.0, 1.5))
     source = np.array([[6.0, 1.0, 1.1]])
-    paths = trace_paths(ground, source, receiver, max_depth=2)
+    paths = trace_paths(ground, source, receiver, TraceOptions(max_depth=2)).paths
     assert paths.bounces.tolist() == [0, 1]
     elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
     expected = np.zeros(16, complex)
@@ -127,14 +128,14 @@ def test_two_paths_over_a_metal_floor(ground: Any):
         assert length == pytest.approx(np.linalg.norm(place - receiver.position_m), abs=LENGTH_M)
         distance = np.linalg.norm(place - elements, axis=-1)
         expected += WAVELENGTH_M / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / WAVELENGTH_M)
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0]
+    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0]
     np.testing.assert_allclose(signals, expected, atol=10 * SINGLE * np.abs(expected).max())
 
 
 def test_a_transmitter_without_a_path_is_dark(ground: Any):
-    paths = trace_paths(ground, [[3.0, 0, -1], [3.0, 0, 1]], upright(0, (0.0, 0, 1)))
-    assert set(paths.transmitter.tolist()) == {1}
-    signals = element_signals(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)
+    paths = trace_paths(ground, [[3.0, 0, -1], [3.0, 0, 1]], upright(0, (0.0, 0, 1))).paths
+    assert set(paths.tx.tolist()) == {1}
+    signals = element_signals(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)[0]
     assert (signals[0] == 0).all()
     assert (signals[1] != 0).all()
 
@@ -152,18 +153,17 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
     scene = open_scene(write_scene(tmp_path, walls), FREQUENCY_HZ)
     receiver = upright(195, (5.0, 2.4, 1.2))
     source = np.array([1.3, 2.9, 1.6])
-    paths = trace_paths(scene, source[None], receiver)
+    paths = trace_paths(scene, source[None], receiver).paths
     assert len(paths.gain) == 8  # up to one reflection at each of three mutually perpendicular mirrors
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0]
+    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0]
 
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     pattern = scene.rx_array.antenna_pattern
     x, y, z = (ARRAY_M / WAVELENGTH_M).T.astype(np.float32)
     scene.rx_array = rt.AntennaArray(pattern, mi.Point3f(z, x, y))
     angles = mi.Point3f(sionna_orientation(receiver.orientation_xyzw))
     scene.add(rt.Receiver("array", mi.Point3f(receiver.position_m.tolist()), angles))
     scene.add(rt.Transmitter("source", mi.Point3f(source.tolist())))
-    with pytest.raises(ValueError, match="has transmitters"):
-        trace_paths(scene, source[None], receiver)
     traced = rt.PathSolver(deterministic=True)(scene, synthetic_array=False, refraction=False, samples_per_src=10_000)
     a, _ = traced.cir(normalize_delays=False, out_type="numpy")
     reference = a[0, :, 0, 0, :, 0].sum(axis=-1)

@@ -20,7 +20,7 @@ import drjit as dr  # noqa: E402
 
 from wrf_mi.core import InputError, Record  # noqa: E402
 from wrf_mi.field import FIELDS, random_gaussians  # noqa: E402
-from wrf_mi.fit.device import to_float  # noqa: E402
+from wrf_mi.field.device import to_float  # noqa: E402
 from wrf_mi.fit.predictor import Predictor  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
@@ -235,7 +235,7 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
 
 
 def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
-    with pytest.raises(InputError, match="task 'rssi'; this trainer fits spectra"):
+    with pytest.raises(InputError, match="task 'rssi'; learned fields are fitted to spectra"):
         Trainer(replace(one_gateway, task="rssi"), official(one_gateway), settings())
     with pytest.raises(InputError, match="model 'nerf2' cannot be trained here"):
         Trainer(one_gateway, official(one_gateway), settings("model=nerf2"))

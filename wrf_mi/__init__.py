@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from .report.compare import compare
     from .report.figures import spectrum_table
     from .report.runs import Run, evaluate_run, resume, train
+    from .report.traced import trace_run
+    from .report.view import scene_view
+    from .scene.make import make_scene
+    from .trace import TraceOptions
     from .trace import load_record as load
 
 __version__ = "0.1.0"
@@ -28,15 +32,19 @@ _HOME = {
     "Record": "core",
     "Run": "report.runs",
     "Split": "core",
+    "TraceOptions": "trace",
     "TrainConfig": "fit.config",
     "Trainer": "fit.trainer",
     "compare": "report.compare",
     "evaluate_run": "report.runs",
     "fetch": "measure",
     "load": "trace:load_record",
+    "make_scene": "scene.make",
     "make_splits": "measure",
     "resume": "report.runs",
+    "scene_view": "report.view",
     "spectrum_table": "report.figures",
+    "trace_run": "report.traced",
     "train": "report.runs",
     "with_settings": "fit.config",
 }
@@ -48,15 +56,19 @@ __all__ = [
     "Record",
     "Run",
     "Split",
+    "TraceOptions",
     "TrainConfig",
     "Trainer",
     "compare",
     "evaluate_run",
     "fetch",
     "load",
+    "make_scene",
     "make_splits",
     "resume",
+    "scene_view",
     "spectrum_table",
+    "trace_run",
     "train",
     "with_settings",
 ]

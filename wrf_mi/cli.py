@@ -49,8 +49,8 @@ def _data_list(a: Arguments) -> int:
         _print_json(rows)
         return 0
     for row in rows:
-        print(f"{row['name']:<12} {row['task']:<9} {row['licence']:<5} {row['location'] or 'not here yet'}")
-        print(f"{'':<12} {row['origin']}")
+        print(f"{row['name']:<17}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
+        print(f"{'':<17}{row['origin']}")
     return 0
 
 
@@ -65,6 +65,33 @@ def _data_fetch(a: Arguments) -> int:
     return 0
 
 
+def _mesh(a: Arguments) -> int:
+    from .scene.make import make_scene
+    from .scene.register import read_pairs, register_pairs
+
+    pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
+    scene = make_scene(
+        a.points,
+        a.out,
+        units=a.units,
+        materials=a.materials,
+        height_m=a.height,
+        floor_m=a.floor,
+        resolution_m=a.resolution,
+        registration=None if pairs is None else pairs.matrix,
+        register_walls_of=a.register_walls,
+        replace=a.replace,
+    )
+    kinds = list(scene.materials.surfaces.values())
+    counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
+    if a.json:
+        _print_json({"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts})
+    else:
+        print(", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}")
+        print(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
+    return 0
+
+
 def _train(a: Arguments) -> int:
     from .fit.config import PRESETS, TrainConfig, describe, with_settings
     from .report.runs import resume, train
@@ -72,6 +99,13 @@ def _train(a: Arguments) -> int:
     if a.help_settings:
         print(describe())
         return 0
+    traced = (a.scene, a.material, a.paths, a.depth, a.reflections, a.rays, a.calibrate)
+    if a.model == "ray-tracing":
+        if not (a.scene and a.dataset and a.out) or a.resume or a.set or a.preset or a.deterministic:
+            raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
+        return _trace(a)
+    if any(value is not None for value in traced):
+        raise InputError("--scene and what is traced in it belong to --model ray-tracing")
     with _watch() as watch:
         if a.resume:
             given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset)
@@ -98,6 +132,27 @@ def _train(a: Arguments) -> int:
     return _show_metrics(run.metrics, folder, a.json)
 
 
+def _trace(a: Arguments) -> int:
+    from .report.traced import trace_run
+    from .trace.options import DEFAULTS, with_kinds
+
+    options = with_kinds(DEFAULTS, a.paths, max_depth=a.depth, max_reflections=a.reflections, rays=a.rays, seed=a.seed)
+    split = "official" if a.split is None else a.split
+    folder = trace_run(
+        a.scene,
+        a.dataset,
+        a.out,
+        options,
+        material=a.material,
+        split=split,
+        n_train=a.n_train,
+        seed=a.seed or 0,
+        calibration=a.calibrate,
+        progress=sys.stderr.isatty(),
+    )
+    return _show_metrics(json.loads((folder / "metrics.json").read_text()), folder, a.json)
+
+
 def _evaluate(a: Arguments) -> int:
     from .report.runs import evaluate_run
 
@@ -108,13 +163,20 @@ def _show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -
     if as_json:
         _print_json(metrics)
         return 0
-    own, blend = metrics["ssim"], metrics["reference"]["idw4"]
-    print(f"{'SSIM on ' + str(metrics['n_test']) + ' test rows':<28}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
-    for name, block in ((metrics["model"], own), ("blend of 4 nearest (idw4)", blend)):
-        print(f"{name:<28}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    from .report.metrics import TASKS
+
+    task = TASKS[metrics["task"]]
+    title = f"{task.label} on {metrics['n_test']} test rows"
+    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
+    named = (
+        (metrics["model"], metrics[task.block]),
+        (f"{task.reference_name} ({task.reference})", metrics["reference"][task.reference]),
+    )
+    for name, block in named:
+        print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
     print(
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
-        f"{metrics['ms_per_sample']:.1f} ms per spectrum, peak memory {metrics['peak_memory_mb']:.0f} MB"
+        f"{metrics['ms_per_sample']:.1f} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
     )
     if folder is not None:
         print(f"results: {folder}")
@@ -142,9 +204,9 @@ def _compare(a: Arguments) -> int:
 
 
 def _bench(a: Arguments) -> int:
-    from .report.bench import CASES, bench
+    from .report.bench import CASES, CHECKS, bench
 
-    rows = bench(a.names or list(CASES), Path(a.out), Path(a.runs))
+    rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs))
     if a.json:
         _print_json(rows)
     return 0
@@ -195,11 +257,27 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("fetch", _data_fetch, "download a data set, checked by SHA-256", json_output=False, where=data)
     sub.add_argument("name", metavar="NAME")
 
+    sub = command("mesh", _mesh, "make a scene for both tracers from a LiDAR scan, a plan or a mesh")
+    sub.add_argument(
+        "points", metavar="POINTS", help="scan (PLY, LAS, LAZ, XYZ, NPZ), plan (NPZ, PNG, ROS map YAML, CSV) or mesh"
+    )
+    sub.add_argument("--out", required=True, metavar="DIR", help="scene folder to make")
+    sub.add_argument("--units", default="m", help="of the coordinates: m (default), cm, mm or ft")
+    sub.add_argument("--height", type=float, metavar="M", help="from floor to ceiling; a plan needs it")
+    sub.add_argument("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
+    sub.add_argument("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
+    sub.add_argument("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
+    sub.add_argument("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
+    sub.add_argument("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
+    sub.add_argument("--replace", action="store_true", help="take the place of an existing scene folder")
+
     sub = command("train", _train, "fit a field to measured spectra and score it")
     sub.add_argument(
         "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
     )
-    sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+"), help="default: wrf-gs+")
+    sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+", "ray-tracing"), help="default: wrf-gs+")
+    sub.add_argument("--scene", metavar="SCENE", help="for ray-tracing, which is then the same as the command trace")
+    _add_tracing(sub)
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
     sub.add_argument(
         "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"
@@ -211,6 +289,15 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
     sub.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     sub.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped")
+
+    sub = command("trace", _trace, "predict by ray tracing and score it like a learned field")
+    sub.add_argument("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
+    sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
+    sub.add_argument("--out", metavar="RUN", required=True, help="run folder to make")
+    _add_tracing(sub)
+    sub.add_argument("--split", help="as for train; official by default")
+    sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
+    sub.add_argument("--seed", type=int, metavar="N", help="of split and rays; default: 0")
 
     sub = command("evaluate", _evaluate, "score a run on its held-out rows")
     sub.add_argument("run", metavar="RUN")
@@ -235,6 +322,18 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("demo", _demo, "the main job on real spectra, or on a traced room where there are none")
     sub.add_argument("--out", metavar="RUN", help="run folder (default: a new one in runs/)")
     return parser
+
+
+def _add_tracing(sub: Any) -> None:
+    """Options of what is traced."""
+    sub.add_argument("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
+    kinds = "line-of-sight,reflection,transmission,diffraction,scattering"
+    sub.add_argument("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
+    sub.add_argument("--depth", type=int, metavar="N", help="interactions per path at most (default: 3)")
+    sub.add_argument("--reflections", type=int, metavar="N", help="of these reflections at most (default: all)")
+    fit = "fit antenna patterns, or materials too, to the training rows (signal strengths)"
+    sub.add_argument("--calibrate", choices=("patterns", "all"), help=fit)
+    sub.add_argument("--rays", metavar="N", help="that search from each source, or auto: until no more paths are found")
 
 
 def _number(text: str) -> int | float:

@@ -4,7 +4,7 @@ Run ``python -m wrf_mi_scenes.build_laboratory`` after a change; it rewrites ``l
 was measured or taken from anywhere: the room is made up, so that a machine without data can still trace one.
 
 Walls, boards and panes are single sheets, because Sionna RT treats a surface as a slab whose thickness
-belongs to the material (``thickness_m`` below); only the metal cabinets are closed boxes.
+belongs to the material (`mitsuba_xml.THICKNESS_M`); only the metal cabinets are closed boxes.
 """
 
 from __future__ import annotations
@@ -17,32 +17,11 @@ import numpy as np
 import trimesh
 import yaml
 
+from .mitsuba_xml import THICKNESS_M, scene_xml
 from .registry import content_sha256
 
 LENGTH, WIDTH, HEIGHT = 9.0, 7.0, 3.0
 """The room's inner size along x, y and z in metres; the origin is the floor's south-west corner."""
-
-THICKNESS_M = {
-    "itu_concrete": 0.25,
-    "itu_brick": 0.20,
-    "itu_plasterboard": 0.10,
-    "itu_ceiling_board": 0.02,
-    "itu_wood": 0.03,
-    "itu_glass": 0.012,
-    "itu_metal": 0.002,
-}
-"""Slab thickness of each material in metres: ordinary building practice."""
-
-COLOURS = {
-    "itu_concrete": "0.45 0.45 0.45",
-    "itu_brick": "0.65 0.55 0.45",
-    "itu_plasterboard": "0.80 0.80 0.76",
-    "itu_ceiling_board": "0.90 0.90 0.88",
-    "itu_wood": "0.50 0.33 0.18",
-    "itu_glass": "0.55 0.70 0.80",
-    "itu_metal": "0.35 0.36 0.40",
-}
-"""What the materials look like when Mitsuba renders the room."""
 
 Span = tuple[float, float]
 Mesh = trimesh.Trimesh
@@ -155,30 +134,6 @@ def laboratory_parts() -> dict[str, tuple[str, Mesh]]:
     }
 
 
-def scene_xml(parts: dict[str, tuple[str, Mesh]]) -> str:
-    """The Mitsuba scene file over ``meshes/<part>.ply``.
-
-    The BSDF names ``mat-itu_*`` are what Sionna RT turns into its ITU radio materials; Mitsuba itself sees
-    plain two-sided diffuse ones.
-    """
-    lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
-    for material in dict.fromkeys(material for material, _ in parts.values()):
-        lines += [
-            f'    <bsdf type="twosided" id="mat-{material}">',
-            f'        <bsdf type="diffuse"><rgb name="reflectance" value="{COLOURS[material]}"/></bsdf>',
-            "    </bsdf>",
-        ]
-    for name, (material, _) in parts.items():
-        lines += [
-            f'    <shape type="ply" id="mesh-{name}">',
-            f'        <string name="filename" value="meshes/{name}.ply"/>',
-            '        <boolean name="face_normals" value="true"/>',
-            f'        <ref id="mat-{material}" name="bsdf"/>',
-            "    </shape>",
-        ]
-    return "\n".join([*lines, "</scene>", ""])
-
-
 def build(folder: Path) -> None:
     """Write the scene's files into ``folder``: ``laboratory.xml``, ``meshes/*.ply`` and ``scene.yml``."""
     parts = laboratory_parts()
@@ -186,7 +141,8 @@ def build(folder: Path) -> None:
     meshes.mkdir(parents=True, exist_ok=True)
     for name, (_, mesh) in parts.items():
         mesh.export(meshes / f"{name}.ply", vertex_normal=False)
-    (folder / "laboratory.xml").write_text(scene_xml(parts), encoding="utf-8", newline="\n")
+    materials = {name: material for name, (material, _) in parts.items()}
+    (folder / "laboratory.xml").write_text(scene_xml(materials), encoding="utf-8", newline="\n")
     facts = {
         "description": "Made-up laboratory, 9 x 7 x 3 m: brick walls, windows, tables, metal shelves, an inner room",
         "licence": "MIT",
@@ -194,7 +150,7 @@ def build(folder: Path) -> None:
         "frame": "right-handed; x east, y north, z up; origin at the floor's south-west corner",
         "units": "m",
         "xml": "laboratory.xml",
-        "thickness_m": THICKNESS_M,
+        "thickness_m": {material: THICKNESS_M[material] for material in THICKNESS_M if material in materials.values()},
         "sha256": content_sha256(folder, "laboratory.xml"),
     }
     text = yaml.safe_dump(facts, sort_keys=False, width=110)

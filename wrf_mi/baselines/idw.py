@@ -12,38 +12,45 @@ from wrf_mi.core import InputError
 class InverseDistance:
     """Inverse-distance weighting of the nearest training rows.
 
-    A prediction is sum_i w_i y_i / sum_i w_i over the ``k`` nearest training positions with w_i = d_i^-power;
-    where training positions coincide with the one asked for, their mean.
+    A prediction is sum_i w_i y_i / sum_i w_i over the ``k`` nearest training positions with w_i = (d_i + s)^-power;
+    where training positions coincide with the one asked for and s = 0, their mean.
 
     Args:
         k: number of neighbours, at least 1; all rows where there are fewer.
         power: exponent of the distance.
+        softening_m: s in metres. Rows much nearer than that weigh the same, so that their noise averages out.
 
     Source: Shepard, "A two-dimensional interpolation function for irregularly-spaced data" (1968).
     """
 
-    def __init__(self, k: int = 4, power: float = 2) -> None:
+    def __init__(self, k: int = 4, power: float = 2, softening_m: float = 0) -> None:
         if k < 1:
             raise InputError(f"k = {k}: the blend needs at least one neighbour")
+        if not softening_m >= 0:
+            raise InputError(f"softening {softening_m} m: choose 0 or more")
         self.k = k
         self.power = power
+        self.softening_m = softening_m
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike) -> InverseDistance:
-        """Keep the training rows.
+        """Keep the training rows that were observed.
 
         Args:
             tx_pos: shape [n, 3], metres.
-            observation: shape [n, ...], any unit.
+            observation: shape [n, ...], any unit; rows with NaN, where nothing was received, are left out.
 
         Raises:
-            InputError: no rows, or two different numbers of them.
+            InputError: no rows, none that was observed, or two different numbers of them.
         """
         positions, values = np.asarray(tx_pos, float), np.asarray(observation)
         if len(positions) == 0 or len(positions) != len(values):
             raise InputError(
                 f"{len(positions)} positions and {len(values)} observations: give one per row, at least one"
             )
-        self._tree, self._values = KDTree(positions), values
+        observed = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
+        if not observed.any():
+            raise InputError(f"{len(values)} training rows: none of them was received; use another split")
+        self._tree, self._values = KDTree(positions[observed]), values[observed]
         return self
 
     def predict(self, tx_pos: ArrayLike) -> NDArray[np.floating]:
@@ -58,6 +65,7 @@ class InverseDistance:
         positions = np.asarray(tx_pos, float)
         k = min(self.k, len(self._values))
         distance, neighbour = self._tree.query(positions, k=list(range(1, k + 1)))
+        distance += self.softening_m
         nearest = distance[:, :1]
         # Relative to the nearest, so that tiny distances do not overflow; coincident rows alone count.
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -23,6 +23,15 @@ def elevation_rad(height: int) -> FloatArray:
     return np.arange(height, dtype=float) * (np.pi / 2 / height)
 
 
+def sphere_elevation_rad(height: int) -> FloatArray:
+    """Elevation of each of ``height`` rows over the full sphere, in radians, shape [height].
+
+    Row r lies at ``-90 + r * 180 / height`` degrees: row 0 points down, and the zenith has no row, as on the
+    hemisphere.
+    """
+    return np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
+
+
 def azimuth_rad(width: int) -> FloatArray:
     """Azimuth of each of ``width`` columns over the full circle, in radians, shape [width]."""
     return np.arange(width, dtype=float) * (2 * np.pi / width)
@@ -45,6 +54,11 @@ def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> FloatArray:
 def pixel_directions(height: int, width: int) -> FloatArray:
     """Unit vector of every pixel of a ``height`` x ``width`` spectrum, shape [height, width, 3]."""
     return unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None])
+
+
+def sphere_directions(height: int, width: int) -> FloatArray:
+    """Unit vector of every pixel of ``height`` x ``width`` over the full sphere, shape [height, width, 3]."""
+    return unit_vectors(azimuth_rad(width)[None, :], sphere_elevation_rad(height)[:, None])
 
 
 def azimuth_elevation(vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -5,7 +5,7 @@ from ..backend import init
 # Dr.Jit loads an LLVM of its own choice when it is imported: ours must be chosen before.
 init()
 
-from .gaussians import Gaussians
+from .gaussians import Gaussians, rows
 from .initial import InitialGaussians, gaussians_from_points, random_gaussians
 from .models import Encoding, WrfGs, WrfGsPlus
 
@@ -21,4 +21,5 @@ __all__ = [
     "WrfGsPlus",
     "gaussians_from_points",
     "random_gaussians",
+    "rows",
 ]

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Receiver
+from ..field.device import to_tensor
+from ..field.gaussians import Gaussians
 from ..splat.tiles import perception_plane
-from .device import to_tensor
 from .step import Field, Params, device_pose, make_prediction
 
 
@@ -47,6 +48,11 @@ class Predictor:
             self._predict, self._count = make_prediction(self._field), params["position"].shape[1]
         self._params = params
         dr.eval(self._params)
+
+    def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
+        """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
+        columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
+        return self._field.gaussians(self._params, to_tensor(columns))
 
     def __call__(self, tx_pos_m: ArrayLike, receiver: int = 0) -> NDArray[np.float32]:
         """Spectra of transmitters at one receiver.

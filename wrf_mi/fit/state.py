@@ -12,7 +12,7 @@ from drjit.opt import Adam
 from numpy.typing import NDArray
 
 from ..field.density import DensityChange
-from .device import to_float, to_tensor
+from ..field.device import to_float, to_tensor
 
 Arrays = dict[str, NDArray[Any]]
 

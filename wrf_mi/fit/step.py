@@ -19,7 +19,7 @@ from ..field.models import WrfGs, WrfGsPlus
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.tiles import Plane
-from .device import Recorded
+from .recorded import Recorded
 
 Field = WrfGs | WrfGsPlus
 Loss = Callable[[Any, Any, int, int, int], Any]

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians, gaussians_from_points, random_gaussians
 from ..field.density import adapt, reset_opacity
+from ..field.device import to_float, to_tensor
 from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
+from ..scene.points import read_points
 from ..splat.tiles import perception_plane
 from .config import TrainConfig
-from .device import to_float, to_tensor
-from .points import read_points
 from .predictor import Predictor
 from .schedule import plan
 from .state import FitState
@@ -129,7 +129,8 @@ class Trainer:
         loss: Loss | None = None,
     ) -> None:
         if record.task != "spectrum":
-            raise InputError(f"{record.name}: task {record.task!r}; this trainer fits spectra")
+            what = f"{record.name}: task {record.task!r}; learned fields are fitted to spectra"
+            raise InputError(f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
         check_rows(split, record, f"split {split.name}")
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])

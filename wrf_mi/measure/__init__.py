@@ -1,6 +1,8 @@
 """Measurements: records, their files, their public originals and their splits."""
 
+from .ble_folder import read_ble_folder
 from .fetch import fetch
+from .newrf import read_newrf
 from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
 from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
 from .splits import SPLIT_NAMES, load_split, make_splits, save_split
@@ -15,6 +17,8 @@ __all__ = [
     "load",
     "load_split",
     "make_splits",
+    "read_ble_folder",
+    "read_newrf",
     "read_spectrum_folder",
     "save_split",
     "user_cache",

@@ -1,9 +1,15 @@
-"""Downloading known data sets: from their public originals, at fixed commits, checked by SHA-256."""
+"""Downloading known data sets: from their public originals, at fixed commits, checked by SHA-256.
+
+Where ours is made from an original file of which only the content is known (the pickles of NeWRF), the arrays that it
+gives are checked in place of the file. Such a pickle is not unpickled: `wrf_mi.measure.pickled_table` reads it as data
+and runs nothing of what it names. It is not kept.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.resources import files
 from pathlib import Path
@@ -15,8 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..core import InputError
-from ..core.files import atomic_folder, one_line
-from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, remote_files
+from ..core.files import atomic_folder, one_line, write_arrays
+from .newrf import KEYS, arrays_sha256, read_arrays
+from .newrf_original import convert_newrf
+from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, locate, remote_files
 
 THREADS = 8
 """Downloads under way at once: the files are small, so waiting is what takes the time."""
@@ -36,14 +44,15 @@ def fetch(
 ) -> Path:
     """Download a known data set, or check it where it is there already.
 
-    Every file must have the published SHA-256. The folder appears complete or not at all.
+    Every file, or the arrays in it where it is converted, must have the published SHA-256. The folder appears complete
+    or not at all.
 
     Args:
         name: of a known data set.
         home: folder to put ``<name>/`` in; by default that of ``WRF_MI_DATA``, or else the user's cache.
         base_url: a mirror of the public original.
         retries: how often a file is tried again.
-        progress: show a progress bar on standard error.
+        progress: show a progress bar, and what a user has to know of the data, on standard error.
 
     Returns:
         The data set's folder.
@@ -54,8 +63,12 @@ def fetch(
     dataset = known(name)
     if dataset.base_url is None:
         raise InputError(f"data set {name}: is not downloaded but {dataset.origin}")
-    target = (Path(home) if home else data_home()) / name
-    return download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    place = Path(home) if home else data_home()
+    target = locate(name, place) or place / name
+    folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    if progress and dataset.note:
+        print(f"{name}: {dataset.note}", file=sys.stderr)
+    return folder
 
 
 def download(
@@ -68,22 +81,39 @@ def download(
 ) -> Path:
     """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds; see `fetch`."""
     if target.exists():
-        damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry.sha256)]
+        damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry)]
         if damaged:
             text = f"is not the published file ({len(damaged)} of {len(entries)} are not)"
             raise InputError(f"{target / damaged[0]}: missing or {text}; remove {target} and fetch it again")
         return target
     with atomic_folder(target) as part:
         urls = {entry.path: f"{base_url.rstrip('/')}/{entry.remote}" for entry in entries}
-        hashes = {entry.path: f"sha256:{entry.sha256}" for entry in entries}
+        hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
         for entry in entries:  # pooch makes folders too, but not if two threads do at once
             (part / entry.path).parent.mkdir(parents=True, exist_ok=True)
         store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=retries)
         _fetch_all(store, dataset.name, progress)
+        for entry in entries:
+            if entry.converted:
+                _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
         if dataset.folds is not None:
             folds = (files(__package__) / "data" / dataset.folds).read_bytes()
             (part / "blocked_folds.txt").write_bytes(folds)
+        source = f"{dataset.name}: {dataset.origin}\nLicence: {dataset.licence}\n{dataset.note}".strip()
+        (part / "SOURCE.txt").write_text(f"{source}\n", encoding="utf-8")
     return target
+
+
+def _convert(path: Path, entry: RemoteFile, source: str) -> None:
+    """Put our file in the place of the original's."""
+    remedy = f"nothing was kept; set {DATA_VARIABLE} to a folder that holds {path.name} in this form"
+    try:
+        arrays = convert_newrf(path)
+    except InputError as error:
+        raise InputError(f"{source} cannot be converted ({str(error).removeprefix(f'{path}: ')}); {remedy}") from None
+    if arrays_sha256(arrays) != entry.sha256:
+        raise InputError(f"{source} does not hold the published arrays, {remedy}")
+    write_arrays(path, arrays, compressed=True)
 
 
 def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
@@ -121,5 +151,12 @@ def _result(error: BaseException | None, name: str, url: str) -> None:
         raise error
 
 
-def _is_intact(path: Path, sha256: str) -> bool:
-    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+def _is_intact(path: Path, entry: RemoteFile) -> bool:
+    if not path.is_file():
+        return False
+    if not entry.converted:
+        return hashlib.sha256(path.read_bytes()).hexdigest() == entry.sha256
+    try:
+        return arrays_sha256(read_arrays(path, KEYS)) == entry.sha256
+    except InputError:
+        return False

@@ -7,10 +7,14 @@ from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from pathlib import Path
 
+import numpy as np
 import pooch
 
 from ..core import InputError, Record
-from .spectrum_folder import parse_folds, read_spectrum_folder
+from ..core.arrays import planar_array
+from .ble_folder import ANCHORS, read_ble_folder
+from .newrf import read_newrf
+from .spectrum_folder import GATEWAYS, parse_folds, read_spectrum_folder
 
 DATA_VARIABLE = "WRF_MI_DATA"
 """Environment variable: a folder that holds data sets as ``<name>/``; it takes the place of the user's cache."""
@@ -18,11 +22,19 @@ DATA_VARIABLE = "WRF_MI_DATA"
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """One file of a public original: its place in our folder, its SHA-256 (hex) and its path below the base URL."""
+    """One file of a public original.
+
+    Attributes:
+        path: its place in our folder.
+        sha256: hex; of the file, or of the arrays in it (`wrf_mi.measure.newrf.arrays_sha256`).
+        remote: its path below the base URL.
+        converted: whether ours is made from the original's; then the hash is that of our arrays.
+    """
 
     path: str
     sha256: str
     remote: str
+    converted: bool = False
 
 
 @dataclass(frozen=True)
@@ -35,8 +47,14 @@ class DataSet:
         licence: of the data.
         origin: who made it, where.
         base_url: where the public original's files are found; None where it is made on this machine.
-        manifest: text file in this package with one line per file: SHA-256, file, remote path; None likewise.
+        manifest: text file in this package with one line per file: SHA-256, file, remote path; None likewise. The
+            SHA-256 of arrays in a converted file is marked ``arrays:``.
         folds: text file in this package with the spatial fold of each row, or None.
+        file: the one file of the folder that holds the record, or None where it is the folder.
+        shared_folder: name of a folder that may hold it beside others, in place of ``<name>/``.
+        frequency_hz: of the carrier, where the files do not tell.
+        array: rows, columns and spacing (m) of the planar array, where the files do not tell.
+        note: what a user who fetches it has to know.
     """
 
     name: str
@@ -46,6 +64,11 @@ class DataSet:
     base_url: str | None = None
     manifest: str | None = None
     folds: str | None = None
+    file: str | None = None
+    shared_folder: str | None = None
+    frequency_hz: float | None = None
+    array: tuple[int, int, float] | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,6 +88,33 @@ KNOWN = (
         base_url="https://raw.githubusercontent.com/wenchaozheng/WRF-GSplus",
         manifest="rfid-lab.txt",
         folds="rfid-lab-blocked_folds.txt",
+        # Only frequency times spacing can be told from the spectra; 915 MHz and 0.161 m fit as well.
+        frequency_hz=920e6,
+        array=(4, 4, 0.16),
+    ),
+    DataSet(
+        name="flat-ble",
+        task="rssi",
+        licence="CC BY 4.0",
+        origin="M. Kolakowski, Sensors 21, 6270 (2021), doi 10.5281/zenodo.5457591; "
+        "GitHub marckolak/ble-rss-fingerprints-calib2021",
+        base_url="https://raw.githubusercontent.com/marckolak/ble-rss-fingerprints-calib2021",
+        manifest="flat-ble.txt",
+        note="lidar/points.npz and lidar/gridmap.npz, which some copies of this data set hold, were derived from its "
+        "scans by steps that are not published: they cannot be made again here. layout.csv has the walls.",
+    ),
+    *(
+        DataSet(
+            name=f"newrf-{room}",
+            task="csi",
+            licence="MIT",
+            origin="channels computed by MATLAB's ray tracer (image method); H. Lu, GitHub LuHaofan/NeWRF",
+            base_url="https://raw.githubusercontent.com/LuHaofan/NeWRF",
+            manifest=f"newrf-{room}.txt",
+            file=f"{room}.npz",
+            shared_folder="newrf",
+        )
+        for room in ("conference", "office")
     ),
     DataSet(
         name="laboratory",
@@ -93,7 +143,10 @@ def remote_files(dataset: DataSet) -> list[RemoteFile]:
         return []
     lines = (files(__package__) / "data" / dataset.manifest).read_text(encoding="utf-8").splitlines()
     entries = [line.split() for line in lines if line and not line.startswith("#")]
-    return [RemoteFile(path, sha256, remote) for sha256, path, remote in entries]
+    return [
+        RemoteFile(path, sha256.removeprefix("arrays:"), remote, sha256.startswith("arrays:"))
+        for sha256, path, remote in entries
+    ]
 
 
 def user_cache() -> Path:
@@ -107,11 +160,17 @@ def data_home() -> Path:
     return Path(chosen).expanduser() if chosen else user_cache()
 
 
-def locate(name: str) -> Path | None:
-    """The folder of a data set by name: below ``WRF_MI_DATA``, else in the user's cache, else None."""
-    for home in (data_home(), user_cache()):
-        if (home / name).is_dir():
-            return home / name
+def locate(name: str, home: Path | None = None) -> Path | None:
+    """The folder of a known data set: below ``home``, or else below ``WRF_MI_DATA``, then in the user's cache, or None.
+
+    Raises:
+        InputError: no data set of that name is known.
+    """
+    dataset = known(name)
+    for place in (home,) if home else (data_home(), user_cache()):
+        for folder in (place / name, place / (dataset.shared_folder or name)):
+            if folder.is_dir() and (dataset.file is None or (folder / dataset.file).is_file()):
+                return folder
     return None
 
 
@@ -121,16 +180,19 @@ def datasets() -> list[DataSetStatus]:
 
 
 def load(name_or_folder: str | Path) -> Record:
-    """Read a data set: a folder, or a known one by its name.
+    """Read a data set: a folder, a room's ``.npz`` file, or a known one by its name.
 
-    A path to a folder is taken first, then ``<name>/`` below ``WRF_MI_DATA``, then in the user's cache.
+    A path to a folder is taken first, then ``<name>/`` below ``WRF_MI_DATA``, then in the user's cache. A folder with
+    ``anchors.csv`` is read as `read_ble_folder` does, one with an ``.npz`` file alone as `read_newrf`, any other as
+    `read_spectrum_folder`.
 
     Raises:
         InputError: not there (the line says how to get it), or what the reader finds wrong.
     """
-    if Path(name_or_folder).is_dir():
-        return read_spectrum_folder(name_or_folder)
-    if isinstance(name_or_folder, Path) or Path(name_or_folder).name != name_or_folder:
+    path = Path(name_or_folder)
+    if path.is_dir() or (path.is_file() and path.suffix == ".npz"):
+        return _read(path)
+    if isinstance(name_or_folder, Path) or path.name != name_or_folder:
         raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
     dataset = known(name_or_folder)
     folder = locate(dataset.name)
@@ -139,8 +201,27 @@ def load(name_or_folder: str | Path) -> Record:
         if dataset.manifest is None:
             how = f"wrf_mi.trace.load_record({dataset.name!r}) traces it in under a minute"
         raise InputError(f"data set {dataset.name}: not on this machine; {how}")
-    record = read_spectrum_folder(folder, dataset.name)
+    return _complete(dataset, _read(folder / (dataset.file or ""), dataset.name))
+
+
+def _read(path: Path, name: str | None = None) -> Record:
+    if path.is_file():
+        return read_newrf(path, name)
+    if not (path / GATEWAYS).exists():
+        if (path / ANCHORS).exists():
+            return read_ble_folder(path, name)
+        if any(path.glob("*.npz")):
+            return read_newrf(path, name)
+    return read_spectrum_folder(path, name)
+
+
+def _complete(dataset: DataSet, record: Record) -> Record:
+    """Add what is known of a data set and not in its files."""
     if record.folds is None and dataset.folds is not None:
         with as_file(files(__package__) / "data" / dataset.folds) as path:
             record = replace(record, folds=parse_folds(path, len(record)))
+    if record.frequencies_hz is None and dataset.frequency_hz is not None:
+        record = replace(record, frequencies_hz=np.array([dataset.frequency_hz]))
+    if record.array_m is None and dataset.array is not None:
+        record = replace(record, array_m=planar_array(*dataset.array))
     return record

@@ -3,8 +3,9 @@
 Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
 
 - ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
-  metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world); ``dataset_name`` and other
-  plain values beside them are not used.
+  metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world). Optional and ours: ``frequency_hz``
+  of the carrier, and ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``, a list of x, y, z
+  in the array's frame. ``dataset_name`` and other plain values beside them are not used.
 - ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
 - ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
   row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
@@ -15,8 +16,10 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,9 +28,11 @@ from PIL import Image
 
 from ..core import InputError, Receiver, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
 from ..core.types import IntArray
 
+GATEWAYS = "gateway_info.yml"
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -48,8 +53,10 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give one that holds gateway_info.yml, tx_pos.csv and spectrum/")
-    receivers = _read_receivers(folder / "gateway_info.yml")
+        raise InputError(f"{folder}: not a folder; give one that holds {GATEWAYS}, tx_pos.csv and spectrum/")
+    gateways = folder / GATEWAYS
+    info = _read_info(gateways)
+    receivers = _receivers(gateways, info)
     positions = _read_positions(folder / "tx_pos.csv")
     images = folder / "spectrum"
     places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
@@ -61,12 +68,18 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         observation=_read_images(places, len(positions)),
         official=_read_official(folder, len(positions)),
         folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
+        frequencies_hz=_frequency(gateways, info),
+        array_m=_array(gateways, info),
         source=str(folder),
     )
 
 
 def write_spectrum_folder(
-    path: str | Path, record: Record, bits: int = 8, replace: bool = False, notes: Mapping[str, str] | None = None
+    path: str | Path,
+    record: Record,
+    bits: int = 8,
+    replace: bool = False,
+    extra: Mapping[str, str | bytes] | None = None,
 ) -> Path:
     """Write a record in the NeRF2 spectrum layout; the folder appears complete or not at all.
 
@@ -75,7 +88,7 @@ def write_spectrum_folder(
         record: its ``observation`` [n_rx, n, height, width] must lie in 0..1; it is rounded to grey levels.
         bits: 8 or 16 per pixel.
         replace: take the place of an existing folder.
-        notes: further text files to put into the folder, by name.
+        extra: further files to put into the folder, by their place in it.
 
     Raises:
         InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1.
@@ -96,8 +109,9 @@ def write_spectrum_folder(
             r.name: {"position": r.position_m.tolist(), "orientation": r.orientation_xyzw.tolist()}
             for r in record.receivers
         }
-        info = yaml.safe_dump({"dataset_name": record.name, **poses}, sort_keys=False, default_flow_style=None)
-        (part / "gateway_info.yml").write_text(info, encoding="utf-8")
+        content = {"dataset_name": record.name, **poses, **_instrument(record)}
+        info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+        (part / GATEWAYS).write_text(info, encoding="utf-8")
         rows = [",".join(repr(float(v)) for v in position) for position in record.tx_pos_m]
         _write_lines(part / "tx_pos.csv", ["x,y,z", *rows])
         if record.official is not None:
@@ -105,8 +119,9 @@ def write_spectrum_folder(
                 _write_lines(part / f"{kind}_index.txt", [f"{row + 1:05d}" for row in index])
         if record.folds is not None:
             _write_lines(part / "blocked_folds.txt", [str(fold) for fold in record.folds])
-        for name, text in (notes or {}).items():
-            (part / name).write_text(text, encoding="utf-8")
+        for name, data in (extra or {}).items():
+            (part / name).parent.mkdir(exist_ok=True)
+            (part / name).write_bytes(data.encode() if isinstance(data, str) else data)
     return Path(path)
 
 
@@ -138,12 +153,55 @@ def _whole_number(path: Path, line: int, text: str) -> int:
     return int(digits)
 
 
-def _read_receivers(path: Path) -> tuple[Receiver, ...]:
+def _instrument(record: Record) -> dict[str, Any]:
+    known: dict[str, Any] = {}
+    if record.frequencies_hz is not None:
+        known["frequency_hz"] = float(record.frequencies_hz[0])
+    if record.array_m is not None:
+        known["array"] = {"elements_m": record.array_m.tolist()}
+    return known
+
+
+def _read_info(path: Path) -> dict[Any, Any]:
     try:
         info = yaml.safe_load("\n".join(text_lines(path)))
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
-    poses = {key: value for key, value in info.items() if isinstance(value, dict)} if isinstance(info, dict) else {}
+    return info if isinstance(info, dict) else {}
+
+
+def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
+    if "frequency_hz" not in info:
+        return None
+    try:
+        frequency_hz = float(info["frequency_hz"])  # YAML reads 920e6 as text
+    except (TypeError, ValueError):
+        frequency_hz = np.nan
+    if not 0 < frequency_hz < np.inf:
+        raise InputError(f"{path}: frequency_hz is {info['frequency_hz']!r}; give the carrier in Hz, such as 920e6")
+    return np.array([frequency_hz])
+
+
+def _array(path: Path, info: dict[Any, Any]) -> FloatArray | None:
+    if "array" not in info:
+        return None
+    array = info["array"]
+    try:
+        if "elements_m" in array:
+            elements = np.array(array["elements_m"], float)
+        else:
+            rows, columns = (operator.index(array[key]) for key in ("rows", "columns"))
+            elements = planar_array(rows, columns, float(array["spacing_m"]))
+    except (TypeError, ValueError, KeyError):
+        elements = np.empty(0)
+    if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
+        remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
+        raise InputError(f"{path}: array is {str(array)[:60]!r}; {remedy}")
+    return elements
+
+
+def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
+    poses = {key: value for key, value in info.items() if isinstance(value, dict) and key != "array"}
     if not poses:
         raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
     receivers = []

@@ -40,7 +40,8 @@ def make_splits(
       k-means clusters of the positions. ``blocked:2`` is the split of fold 2 alone.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
 
-    Validation rows are a seeded draw from the training rows. Subsets by ``n_train`` are nested for one seed, and so
+    Rows that no receiver received (NaN throughout) are in no part of any split. Validation rows are a seeded draw from
+    the training rows. Subsets by ``n_train`` are nested for one seed, and so
     are their validation rows: a smaller one's are among a larger one's.
 
     Args:
@@ -55,7 +56,8 @@ def make_splits(
         One split, or one per fold for ``blocked``; rows are sorted.
 
     Raises:
-        InputError: an unknown name, a rule that the record cannot follow, or numbers out of range.
+        InputError: an unknown name, a rule that the record cannot follow, a part without any row that was received, or
+            numbers out of range.
     """
     if not 0 <= validation_fraction < 1:
         raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")
@@ -135,14 +137,17 @@ def position_folds(record: Record) -> IntArray:
 
 
 def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, IntArray, IntArray]]:
-    rows = np.arange(len(record))
+    missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
+    received = np.asarray(~missing.all(axis=(0, 2)))
+    rows = np.flatnonzero(received)
     kind, _, fold = name.partition(":")
     if kind not in SPLIT_NAMES or (":" in name and kind != "blocked"):
         raise InputError(f"split {name!r}: unknown; choose official, random, blocked, blocked:K or trajectory")
     if kind == "official":
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
-        return [(name, *record.official)]
+        train, test = (part[received[part]] for part in record.official)
+        return [_with_rows(record, name, train, test)]
     if kind == "blocked":
         folds = position_folds(record)
         count = int(folds.max()) + 1
@@ -151,12 +156,20 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
             if not (fold.isascii() and fold.isdecimal() and int(fold) < count):
                 raise InputError(f"split {name!r}: no such fold; {record.name} has blocked:0 to blocked:{count - 1}")
             chosen = range(int(fold), int(fold) + 1)
-        return [(f"blocked:{k}", rows[folds != k], rows[folds == k]) for k in chosen]
+        of_row = folds[rows]
+        return [_with_rows(record, f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [(name, order[:first], order[first:])]
+
+
+def _with_rows(record: Record, label: str, train: IntArray, test: IntArray) -> tuple[str, IntArray, IntArray]:
+    for what, part in (("trains", train), ("scores", test)):
+        if len(part) == 0:
+            raise InputError(f"{record.name}, split {label}: no row that was received {what}; use another split")
+    return label, train, test
 
 
 def _finish(

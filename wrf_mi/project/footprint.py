@@ -52,11 +52,12 @@ class Footprints:
     depth: dr.ArrayBase
 
 
-def _dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
+def dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Scalar product of two vectors, each three arrays."""
     return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
 
 
-def _tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
+def tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
     """Two unit vectors perpendicular to n and to each other (Duff et al. 2017, J. Comput. Graph. Techn. 6)."""
     x, y, z = n
     sign: Any = dr.copysign(type(z)(1), dr.detach(z))
@@ -65,7 +66,7 @@ def _tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.A
     return [dr.fma(sign * x * x, a, 1), sign * b, -sign * x], [b, dr.fma(y * y, a, sign), -y]
 
 
-def _axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
+def own_axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
     """World directions of the three own axes (columns of the rotation) of unnormalised quaternions x, y, z, w."""
     x, y, z, w = quaternion
     f = 2 / (x * x + y * y + z * z + w * w)
@@ -85,20 +86,20 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     batch = gaussians.batch
     offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
     local = pose.to_local(offset)
-    depth = dr.sqrt(_dot(local, local))
+    depth = dr.sqrt(dot(local, local))
     visible = dr.detach(depth) >= NEAR_M
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
     n[2] = dr.select(visible, n[2], 1)
-    e1, e2 = _tangent_basis(n)
+    e1, e2 = tangent_basis(n)
     n, e1, e2 = ([dr.tile(c, batch) for c in v] for v in (n, e1, e2))
     inverse = dr.tile(inverse, batch)
 
     # Columns of [e1 e2]^T R diag(s) / d: C = sum of their outer products + low-pass.
     columns = []
-    for scale, axis in zip(gaussians.scale, _axes(gaussians.rotation), strict=True):
+    for scale, axis in zip(gaussians.scale, own_axes(gaussians.rotation), strict=True):
         m, f = pose.to_local(axis), scale * inverse
-        columns.append((_dot(e1, m) * f, _dot(e2, m) * f))
+        columns.append((dot(e1, m) * f, dot(e2, m) * f))
     low = LOW_PASS_RAD**2
     own11 = sum((p * p for p, _ in columns[1:]), columns[0][0] ** 2)
     own22 = sum((q * q for _, q in columns[1:]), columns[0][1] ** 2)

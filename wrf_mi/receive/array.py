@@ -1,4 +1,4 @@
-"""Antenna arrays in NumPy: element positions, response to a plane wave, Bartlett spectrum.
+"""Antenna arrays in NumPy: response to a plane wave, Bartlett spectrum, the instrument's scaling.
 
 Conventions (`wrf_mi.core.angles`): elements lie in the array's x-y plane, boresight +z. With the time factor
 exp(+j omega t), a wave that arrives *from* unit vector u reaches the element at p with the phase +k p . u
@@ -7,6 +7,8 @@ relative to the array's origin.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
@@ -14,28 +16,6 @@ from scipy.constants import speed_of_light
 from ..core.angles import FloatArray, pixel_directions
 
 ComplexArray = NDArray[np.complex128]
-
-
-def planar_array(rows: int, columns: int, spacing_m: float) -> FloatArray:
-    """Element positions of a uniform planar array, centred on its origin.
-
-    Args:
-        rows: elements along y.
-        columns: elements along x.
-        spacing_m: distance between neighbours along both axes, metres.
-
-    Returns:
-        Shape [rows * columns, 3] in metres, x fastest, z = 0.
-
-    Raises:
-        ValueError: fewer than one row or column, or a spacing that is not positive.
-    """
-    if rows < 1 or columns < 1 or not spacing_m > 0:
-        raise ValueError(f"planar_array: {rows} x {columns} elements {spacing_m} m apart; all three must be positive")
-    x = (np.arange(columns) - (columns - 1) / 2) * spacing_m
-    y = (np.arange(rows) - (rows - 1) / 2) * spacing_m
-    grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
-    return np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(rows * columns)], axis=-1)
 
 
 def array_response(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
@@ -71,9 +51,16 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
 
     Source: Van Trees, "Optimum Array Processing" (2002), section 6.2; the real spectra obey it.
     """
-    steering = array_response(positions_m, pixel_directions(height, width).reshape(-1, 3), frequency_hz).conj()
+    steering = _steering(np.asarray(positions_m, float).tobytes(), frequency_hz, height, width)
     signals = np.asarray(h, dtype=complex)
     return np.abs(signals @ steering.T).reshape(*signals.shape[:-1], height, width)
+
+
+@lru_cache(maxsize=4)
+def _steering(positions: bytes, frequency_hz: float, height: int, width: int) -> ComplexArray:
+    """Conjugate response of every pixel [height * width, m]; as long to compute as all the rest for one spectrum."""
+    elements = np.frombuffer(positions).reshape(-1, 3)
+    return array_response(elements, pixel_directions(height, width).reshape(-1, 3), frequency_hz).conj()
 
 
 def minmax_scale(spectrum: ArrayLike) -> FloatArray:

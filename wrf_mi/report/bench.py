@@ -1,4 +1,8 @@
-"""The figures of this project on real spectra, measured by its own command and stored with how they were made."""
+"""The figures of this project, measured by its own command and stored with how they were made.
+
+A case is either a run of ``wrf-mi`` that leaves a run folder, or a check: a function that measures one part
+against what it is held to, on data or scenes that others made.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +45,20 @@ class Case:
     arguments: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Check:
+    """One measurement by a function.
+
+    Attributes:
+        title: for the table.
+        function: ``module:function`` below ``wrf_mi.report``; it takes nothing and returns ``rows``, a list of
+            dictionaries ``what``, ``value`` (text with its unit) and ``asked``, beside whatever else it measured.
+    """
+
+    title: str
+    function: str
+
+
 SHORT = ("--set", "steps=3000", "--set", "hold_out=0")
 """The schedule of the blocked split, whose five folds are fitted in turn."""
 
@@ -64,14 +82,24 @@ CASES: Mapping[str, Case] = {
 }
 
 
+CHECKS: Mapping[str, Check] = {
+    "traced-and-splatted": Check("Mitsuba integrator", "bench_traced:main"),
+    "image-method": Check("Sionna RT against MATLAB", "bench_trace:newrf"),
+    "scan-to-paths": Check("mesh from a scan", "bench_scene:scans"),
+    "large-scan": Check("mesh from a scan", "bench_scene:large_scan"),
+    "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan"),
+    "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat"),
+}
+
+
 def bench(names: Sequence[str], out: Path, runs: Path) -> list[dict[str, Any]]:
     """Measure cases one after the other, each as a process of its own, and write the table.
 
     A case whose run folder is finished is only written down again; one that was stopped goes on.
 
     Args:
-        names: keys of `CASES`.
-        out: folder for ``<case>.json`` and the table ``README.md``.
+        names: keys of `CASES` and `CHECKS`.
+        out: folder for ``<case>.json`` and the tables, ``README.md``.
         runs: folder for run folders.
 
     Returns:
@@ -82,17 +110,18 @@ def bench(names: Sequence[str], out: Path, runs: Path) -> list[dict[str, Any]]:
         BenchFailed: a case that did not finish.
     """
     for name in names:
-        if name not in CASES:
-            raise InputError(f"bench {name}: unknown; choose from {', '.join(CASES)}")
+        if name not in CASES and name not in CHECKS:
+            raise InputError(f"bench {name}: unknown; choose from {', '.join([*CASES, *CHECKS])}")
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name in names:
-        result = _measure(name, runs / name)
+        result = _check(name, runs / name) if name in CHECKS else _measure(name, runs / name)
         write_atomically(out / f"{name}.json", json.dumps(result, indent=1) + "\n")
         rows.append(result)
         print(f"{name}: {out / name}.json", file=sys.stderr)
-    text = "# Figures on rfid-lab\n\nWritten by `wrf-mi bench`. " + NOTE + "\n\n" + table(read_results(out)) + "\n"
-    write_atomically(out / "README.md", text)
+    trained, checked = read_results(out)
+    parts = ["# Figures", f"Written by `wrf-mi bench`. {NOTE}", table(trained), CHECK_NOTE, check_table(checked)]
+    write_atomically(out / "README.md", "\n\n".join(parts) + "\n")
     return rows
 
 
@@ -122,6 +151,24 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
     }
 
 
+def _check(name: str, folder: Path) -> dict[str, Any]:
+    """The stored result of a check, measured now if there is none; in a process of its own, as it states its memory."""
+    stored = folder / "check.json"
+    if not stored.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        call = [sys.executable, "-m", "wrf_mi.report.check", CHECKS[name].function, str(stored)]
+        start = time.perf_counter()
+        status = subprocess.run(call).returncode
+        if status != 0:
+            raise BenchFailed(f"bench {name}: ended with status {status}")
+        measured = json.loads(stored.read_text())
+        where = {"date": time.strftime("%Y-%m-%d"), "machine": machine(), "versions": versions()}
+        measured = {"wall_seconds": time.perf_counter() - start, **where, "figures": measured}
+        write_atomically(stored, json.dumps(measured, indent=1))
+    known = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
+    return known | json.loads(stored.read_text())
+
+
 def machine() -> dict[str, Any]:
     """What this machine is."""
     return {
@@ -132,10 +179,16 @@ def machine() -> dict[str, Any]:
     }
 
 
-def read_results(out: Path) -> list[dict[str, Any]]:
-    """All stored results, in the order of `CASES`."""
-    return [json.loads(path.read_text()) for name in CASES if (path := out / f"{name}.json").exists()]
+def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """All stored results, those of `CASES` and those of `CHECKS`, each in their order."""
 
+    def stored(names: Mapping[str, Any]) -> list[dict[str, Any]]:
+        return [json.loads(path.read_text()) for name in names if (path := out / f"{name}.json").exists()]
+
+    return stored(CASES), stored(CHECKS)
+
+
+CHECK_NOTE = "Checks against what others made, or against what a part is held to:"
 
 NOTE = (
     "SSIM is scikit-image's, over test rows; *blend* is the inverse-distance blend of the four nearest training "
@@ -158,4 +211,13 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
             f"| {result['title']} | **{own['median']:.3f}** | {own['mean']:.3f} | {own['p10']:.3f} | {own['p90']:.3f} "
             f"| {blend:.3f} | {m['steps']:,} | {minutes} | {m['ms_per_sample']:.1f} | {m['peak_memory_mb']:.0f} MB |"
         )
+    return "\n".join(lines)
+
+
+def check_table(results: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table of checks."""
+    lines = ["| what | measured | asked |", "| --- | --- | --- |"]
+    for result in results:
+        rows = result["figures"]["rows"]
+        lines += [f"| {result['title']}: {r['what']} | **{r['value']}** | {r['asked']} |" for r in rows]
     return "\n".join(lines)

@@ -1,54 +1,66 @@
-"""Several runs side by side: a table, score distributions, spectra and training curves."""
+"""Several runs side by side: a table, score distributions, samples with their truth, training curves."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import html
 import io
+import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from wrf_mi.core.files import write_atomically
-
+from ..core import InputError
+from ..core.files import write_atomically
+from ..fit.folder import CHECKPOINT
 from . import figures
+from .metrics import TASKS
 from .run_folder import Run, read_runs
+from .traced import is_traced
+from .view import scene_view
 
 QUANTILES = (0.1, 0.5, 0.9)
-"""Test rows that are shown: those at these quantiles of the first run's similarity."""
-
-BLEND = "blend of 4 nearest"
+"""Test rows that are shown of spectra: those at these quantiles of the first run's score."""
 
 COLUMNS = {
     "run": "run",
     "model": "model",
+    "dataset": "data set",
     "split": "split",
     "seed": "seed",
     "n_train": "training rows",
     "n_test": "test rows",
-    "ssim_median": "SSIM median",
-    "ssim_mean": "mean",
-    "ssim_p10": "p10",
-    "ssim_p90": "p90",
-    "idw4_median": f"{BLEND}, median",
-    "ms_per_sample": "ms per spectrum",
+    "metric": "score",
+    "median": "median",
+    "mean": "mean",
+    "p10": "p10",
+    "p90": "p90",
+    "ms_per_sample": "ms per sample",
     "train_seconds": "training (s)",
     "peak_memory_mb": "peak memory (MB)",
 }
 """Columns of ``compare.csv`` and their headings in ``index.html``."""
 
+Picture = tuple[str, str, Figure]
+"""File name, heading, figure."""
+
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     """Write the comparison of several runs.
 
-    Writes into ``out`` (made if need be): ``compare.csv``, one row per run; ``ssim_cdf.png``;
-    ``spectra.png``, test rows at fixed quantiles of the first run's similarity, truth beside each run and the blend;
-    ``training.png``, validation similarity over seconds, if a run was trained; and ``index.html`` with all of it.
+    Runs on the same data set stand beside each other on the same test rows, and beside the reference method that needs
+    no model (`wrf_mi.report.metrics.TASKS`). Writes into ``out`` (made if need be): ``compare.csv``, one row per run
+    and reference; for each data set ``<data set>-cdf.png``, ``<data set>-samples.png`` with the truth beside each
+    method, ``<data set>-scene.png`` if one was traced and ``<data set>-training.png`` if one was trained; and
+    ``index.html``, one file with all of it.
 
     Args:
-        run_dirs: run folders on spectra.
+        run_dirs: run folders.
         out: folder to write to.
 
     Returns:
@@ -57,53 +69,113 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     Raises:
         InputError: no run, or a folder that is not one.
     """
-    runs = read_runs(run_dirs)
+    groups = _groups(read_runs(run_dirs))
+    table = [row for runs in groups.values() for row in _rows(runs)]
+    sections = [(_heading(runs), _pictures(slug, runs)) for slug, runs in groups.items()]
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    table = [_table_row(run) for run in runs]
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(COLUMNS), lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
     write_atomically(folder / "compare.csv", text.getvalue())
+    for _, pictures in sections:
+        for name, _, figure in pictures:
+            figures.save(figure, folder / name)
+    shown = [(heading, [(folder / name, title) for name, title, _ in pictures]) for heading, pictures in sections]
+    return write_atomically(folder / "index.html", _page(table, shown))
 
-    pictures = [("ssim_cdf.png", "Similarity over test rows", _cdf(runs)), ("spectra.png", *_spectra(runs))]
+
+def _groups(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs by task and data set, under names that can begin a file's name."""
+    by_data: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        by_data.setdefault((run.task, run.dataset), []).append(run)
+    groups: dict[str, list[Run]] = {}
+    for (_, dataset), members in by_data.items():
+        slug = re.sub(r"[^\w.-]+", "_", Path(dataset).name) or "data"
+        while slug in groups:
+            slug += "_"
+        groups[slug] = members
+    return groups
+
+
+def _heading(runs: Sequence[Run]) -> str:
+    return f"{Path(runs[0].dataset).name}: {TASKS[runs[0].task].heading}"
+
+
+def _rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """The table's rows of one data set: each run, and each reference once."""
+    task = TASKS[runs[0].task]
+    rows = []
+    for run in runs:
+        known = {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
+        own = {"run": run.name, "dataset": run.dataset, "seed": run.seed, "metric": task.label}
+        rows.append(known | own | _summary(run.metrics[task.block]))
+    for name, run in _references(runs).items():
+        block = run.metrics["reference"][task.reference]
+        kept = {key: run.metrics[key] for key in ("split", "n_train", "n_test")}
+        own = {"run": name, "model": task.reference, "dataset": run.dataset, "metric": task.label}
+        rows.append(kept | own | _summary(block))
+    return [{key: row.get(key) for key in COLUMNS} for row in rows]
+
+
+def _summary(block: dict[str, Any]) -> dict[str, Any]:
+    return {key: block.get(key) for key in ("median", "mean", "p10", "p90")}
+
+
+def _references(runs: Sequence[Run]) -> dict[str, Run]:
+    """The reference method by its name, once for runs with the same training and test rows."""
+    found: dict[str, Run] = {}
+    for run in runs:
+        if any(np.array_equal(run.reference_score, r.reference_score, equal_nan=True) for r in found.values()):
+            continue
+        name = f"{TASKS[run.task].reference_name}, {run.metrics['split']}"
+        found[f"{name} of {run.name}" if name in found else name] = run
+    return found
+
+
+def _pictures(slug: str, runs: Sequence[Run]) -> list[Picture]:
+    task = TASKS[runs[0].task]
+    cdf = figures.score_cdf(
+        {run.name: run.score for run in runs},
+        {name: run.reference_score for name, run in _references(runs).items()},
+        task.label,
+    )
+    samples = _spectra(runs) if runs[0].task == "spectrum" else _maps(runs)
+    pictures: list[Picture] = [
+        (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
+        (f"{slug}-samples.png", *samples),
+    ]
+    if (view := _scene(runs)) is not None:
+        pictures.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
     curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
     if curves:
-        pictures.append(("training.png", "Training", figures.training_curves(curves)))
-    for name, _, figure in pictures:
-        figures.save(figure, folder / name)
-    return write_atomically(folder / "index.html", _page(table, [(name, title) for name, title, _ in pictures]))
+        pictures.append((f"{slug}-training.png", "Training", figures.training_curves(curves)))
+    return pictures
 
 
-def _table_row(run: Run) -> dict[str, Any]:
-    metrics = run.metrics
-    return {
-        "run": run.name,
-        "seed": run.seed,
-        **{f"ssim_{key}": metrics["ssim"].get(key) for key in ("median", "mean", "p10", "p90")},
-        "idw4_median": metrics["reference"]["idw4"]["median"],
-        **{key: metrics[key] for key in COLUMNS if key in metrics and key != "seed"},
-    }
+def _scene(runs: Sequence[Run]) -> Figure | None:
+    """The first traced run's scene, with the Gaussians of the first field; None where nothing was traced."""
+    traced = next((run for run in runs if is_traced(run.path)), None)
+    if traced is None:
+        return None
+    field = next((run.path for run in runs if (run.path / CHECKPOINT).exists()), None)
+    row = traced.row[np.argsort(np.nanmean(traced.score, axis=0))[len(traced.row) // 2]]
+    try:
+        return scene_view(traced.path, int(row), field)
+    except InputError as error:
+        # A run folder outlives the scene that it was traced in.
+        print(f"no picture of the scene of {traced.name}: {error}", file=sys.stderr)
+        return None
 
 
-def _cdf(runs: Sequence[Run]) -> Any:
-    """Each run's distribution, and the blend's once for runs with the same training and test rows."""
-    references: dict[str, Any] = {}
-    for run in runs:
-        if any(np.array_equal(run.reference_ssim, known) for known in references.values()):
-            continue
-        name = f"{BLEND}, {run.metrics['split']}"
-        references[f"{name} of {run.name}" if name in references else name] = run.reference_ssim
-    return figures.score_cdf({run.name: run.ssim for run in runs}, references)
-
-
-def _spectra(runs: Sequence[Run]) -> tuple[str, Any]:
+def _spectra(runs: Sequence[Run]) -> tuple[str, Figure]:
     """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
     first = runs[0]
     shared = np.array([all(_position(run, first, m) is not None for run in runs) for m in range(len(first.row))])
     candidates = np.flatnonzero(shared if shared.any() else np.ones_like(shared))
-    score = first.ssim[:, candidates]
+    score = first.score[:, candidates]
     order = np.argsort(score, axis=None, kind="stable")
     rows = []
     for quantile in QUANTILES:
@@ -113,10 +185,41 @@ def _spectra(runs: Sequence[Run]) -> tuple[str, Any]:
         name = f"row {first.row[m]}" + (f", receiver {receiver}" if len(first.truth) > 1 else "")
         predictions = [None if p is None else run.prediction[receiver, p] for run, p in zip(runs, places, strict=True)]
         rows.append((name, [first.truth[receiver, m], *predictions, first.reference[receiver, m]]))
-    columns = ["truth", *(run.name for run in runs), f"{BLEND} ({first.metrics['split']})"]
+    columns = ["truth", *(run.name for run in runs), f"{TASKS[first.task].reference_name} ({first.metrics['split']})"]
     percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
-    heading = f"Test rows at the {percent} % quantiles of the similarity of {first.name}"
+    heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"
     return heading, figures.spectrum_table(rows, columns)
+
+
+def _maps(runs: Sequence[Run]) -> tuple[str, Figure]:
+    """Heading and picture of each receiver's power over the first run's test positions."""
+    first = runs[0]
+    columns = ["truth", *(run.name for run in runs), f"{TASKS[first.task].reference_name} ({first.metrics['split']})"]
+    rows = []
+    for r, receiver in enumerate(first.receivers):
+        aligned = [_aligned(run, first, r) for run in runs]
+        maps = [first.truth[r], *aligned, first.reference[r]]
+        rows.append((receiver, [None if values is None else _power_db(values) for values in maps]))
+    heading = f"Power at each receiver over the test positions of {first.name}"
+    return heading, figures.position_table(rows, columns, first.tx_pos_m, TASKS[first.task].quantity)
+
+
+def _power_db(values: np.ndarray) -> np.ndarray:
+    """RSSI as it is; the power of a channel's coefficients, summed over subcarriers, in dB."""
+    if not np.iscomplexobj(values):
+        return values
+    power = np.square(np.abs(values)).sum(axis=-1)
+    return 10 * np.log10(np.where(power > 0, power, np.nan))
+
+
+def _aligned(run: Run, first: Run, receiver: int) -> np.ndarray | None:
+    """Predictions of ``run`` in the order of the test rows of ``first``, NaN where it has none; None without any."""
+    places = [_position(run, first, m) for m in range(len(first.row))]
+    if all(p is None for p in places):
+        return None
+    values = run.prediction[receiver]
+    missing = np.full(values.shape[1:], np.nan, values.dtype)
+    return np.stack([missing if p is None else values[p] for p in places])
 
 
 def _position(run: Run, first: Run, m: int) -> int | None:
@@ -124,16 +227,19 @@ def _position(run: Run, first: Run, m: int) -> int | None:
     found = np.flatnonzero(run.row == first.row[m])
     if len(found) != 1 or len(run.truth) != len(first.truth):
         return None
-    return int(found[0]) if np.array_equal(run.truth[:, found[0]], first.truth[:, m]) else None
+    same = np.array_equal(run.truth[:, found[0]], first.truth[:, m], equal_nan=True)
+    return int(found[0]) if same else None
 
 
-def _page(table: Sequence[dict[str, Any]], pictures: Sequence[tuple[str, str]]) -> str:
-    """A plain page with the table and the pictures."""
+def _page(table: Sequence[dict[str, Any]], sections: Sequence[tuple[str, Sequence[tuple[Path, str]]]]) -> str:
+    """A page that needs no other file: the table, and each data set's pictures within it."""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in COLUMNS.values())
     body = "\n".join("<tr>" + "".join(f"<td>{_cell(row[key])}</td>" for key in COLUMNS) + "</tr>" for row in table)
     images = "\n".join(
-        f'<h2>{html.escape(title)}</h2>\n<img src="{name}" alt="{html.escape(title)}">' for name, title in pictures
+        f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(_image(path, title) for path, title in pictures)
+        for heading, pictures in sections
     )
+    notes = "\n".join(f"<li>{html.escape(task.note)}</li>" for task in TASKS.values() if _shows(table, task.label))
     return f"""<!DOCTYPE html>
 <html lang="en">
 <meta charset="utf-8">
@@ -142,20 +248,29 @@ def _page(table: Sequence[dict[str, Any]], pictures: Sequence[tuple[str, str]]) 
 body {{ font-family: sans-serif; margin: 2em; }}
 table {{ border-collapse: collapse; }}
 th, td {{ border-bottom: 1px solid #ccc; padding: 0.3em 0.6em; text-align: right; }}
-th:nth-child(-n+3), td:nth-child(-n+3) {{ text-align: left; }}
+th:nth-child(-n+4), td:nth-child(-n+4) {{ text-align: left; }}
 img {{ max-width: 100%; }}
 </style>
 <h1>Comparison of runs</h1>
-<p>SSIM is scikit-image's structural similarity with a data range of one; the {BLEND} training spectra,
-weighted by inverse squared distance, stands beside each run on the same test rows.</p>
 <table>
 <tr>{head}</tr>
 {body}
 </table>
-<p>The same as <a href="compare.csv">CSV</a>.</p>
+<ul>
+{notes}
+</ul>
 {images}
 </html>
 """
+
+
+def _shows(table: Sequence[dict[str, Any]], label: str) -> bool:
+    return any(row["metric"] == label for row in table)
+
+
+def _image(path: Path, title: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<h3>{html.escape(title)}</h3>\n<img src="data:image/png;base64,{data}" alt="{html.escape(title)}">'
 
 
 def _cell(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""The main job in one call: train WRF-GS+ with a short schedule, score it, draw it."""
+"""The main job in one call: train WRF-GS+ with a short schedule, trace a room, score both, draw them."""
 
 from __future__ import annotations
 
@@ -11,39 +11,73 @@ from ..core import InputError
 from ..fit.config import PRESETS, TrainConfig, with_settings
 from ..measure import fetch
 from ..measure.registry import locate
+from ..scene.make import make_scene
+from ..trace import TraceOptions, load_record
 from ..trace.laboratory import NAME as LABORATORY
+from ..trace.laboratory import SCAN
 from .compare import compare
 from .runs import Listen, Run, train
+from .traced import trace_run
 
 REAL = "rfid-lab"
+FLAT = "flat-ble"
+FLAT_PLAN = "layout.csv"
+FLAT_HEIGHT_M = 2.7
+"""Usual height of a room; the plan does not tell it."""
 
 
-def demo_dataset() -> str:
-    """Real spectra where they are or can be fetched; else the embedded room, and a line that says so."""
-    if locate(REAL) is not None:
-        return REAL
+def here(name: str) -> Path | None:
+    """The folder of a real data set where it is or can be fetched; else None, and a line that says so."""
+    if (found := locate(name)) is not None:
+        return found
     try:
-        fetch(REAL)
-        return REAL
+        return fetch(name)
     except InputError as error:
-        print(f"no real spectra ({error}): using the embedded room, traced here by Sionna RT", file=sys.stderr)
-        return LABORATORY
+        print(f"no {name} ({error})", file=sys.stderr)
+        return None
 
 
 def demo(out: Path | None, listen: Listen, stop: Callable[[], bool]) -> tuple[Run, Path]:
-    """Train on real spectra, or on a room traced on the spot, and draw the result.
+    """Train on real spectra, trace real signal strengths, and draw both; or all in a room made up for it.
+
+    Without real spectra, spectra of the embedded room take their place, traced in its true mesh; the ray tracer is
+    then given the mesh that a LiDAR scan of the room makes.
 
     Args:
-        out: run folder; None: a new one in ``runs/``.
+        out: run folder; None: a new one in ``runs/``. The traced run lies in ``traced/`` in it.
         listen: hears of progress.
         stop: True stops at a checkpoint.
 
     Returns:
-        The run and the ``index.html`` with its pictures.
+        The run of the field and the ``index.html`` with all pictures.
     """
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
     config = with_settings(TrainConfig(), PRESETS["quick"])
-    dataset = demo_dataset()
+    real = here(REAL) is not None
+    if not real:
+        print(f"using the embedded room {LABORATORY}, traced here by Sionna RT, in its place", file=sys.stderr)
+    dataset = REAL if real else LABORATORY
     print(f"training {config.model} on {dataset}; results go to {folder}", file=sys.stderr)
     run = train(dataset, folder, config, listen=listen, stop=stop)
-    return run, compare([folder], folder / "compare")
+    traced = _trace_flat(folder) if real else _trace_scan(folder)
+    runs = [folder] if traced is None else [folder, traced]
+    return run, compare(runs, folder / "compare")
+
+
+def _trace_flat(folder: Path) -> Path | None:
+    """Signal strengths in a flat whose plan is known; None where the data cannot be had."""
+    data = here(FLAT)
+    if data is None:
+        return None
+    print(f"tracing {FLAT} in the walls of its plan", file=sys.stderr)
+    scene = make_scene(data / FLAT_PLAN, folder / "scene", height_m=FLAT_HEIGHT_M)
+    options = TraceOptions(transmission=True, max_depth=6, max_reflections=2)
+    return trace_run(scene.folder, FLAT, folder / "traced", options, progress=sys.stderr.isatty())
+
+
+def _trace_scan(folder: Path) -> Path:
+    """The embedded room's spectra, from the mesh of its scan."""
+    print(f"tracing {LABORATORY} in the mesh of its scan", file=sys.stderr)
+    points = Path(load_record(LABORATORY).source) / SCAN
+    scene = make_scene(points, folder / "scene")
+    return trace_run(scene.folder, LABORATORY, folder / "traced", progress=sys.stderr.isatty())

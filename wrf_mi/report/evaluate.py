@@ -1,4 +1,4 @@
-"""Scores of a run on its held-out rows: ``metrics.json`` and ``predictions.npz``."""
+"""Scores of a method on held-out rows: ``metrics.json`` and ``predictions.npz``."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..baselines.idw import InverseDistance
-from ..core import Record, Split
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.files import write_arrays, write_atomically
-from .metrics import ssim, summary
-from .run_folder import METRICS, PREDICTIONS, Spectra
+from ..core.types import IntArray
+from .metrics import TASKS, TaskScore, summary
+from .run_folder import METRICS, PREDICTIONS, Observations, reference_key
 
-Predict = Callable[[FloatArray, int], Spectra]
-"""Spectra [m, H, W] of transmitter positions [m, 3] at the receiver of an index."""
+Predict = Callable[[IntArray, int], NDArray[Any]]
+"""What the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or channel
+coefficients [m, subcarriers]. Rows, and not positions, because a method may use how the transmitter was turned."""
 
 REPEATS = 20
 """Single predictions that are timed; the median is stated."""
 
 
-def milliseconds_per_sample(predict: Predict, tx_pos_m: FloatArray) -> float:
-    """Median time of one spectrum from one transmitter position, warm, in ms."""
-    one = tx_pos_m[:1]
+def milliseconds_per_sample(predict: Predict, rows: IntArray) -> float:
+    """Median time of one prediction at one transmitter position, warm, in ms."""
+    one = rows[:1]
     predict(one, 0)
     times = []
     for _ in range(REPEATS):
@@ -37,50 +40,70 @@ def milliseconds_per_sample(predict: Predict, tx_pos_m: FloatArray) -> float:
 
 
 def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Score a method on the test rows of a split, with the nearest-neighbour blend beside it.
+    """Score a method on the test rows of a split, with the nearest-neighbour blend of its task beside it.
 
     Args:
-        record: spectra [n_rx, n, H, W].
+        record: of any task in `wrf_mi.report.metrics.TASKS`.
         split: the blend is fitted on all its training rows, validation rows included.
-        predict: the method.
+        predict: the method; finite wherever something was received.
 
     Returns:
-        The blocks of ``metrics.json`` that scoring gives (``ssim``, ``reference``, for several receivers
-        ``receivers``, ``n_train``, ``n_test``, ``ms_per_sample``), and the arrays of ``predictions.npz``.
+        The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
+        receivers ``receivers``, ``n_train``, ``n_test``, ``ms_per_sample``), and the arrays of ``predictions.npz``.
+
+    Raises:
+        InputError: no test rows, predictions of another shape or not finite, or a receiver that received no training
+            row.
     """
     rows, known = split.test, split.all_train
-    tx_pos = record.tx_pos_m[rows]
-    receivers = range(len(record.receivers))
-    prediction = np.stack([predict(tx_pos, r) for r in receivers]).astype(np.float32)
-    reference = np.stack(
-        [InverseDistance().fit(record.tx_pos_m[known], record.observation[r, known]).predict(tx_pos) for r in receivers]
-    ).astype(np.float32)
+    if len(rows) == 0:
+        raise InputError(f"split {split.name}: no test rows to score; use another split")
+    tx_pos, task = record.tx_pos_m[rows], TASKS[record.task]
+    truth = record.observation[:, rows]
     arrays = {
         "row": rows,
-        "prediction": prediction,
-        "truth": record.observation[:, rows],
+        "prediction": np.stack([predict(rows, r) for r in range(len(truth))]).astype(truth.dtype),
+        "truth": truth,
         "tx_pos": tx_pos,
-        "reference_idw4": reference,
+        reference_key(task): _reference(task, record, known, tx_pos).astype(truth.dtype),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
-    metrics = score(arrays) | {
+    metrics = score(arrays, record.task) | {
         "n_train": len(known),
-        "ms_per_sample": milliseconds_per_sample(predict, tx_pos),
+        "ms_per_sample": milliseconds_per_sample(predict, rows),
     }
     return metrics, arrays
 
 
-def score(arrays: dict[str, Any]) -> dict[str, Any]:
-    """The score blocks of ``metrics.json`` from the arrays of ``predictions.npz``."""
-    own, blend = ssim(arrays["prediction"], arrays["truth"]), ssim(arrays["reference_idw4"], arrays["truth"])
-    metrics: dict[str, Any] = {
-        "ssim": summary(own),
-        "reference": {"idw4": summary(blend)},
-        "n_test": len(arrays["row"]),
-    }
+def _reference(task: TaskScore, record: Record, rows: NDArray[np.int64], tx_pos: FloatArray) -> Observations:
+    blends = []
+    for receiver, observed in zip(record.receivers, record.observation, strict=True):
+        blend = InverseDistance(task.neighbours, softening_m=task.softening_m)
+        try:
+            blends.append(blend.fit(record.tx_pos_m[rows], observed[rows]).predict(tx_pos))
+        except InputError as error:
+            raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
+    return np.stack(blends)
+
+
+def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
+    """The score blocks of ``metrics.json`` from the arrays of ``predictions.npz`` (with a first axis per receiver).
+
+    Rows that a receiver did not receive are left out; with several receivers each has a block of its own, with the
+    number of rows that count, and the block at the top pools all.
+    """
+    scorer = TASKS[task]
+    own = scorer.score(arrays["prediction"], arrays["truth"])
+    blend = scorer.score(arrays[reference_key(scorer)], arrays["truth"])
+
+    def blocks(scores: FloatArray, references: FloatArray) -> dict[str, Any]:
+        return {scorer.block: summary(scores), "reference": {scorer.reference: summary(references)}}
+
+    metrics: dict[str, Any] = {"task": task, **blocks(own, blend), "n_test": len(arrays["row"])}
     if len(own) > 1:
+        counts = np.count_nonzero(~np.isnan(own), axis=1)
         metrics["receivers"] = {
-            str(name): {"ssim": summary(own[r]), "reference": {"idw4": summary(blend[r])}}
+            str(name): {**(blocks(own[r], blend[r]) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
     return metrics
@@ -89,15 +112,15 @@ def score(arrays: dict[str, Any]) -> dict[str, Any]:
 def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics and predictions of several folds as one: every row's score counts once.
 
-    ``n_train`` is the mean over the folds, times are medians (per sample) and sums (training).
+    ``n_train`` is the mean over the folds, ``ms_per_sample`` the median.
     """
-    every = [arrays for _, arrays in parts]
-    arrays = {"row": np.concatenate([a["row"] for a in every]), "tx_pos": np.concatenate([a["tx_pos"] for a in every])}
-    for key in ("prediction", "truth", "reference_idw4"):
+    blocks, every = zip(*parts, strict=True)
+    task = blocks[0]["task"]
+    arrays = {key: np.concatenate([a[key] for a in every]) for key in ("row", "tx_pos")}
+    for key in ("prediction", "truth", reference_key(TASKS[task])):
         arrays[key] = np.concatenate([a[key] for a in every], axis=1)
     arrays["receiver_name"] = every[0]["receiver_name"]
-    blocks = [metrics for metrics, _ in parts]
-    metrics = score(arrays) | {
+    metrics = score(arrays, task) | {
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
@@ -111,12 +134,26 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
 
 
 def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Write spectra as ``.npz``: greys in 0..1, float32, [m, H, W] for one receiver, else [n_rx, m, H, W].
+    """Write predictions as ``.npz``, observations without their first axis where there is one receiver.
 
-    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. Returns the arrays as written.
+    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. ``prediction`` and, where they are
+    known, ``truth`` and ``reference_<name>``: grey in 0..1 [m, H, W] or [n_rx, m, H, W] float32, power in dBm [m] or
+    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k] or [n_rx, m, k] complex64.
+
+    Returns:
+        The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
-    spectra = ("prediction", "truth", "reference_idw4")
-    written = {k: v[0] if single and k in spectra else v for k, v in arrays.items()}
+    shared = ("row", "tx_pos", "receiver_name")
+    written = {k: v[0] if single and k not in shared else v for k, v in arrays.items()}
     write_arrays(path, written, compressed=True)
     return written
+
+
+def stored_metrics(folder: Path) -> dict[str, Any]:
+    """The last ``metrics.json``; nothing where it is missing or damaged, since scoring writes it anew."""
+    try:
+        stored = json.loads((folder / METRICS).read_text())
+    except (OSError, ValueError):
+        return {}
+    return stored if isinstance(stored, dict) else {}

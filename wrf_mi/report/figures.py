@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
@@ -77,6 +79,49 @@ def spectrum_table(rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], colum
     return figure
 
 
+def position_table(
+    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], tx_pos_m: ArrayLike, label: str
+) -> Figure:
+    """Maps of one value for each transmitter position side by side, for example truth beside prediction.
+
+    Args:
+        rows: a name and one array [m] per column; None leaves the place empty, NaN leaves a position out. The maps of
+            a row share their colours.
+        columns: a title for each column.
+        tx_pos_m: positions [m, 3], metres; drawn from above.
+        label: of the value, with its unit.
+
+    Returns:
+        The figure.
+    """
+    x, y, _ = np.asarray(tx_pos_m, float).T
+    aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
+    figure = Figure(figsize=(PANEL_IN * len(columns) + 0.8, PANEL_IN * aspect * len(rows) + 0.6), layout="constrained")
+    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
+    for r, (name, maps) in enumerate(rows):
+        given = np.concatenate([np.ravel(values) for values in maps if values is not None])
+        low, high = np.nanpercentile(given, [1, 99]) if np.isfinite(given).any() else (0.0, 1.0)
+        for c, (title, values) in enumerate(zip(columns, maps, strict=True)):
+            axes = grid[r, c]
+            axes.set_aspect("equal")
+            axes.tick_params(labelsize=6)
+            if r == 0:
+                axes.set_title(title, fontsize=8)
+            if c == 0:
+                axes.set_ylabel(f"{name}\ny (m)", fontsize=7)
+            if r == len(rows) - 1:
+                axes.set_xlabel("x (m)", fontsize=7)
+            if values is None:
+                axes.set_axis_off()
+                continue
+            axes.scatter(x, y, c=np.asarray(values), s=6, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+        colours = ScalarMappable(Normalize(low, high), cmap="viridis")
+        bar = figure.colorbar(colours, ax=list(grid[r]), shrink=0.9)
+        bar.set_label(label, fontsize=7)
+        bar.ax.tick_params(labelsize=6)
+    return figure
+
+
 def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
     """A spectrum beside the Gaussians that make it, each as the receiver sees it.
 
@@ -120,7 +165,7 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
     """Cumulative distributions of a score over test rows, one step curve each; references dashed.
 
     Args:
-        scores: values of each run by its name.
+        scores: values of each run by its name; NaN are left out.
         references: the same for what runs are held against.
         label: of the score's axis.
     """
@@ -128,7 +173,8 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
     axes = figure.subplots()
     for group, style in ((scores, "-"), (references, "--")):
         for name, values in group.items():
-            axes.ecdf(np.ravel(values), label=name, linestyle=style)
+            scored = np.ravel(values)
+            axes.ecdf(scored[~np.isnan(scored)], label=name, linestyle=style)
     axes.set_xlabel(label)
     axes.set_ylabel("share of test rows below")
     axes.grid(alpha=0.3)

@@ -18,51 +18,65 @@ from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 
-from .metrics import ssim
+from .metrics import TASKS, TaskScore
 
 METRICS = "metrics.json"
 PREDICTIONS = "predictions.npz"
 LOG = "log.jsonl"
 CONFIG = "config.yaml"
 
-Spectra = NDArray[np.float32]
+Observations = NDArray[np.float32] | NDArray[np.complex64]
+"""Greys, powers in dBm or channel coefficients, see `wrf_mi.core.Record`."""
+
+
+def reference_key(task: TaskScore) -> str:
+    """Key in ``predictions.npz`` of what the task's reference predicts."""
+    return f"reference_{task.reference}"
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run on spectra, with one first axis per receiver.
+    """A finished run, with one first axis per receiver.
 
     Attributes:
         path: the run folder.
         name: for tables and legends.
+        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``; `wrf_mi.report.metrics.TASKS` says how it is scored.
+        dataset: name or folder of the data set, "" where the run does not tell.
         metrics: content of ``metrics.json``.
         seed: of the configuration, or None where it states none.
+        receivers: their names.
         row: test rows, shape [m].
-        prediction: grey values, shape [n_rx, m, H, W].
-        truth: the same shape.
-        reference: the blend of the four nearest training spectra, the same shape.
+        tx_pos_m: transmitter positions [m, 3], metres.
+        prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients.
+        truth: the same shape; NaN where nothing was received.
+        reference: the blend of the nearest training rows, the same shape.
         validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
     """
 
     path: Path
     name: str
+    task: str
+    dataset: str
     metrics: dict[str, Any]
     seed: int | None
+    receivers: tuple[str, ...]
     row: IntArray
-    prediction: Spectra
-    truth: Spectra
-    reference: Spectra
+    tx_pos_m: FloatArray
+    prediction: Observations
+    truth: Observations
+    reference: Observations
     validation: dict[str, list[tuple[float, float]]]
 
     @cached_property
-    def ssim(self) -> FloatArray:
-        """Structural similarity of each prediction, shape [n_rx, m]."""
-        return ssim(self.prediction, self.truth)
+    def score(self) -> FloatArray:
+        """The task's metric of each prediction, shape [n_rx, m]; NaN where nothing was received."""
+        return TASKS[self.task].score(self.prediction, self.truth)
 
     @cached_property
-    def reference_ssim(self) -> FloatArray:
-        """Structural similarity of the blend, shape [n_rx, m]."""
-        return ssim(self.reference, self.truth)
+    def reference_score(self) -> FloatArray:
+        """The same of the blend."""
+        return TASKS[self.task].score(self.reference, self.truth)
 
 
 def read_run(path: str | Path, name: str | None = None) -> Run:
@@ -73,24 +87,29 @@ def read_run(path: str | Path, name: str | None = None) -> Run:
         name: for tables and legends; the folder's own name without one.
 
     Raises:
-        InputError: not a run folder, or a file in it that is missing, damaged or of another task.
+        InputError: not a run folder, or a file in it that is missing or damaged.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a run folder made by train or trace")
     metrics = _read_metrics(folder / METRICS)
-    arrays = _read_predictions(folder / PREDICTIONS)
+    task = TASKS[metrics["task"]]
+    arrays = _read_predictions(folder / PREDICTIONS, task)
     parts = [folder, *sorted(p for p in folder.glob("fold*") if p.is_dir())]
     curves = {p.name if p != folder else "": _read_log(p / LOG) for p in parts}
     return Run(
         path=folder,
         name=name or folder.resolve().name,
+        task=metrics["task"],
+        dataset=str(metrics.get("dataset", "")),
         metrics=metrics,
         seed=_read_seed(folder, metrics),
+        receivers=tuple(str(name) for name in arrays["receiver_name"]),
         row=arrays["row"],
+        tx_pos_m=arrays["tx_pos"],
         prediction=arrays["prediction"],
         truth=arrays["truth"],
-        reference=arrays["reference_idw4"],
+        reference=arrays[reference_key(task)],
         validation={fold: points for fold, points in curves.items() if points},
     )
 
@@ -124,30 +143,37 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     missing = [key for key in needed if key not in metrics]
     if missing:
         raise InputError(f"{path}: no {', '.join(missing)}; run evaluate to write it anew")
-    if metrics["task"] != "spectrum":
-        raise InputError(f"{path}: task {metrics['task']!r}; only runs on spectra can be compared")
-    blocks = (metrics.get("ssim"), (metrics.get("reference") or {}).get("idw4"))
+    if metrics["task"] not in TASKS:
+        raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
+    task = TASKS[metrics["task"]]
+    blocks = (metrics.get(task.block), (metrics.get("reference") or {}).get(task.reference))
     if any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        raise InputError(f"{path}: no ssim or no reference idw4 with a median; run evaluate to write it anew")
+        what = f"no {task.block} or no reference {task.reference} with a median"
+        raise InputError(f"{path}: {what}; run evaluate to write it anew")
     return metrics
 
 
-def _read_predictions(path: Path) -> dict[str, Any]:
+def _read_predictions(path: Path, task: TaskScore) -> dict[str, Any]:
+    observed = ("prediction", "truth", reference_key(task))
     try:
         with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in ("row", "prediction", "truth", "reference_idw4")}
+            arrays = {key: stored[key] for key in ("row", "tx_pos", *observed)}
+            names = stored.get("receiver_name")
     except FileNotFoundError:
         raise InputError(f"{path}: missing; run evaluate to write it") from None
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]}; run evaluate to write it anew") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not readable ({error}); run evaluate to write it anew") from None
-    spectra = {key: arrays[key] if arrays[key].ndim == 4 else arrays[key][None] for key in arrays if key != "row"}
-    shape = spectra["truth"].shape
-    if len(shape) != 4 or shape[1] != len(arrays["row"]) or any(s.shape != shape for s in spectra.values()):
-        shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
+    shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
+    if arrays["truth"].ndim == 1 + task.axes:  # one receiver
+        arrays |= {key: arrays[key][None] for key in observed}
+    shape, rows = arrays["truth"].shape, len(arrays["row"])
+    names = np.arange(shape[0] if shape else 0) if names is None else names
+    fits = len(shape) == 2 + task.axes and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
+    if not fits or any(arrays[key].shape != shape for key in observed):
         raise InputError(f"{path}: shapes do not fit together ({shapes}); run evaluate to write it anew")
-    return {"row": arrays["row"], **spectra}
+    return arrays | {"receiver_name": names}
 
 
 def _read_seed(folder: Path, metrics: dict[str, Any]) -> int | None:

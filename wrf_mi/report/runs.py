@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
+from ..core.types import IntArray
 from ..fit.config import TrainConfig
 from ..fit.folder import (
     RunConfig,
@@ -29,8 +31,9 @@ from ..fit.predictor import Predictor
 from ..fit.trainer import Progress, Trainer, peak_memory_mb
 from ..measure import make_splits
 from ..trace import load_record
-from .evaluate import evaluate, pool, write_predictions, write_results
+from .evaluate import Predict, evaluate, pool, stored_metrics, write_predictions, write_results
 from .run_folder import CONFIG, METRICS
+from .traced import evaluate_traced, is_traced, predict_traced
 
 Listen = Callable[[str, int, Progress], None]
 """Hears of progress: name of the fold ("" where there is one split), steps in all, and the progress."""
@@ -163,15 +166,23 @@ def _fit(
         raise Interrupted(
             f"stopped after step {trainer.state.step} of {run.settings.steps}; go on with: wrf-mi train --resume {top}"
         )
-    metrics, arrays = evaluate(trainer.record, trainer.split, trainer.predictor())
+    metrics, arrays = evaluate(trainer.record, trainer.split, of_rows(trainer.record, trainer.predictor()))
     metrics = _header(run, trainer.seconds) | {"gaussians": trainer.state.gaussians} | metrics
     write_results(folder, metrics, arrays)
     return metrics, arrays
 
 
+def of_rows(record: Record, predictor: Predictor) -> Predict:
+    """A predictor from transmitter positions as a method on a record's rows."""
+
+    def predict(rows: IntArray, receiver: int) -> NDArray[np.float32]:
+        return predictor(record.tx_pos_m[rows], receiver)
+
+    return predict
+
+
 def _header(run: RunConfig, seconds: float) -> dict[str, Any]:
     return {
-        "task": "spectrum",
         "model": run.settings.model,
         "dataset": run.dataset,
         "split": run.split,
@@ -197,6 +208,8 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
         InputError: not a run folder, one that was stopped, or no row of ``split`` is left that the run has not seen.
     """
     path = Path(folder)
+    if is_traced(path):
+        return evaluate_traced(path, split)
     run = read_config(path)
     record = load_record(run.dataset)
     if is_blocked(path):
@@ -206,7 +219,7 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
         for k in range(len(make_splits(record, run.split, run.settings.seed, run.n_train))):
             part = path / f"fold{k}"
             done["train_seconds"] += _finished(part, run)["train_seconds"]
-            parts.append(evaluate(record, load_rows(part, record), load_predictor(part)))
+            parts.append(evaluate(record, load_rows(part, record), of_rows(record, load_predictor(part))))
         metrics, arrays = pool(parts)
     else:
         done = _finished(path, run)
@@ -217,8 +230,8 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
             if len(unseen) == 0:
                 raise InputError(f"{path}: trained on all test rows of split {split}; nothing is left to score")
             rows, run = replace(rows, test=unseen), replace(run, split=f"{split} (rows unseen by {run.split})")
-        metrics, arrays = evaluate(record, rows, load_predictor(path))
-    merged = _header(run, 0.0) | _stored_metrics(path) | done | metrics | {"split": run.split}
+        metrics, arrays = evaluate(record, rows, of_rows(record, load_predictor(path)))
+    merged = _header(run, 0.0) | stored_metrics(path) | done | metrics | {"split": run.split}
     if split is None:
         write_results(path, merged, arrays)
     return merged
@@ -233,17 +246,8 @@ def _finished(folder: Path, run: RunConfig) -> dict[str, Any]:
     return {"train_seconds": float(arrays["seconds"]), "gaussians": arrays["mean/position"].shape[1]}
 
 
-def _stored_metrics(folder: Path) -> dict[str, Any]:
-    """The last ``metrics.json``; nothing where it is missing or damaged, since scoring writes it anew."""
-    try:
-        stored = json.loads((folder / METRICS).read_text())
-    except (OSError, ValueError):
-        return {}
-    return stored if isinstance(stored, dict) else {}
-
-
 def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -> dict[str, tuple[int, ...]]:
-    """Spectra of a run's field at new transmitter positions, as an ``.npz`` file.
+    """What a run's model predicts at new transmitter positions, as an ``.npz`` file.
 
     Args:
         folder: run folder with one field.
@@ -257,13 +261,18 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
     Raises:
         InputError: a run over several blocks, or positions that are not finite.
     """
-    predictor = Run(Path(folder)).predictor()
-    prediction = np.stack([predictor(tx_pos_m, r) for r in range(len(predictor.receivers))])
+    path = Path(folder)
+    if is_traced(path):
+        prediction, names = predict_traced(path, tx_pos_m)
+    else:
+        predictor = Run(path).predictor()
+        prediction = np.stack([predictor(tx_pos_m, r) for r in range(len(predictor.receivers))])
+        names = tuple(r.name for r in predictor.receivers)
     arrays: dict[str, Any] = {
         "row": np.arange(len(tx_pos_m)),
         "prediction": prediction,
         "tx_pos": np.asarray(tx_pos_m, float),
-        "receiver_name": np.asarray([r.name for r in predictor.receivers]),
+        "receiver_name": np.asarray(names),
     }
     return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
 

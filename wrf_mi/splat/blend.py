@@ -36,7 +36,7 @@ In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is go
 LOG2_E = 1.4426950408889634
 
 
-def _pack(columns: list[Any]) -> Any:
+def pack(columns: list[Any]) -> Any:
     """Interleave per-Gaussian arrays into one table [n * RECORD]: one lookup then reads one cache line."""
     n = dr.width(columns[0])
     index = dr.arange(dr.uint32_array_t(type(columns[0])), n) * RECORD
@@ -46,7 +46,8 @@ def _pack(columns: list[Any]) -> Any:
     return table
 
 
-def _read(table: Any, i: Any, count: int) -> list[Any]:
+def read(table: Any, i: Any, count: int) -> list[Any]:
+    """The first ``count`` numbers of record i of the table that `pack` makes."""
     return [dr.gather(type(table), table, i * RECORD + k) for k in range(count)]
 
 
@@ -140,10 +141,12 @@ def _forward(table: Any, lists: TileLists, plane: Plane, n: int, product: bool, 
     state = _start(float_type)
     j = index_type(0)
     while j < lanes.end:
-        record = _read(table, dr.gather(index_type, lists.index, lanes.start + j), fields)
+        record = read(table, dr.gather(index_type, lists.index, lanes.start + j), fields)
         along = _along_azimuth(record, lanes.azimuth)
         state = _add(record, [_footprint(along, e)[0] for e in lanes.elevation], state, product)
         j += 1
+    # Each scatter below is a kernel of its own, which would run the loop again.
+    dr.eval(state.re, state.im)
     out_re, out_im = dr.zeros(float_type, batch * plane.pixels), dr.zeros(float_type, batch * plane.pixels)
     for k in range(LANE_ROWS):
         dr.scatter(out_re, state.re[k], lanes.pixel[k], lanes.active[k])
@@ -158,7 +161,7 @@ def _start(float_type: Any) -> _Sum:
     return _Sum(each(0), each(0), each(1), each(0))
 
 
-def _behind_product(
+def behind_product(
     record: list[Any], g: Any, t: tuple[Any, Any], q: tuple[Any, Any], gradient: tuple[Any, Any]
 ) -> tuple[Any, list[Any], tuple[Any, Any], tuple[Any, Any]]:
     """One pixel's derivatives under product blending: by G', by (S, delta), and the next T and Q."""
@@ -177,7 +180,7 @@ def _behind_product(
     return d_g, [g * a_re, -g * a_im, g * f_re, -g * f_im], following, (q_re, q_im)
 
 
-def _behind_alpha(
+def behind_alpha(
     record: list[Any], g: Any, t: tuple[Any, Any], q: tuple[Any, Any], gradient: tuple[Any, Any]
 ) -> tuple[Any, list[Any], tuple[Any, Any], tuple[Any, Any]]:
     """One pixel's derivatives under alpha blending: by G', by (S, o), and the next T and Q (real parts)."""
@@ -219,7 +222,7 @@ def _take_away(
     record: list[Any], lanes: _Lanes, rest: _Rest, slope: list[tuple[Any, Any]], product: bool
 ) -> tuple[list[Any], Any, _Rest]:
     """One Gaussian's derivatives by its record, summed over the lane's pixels; whether any pixel sees it; the rest."""
-    behind = _behind_product if product else _behind_alpha
+    behind = behind_product if product else behind_alpha
     along = _along_azimuth(record, lanes.azimuth)
     sums: list[list[Any]] = [[0, 0] for _ in range(3)]
     extra: list[Any] = [0 for _ in record[9:]]
@@ -261,7 +264,7 @@ def _backward(
     j = index_type(0)
     while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
-        values, seen, rest = _take_away(_read(table, i, fields), lanes, rest, slope, product)
+        values, seen, rest = _take_away(read(table, i, fields), lanes, rest, slope, product)
         for k in range(fields):
             dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=dr.ReduceMode.Local)
         j += 1
@@ -274,7 +277,7 @@ class _Blend(dr.CustomOp):
     def eval(self, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, columns: list[Any]) -> Any:
         self.parts = (lists, plane, n, product, batch)
         self.count = len(columns)
-        self.table = _pack(columns)
+        self.table = pack(columns)
         dr.eval(self.table)
         self.total = _forward(self.table, *self.parts)
         dr.eval(self.total)

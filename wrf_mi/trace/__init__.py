@@ -9,17 +9,22 @@ from ..measure import load
 from .laboratory import NAME as LABORATORY
 from .laboratory import laboratory_record
 from .materials import set_frequency
-from .paths import SpecularPaths, open_scene, sionna_orientation, trace_paths
-from .spectra import element_signals, trace_spectra
+from .options import TraceOptions
+from .result import TraceResult, load_trace, recompute, save_trace
+from .scenes import open_scene
+from .solve import trace_paths
+from .spectra import trace_spectra
 
 __all__ = [
-    "SpecularPaths",
-    "element_signals",
+    "TraceOptions",
+    "TraceResult",
     "laboratory_record",
     "load_record",
+    "load_trace",
     "open_scene",
+    "recompute",
+    "save_trace",
     "set_frequency",
-    "sionna_orientation",
     "trace_paths",
     "trace_spectra",
 ]

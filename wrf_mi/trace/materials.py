@@ -33,6 +33,17 @@ begins. Its permittivities do not change with frequency, and its conductivities 
 CONSTANTS_FROM_HZ = 0.3e9
 """Where the constants end: below, the conductivity would be off by more than a factor of three."""
 
+PERFECT = "perfect"
+"""Name of a perfect conductor, which reflects without loss and lets nothing pass: what image-method tracers without
+materials assume, but for the sign of the field."""
+
+
+def perfect_reflector() -> Any:
+    """A radio material of so high a conductivity that its reflection coefficients are -1 and +1 to single precision."""
+    from sionna import rt
+
+    return rt.RadioMaterial(PERFECT, thickness=0.1, relative_permittivity=1.0, conductivity=1e13)
+
 
 def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, float] | None = None) -> None:
     """Set a Sionna RT scene's frequency, with explicit constants for ITU materials below their range (logged).

@@ -1,0 +1,176 @@
+"""Which Gaussians the rays of a bundle meet: found by Mitsuba's ray tracing of the ``ellipsoids`` shape.
+
+A ray through many overlapping ellipsoids costs one trace a hit, and each trace tests those around its start again.
+Three things keep that small:
+
+* one ray is traced for each bundle, through ellipsoids grown by the bundle's width (`wrf_mi.project.ray.hulls`);
+* the ellipsoids are dealt out to many places far from each other and traced in each, so that few overlap;
+* the caller keeps what was found for as long as neither the Gaussians' geometry nor the receiver changes.
+
+Each ellipsoid is scaled about the receiver, so that its centre comes to lie between `NEAREST` and `FARTHEST` by its
+rank, its place by distance. That changes nothing in which rays meet it, but the near and small are then as large as the
+far for the roundings of float32. Those wider than `WIDEST` as the receiver sees them are left to all rays.
+
+The hits come in order of entry. One sort of numbers (bundle, rank) puts them in order of depth: no buffer limits how
+far the two orders may differ.
+
+A closest hit hides a second ellipsoid entered at the same place, and the next trace must begin a step behind the hit.
+So each bundle is traced from both ends: what is lost must share its entry with one ellipsoid and its exit with one,
+within `STEP`, of the few in its part. Ranks that follow each other lie in different parts, so coincident Gaussians do.
+Of 165,000 hits of 4,000 Gaussians of 7 degrees one way loses some 45, both ways none: one in 10^7 is to be expected.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import numpy as np  # noqa: E402
+
+from wrf_mi.field.gaussians import Gaussians  # noqa: E402
+from wrf_mi.project.footprint import Pose, depth_order  # noqa: E402
+from wrf_mi.project.ray import Hulls, RayFootprints, hulls  # noqa: E402
+from wrf_mi.splat.bundles import Bundles, RayLists  # noqa: E402
+
+IN_PART = 64
+"""Ellipsoids in a part, about: with fewer, most rays meet none of it; with more, each trace tests many."""
+
+FEWEST_ACROSS, MOST_ACROSS = 4, 16
+"""Bounds of the parts along each side of their square. More would be too far from the origin for float32."""
+
+NEAREST, FARTHEST = 1.0, 4.0
+"""Distances of the nearest and of the farthest centre in the traced scene, whose unit of length is free."""
+
+WIDEST = 2.0
+"""Largest semi-axis of an ellipsoid that is traced, in distances of its centre."""
+
+SIZE = FARTHEST * (1 + WIDEST)
+"""Radius around the receiver that holds all that is traced."""
+
+STEP = 1e-4
+"""Step behind a hit: some roundings of float32 at the farthest part, and a hundredth of the smallest ellipsoid."""
+
+SPACING = 2 * SIZE + 4 * STEP
+"""From one part to the next: rays of one part end before the ellipsoids of the next begin."""
+
+ENTRIES = 1 << 18
+"""Hits that there is room for at first; where there are more, they are traced again with as much as they need."""
+
+
+def traced_lists(gaussians: Gaussians, footprints: RayFootprints, pose: Pose, bundles: Bundles) -> RayLists:
+    """For each bundle the Gaussians that its rays may meet, near to far, each once.
+
+    Args:
+        gaussians: batch 1.
+        footprints: of these Gaussians from ``pose``.
+        pose: of the receiver.
+        bundles: its rays.
+    """
+    order = depth_order(footprints.depth, gaussians.position)
+    order = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, footprints.visible, order)))
+    lists = dr.width(bundles.axis[0])
+    if dr.width(order) == 0:
+        return RayLists(mi.UInt32(0), dr.zeros(mi.UInt32, lists + 1))
+    key_type: Any = mi.UInt32 if lists * dr.width(order) < 2**32 else mi.UInt64
+    # Numbers that change with the geometry stay on the device: as constants of kernels they would compile new ones.
+    count = dr.opaque(key_type, dr.width(order))
+    own = _scaled(hulls(gaussians, pose, bundles.margin_rad), order)
+    widest = dr.maximum(dr.maximum(*own.radius[:2]), own.radius[2]) / _distance(own)
+    narrow, wide = (mi.UInt32(dr.compress(m)) for m in (widest <= WIDEST, widest > WIDEST))
+    found = []
+    if dr.width(wide) > 0:
+        bundle = dr.repeat(dr.arange(mi.UInt32, lists), dr.width(wide))
+        found.append(key_type(bundle) * count + key_type(dr.tile(wide, lists)))
+    if dr.width(narrow) > 0:
+        found.append(_hits(own, narrow, pose, bundles, count))
+    keys = dr.sort(dr.concat(found))
+    number = dr.arange(mi.UInt32, dr.width(keys))
+    first = (number == 0) | (keys != dr.gather(key_type, keys, dr.maximum(number, 1) - 1))
+    keys = dr.gather(key_type, keys, dr.compress(first))
+    length = dr.zeros(mi.UInt32, lists + 1)
+    dr.scatter_add(length, mi.UInt32(1), mi.UInt32(keys // count))
+    result = RayLists(dr.gather(mi.UInt32, order, mi.UInt32(keys % count)), dr.cumsum(length) - length)
+    dr.eval(result)
+    return result
+
+
+def _distance(own: Hulls) -> Any:
+    return dr.norm(mi.Vector3f(*own.centre))
+
+
+def _scaled(own: Hulls, order: Any) -> Hulls:
+    """The ellipsoids in the order of their ranks, scaled about the receiver."""
+    own = Hulls(*([dr.gather(mi.Float, c, order) for c in part] for part in (own.centre, own.radius, own.rotation)))
+    rank = dr.arange(mi.Float, dr.width(order)) / dr.opaque(mi.Float, dr.width(order))
+    scale = dr.lerp(NEAREST, FARTHEST, rank) / _distance(own)
+    result = Hulls([c * scale for c in own.centre], [r * scale for r in own.radius], own.rotation)
+    dr.eval(result.centre, result.radius, result.rotation)
+    return result
+
+
+def _hits(own: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any) -> Any:
+    """Numbers ``bundle * count + rank`` of the ellipsoids of these ranks that the bundles' axes meet, some twice."""
+    own = Hulls(*([dr.gather(mi.Float, c, rank) for c in part] for part in (own.centre, own.radius, own.rotation)))
+    # Room for rounding.
+    own.radius = [r + STEP for r in own.radius]
+    n, lists, key_type = dr.width(rank), dr.width(bundles.axis[0]), type(count)
+    across = int(np.clip(np.ceil(np.sqrt(n / IN_PART)), FEWEST_ACROSS, MOST_ACROSS))
+    parts = across**2
+    place = _place(dr.arange(mi.UInt32, n) % parts, across)
+    columns = [*(c + x for c, x in zip(own.centre, place, strict=True)), *own.radius, *own.rotation]
+    data = dr.concat([mi.TensorXf(c, (n, 1)) for c in columns], axis=1)
+    shape = {"type": "ellipsoids", "data": data, "extent": 1.0, "extent_adaptive_clamping": False}
+    scene = mi.load_dict({"type": "scene", "hulls": shape})
+
+    # No closest hit reports an ellipsoid from within: rays begin in front of those that hold the receiver.
+    distance, radius = _distance(own), dr.maximum(dr.maximum(*own.radius[:2]), own.radius[2])
+    behind = dr.max(dr.select(radius + STEP > distance, distance + radius + STEP, 0))
+    ray = dr.arange(mi.UInt32, 2 * parts * lists)
+    axis = [dr.gather(mi.Float, c, ray % lists) for c in bundles.axis]
+    turned = mi.Vector3f(*(sum(dr.detach(pose.to_world[i][k]) * axis[k] for k in range(3)) for i in range(3)))
+    back = ray >= parts * lists
+    end = SIZE + STEP
+    origin = _place((ray // lists) % parts, across) + turned * dr.select(back, end, -behind)
+    rays = mi.Ray3f(origin, dr.select(back, -turned, turned), end + behind, 0.0, [])
+    first = key_type(ray % lists) * count
+    dr.eval(rays, first, rank)
+    keys, used = _trace(scene, rays, first, rank, dr.opaque(mi.UInt32, ENTRIES), ENTRIES)
+    if used > ENTRIES:
+        keys, used = _trace(scene, rays, first, rank, dr.opaque(mi.UInt32, used), used)
+    return dr.gather(key_type, keys, dr.arange(mi.UInt32, used))
+
+
+def _place(part: Any, across: int) -> Any:
+    """Where the receiver stands in a part."""
+    middle = (across - 1) / 2
+    x, y = mi.Float(part % across), mi.Float(part // across)
+    return mi.Point3f((x - middle) * SPACING, (y - middle) * SPACING, 0)
+
+
+@dr.syntax
+def _trace(scene: Any, start: Any, first: Any, rank: Any, room: Any, entries: int) -> tuple[Any, int]:
+    """Each ray's ``first`` plus the rank of what it hits, unsorted; and how many there are, for whatever room.
+
+    ``room`` is ``entries`` as an array of width 1.
+    """
+    key_type: Any = type(first)
+    keys, used = dr.empty(key_type, entries), dr.zeros(mi.UInt32, 1)
+    dr.eval(keys, used)
+    t = mi.Float(0)
+    active = mi.Bool(True)
+    while active:
+        ray = mi.Ray3f(start.o + t * start.d, start.d)
+        ray.maxt = start.maxt - t
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        active &= hit.is_valid()
+        slot = dr.scatter_inc(used, mi.UInt32(0), active)
+        own = key_type(dr.gather(mi.UInt32, rank, hit.prim_index, active))
+        dr.scatter(keys, first + own, slot, active & (slot < room))
+        t += hit.t + STEP
+    dr.eval(keys, used)
+    return keys, int(used[0])

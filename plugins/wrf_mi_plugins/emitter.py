@@ -1,0 +1,175 @@
+"""The plugins `wrf_gaussian_emitter`, Gaussians as virtual transmitters, and `wrf_gaussians`, the shape they fill."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from numpy.typing import ArrayLike  # noqa: E402
+
+from wrf_mi.core import InputError  # noqa: E402
+from wrf_mi.field.gaussians import Gaussians  # noqa: E402
+from wrf_mi.project.footprint_constants import CUTOFF  # noqa: E402
+from wrf_mi.project.optical_depth import attenuators, one, passing  # noqa: E402
+
+from .shape import gaussian_shape, shape_parameters  # noqa: E402
+from .source import FieldSource, source_from_properties, source_of  # noqa: E402
+
+
+class GaussianEmitter(mi.Emitter):
+    """Gaussians as virtual transmitters whose complex signals depend on where the real transmitter is.
+
+    The emitter holds a trained field and a transmitter position. It is an area emitter: it belongs to one shape
+    `wrf_gaussians`, whose geometry and attributes ``signal``, ``opacity`` or ``attenuation`` it writes when that is
+    loaded and whenever one of its own parameters changes. The traced integrator reads the complex signals there.
+    Declare the emitter in the scene and refer to it in the shape, so that ``mi.traverse(scene)`` lists its parameters.
+
+    ================ ============ ==== ======== =============== =====================================================
+    parameter        type         unit default  differentiable  meaning
+    ================ ============ ==== ======== =============== =====================================================
+    ``run``          string            required no              run folder made by ``wrf-mi train`` (or its
+                                                                ``checkpoint.npz``), looked for beside the scene file
+    ``tx_position``  point        m    required yes             transmitter, world frame
+    (weights)        tensor            of run   yes             each of the field's parameters by name, dots as
+                                                                underscores; ``position``, ``log_scale`` and
+                                                                ``rotation`` with discontinuities
+    ================ ============ ==== ======== =============== =====================================================
+
+    .. code-block:: python
+
+        "transmitter": {"type": "wrf_gaussian_emitter", "run": "runs/first", "tx_position": [0.5, 1.0, 0.8]},
+        "gaussians": {"type": "wrf_gaussians", "emitter": {"type": "ref", "id": "transmitter"}},
+
+    Stock integrators carry power, not phase. To them each Gaussian radiates |a S|^2 towards whoever sees it, with its
+    signal S and a = opacity times G under alpha blending, a = G under product blending, where G is its largest value
+    along the ray. In a shape with a ``null`` BSDF, the default, these powers add up along a ray. They are found by rays
+    that hit them: the emitter cannot be sampled and says so with a density of zero.
+    """
+
+    def __init__(self, props: mi.Properties, source: FieldSource | None = None) -> None:
+        super().__init__(props)
+        self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+        self.source = source_from_properties(props) if source is None else source
+        self._media: list[weakref.ref[Any]] = []
+        self._refresh()
+
+    def _refresh(self) -> None:
+        self.gaussians: Gaussians = self.source.gaussians()
+        self._seen = attenuators(self.gaussians)
+
+    def tell(self, medium: Any) -> None:
+        """Call ``medium.gaussians_changed()`` whenever the Gaussians have changed."""
+        self._media.append(weakref.ref(medium))
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Expose the transmitter position and the field's parameters."""
+        super().traverse(callback)
+        self.source.traverse(callback)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Ask the field anew and pass the Gaussians on to the shape and to media."""
+        super().parameters_changed(keys)
+        if list(keys) == ["parent"]:  # the shape says that it has changed, which is our doing
+            return
+        self._refresh()
+        shape = self.get_shape()
+        if shape is not None:
+            parameters = mi.traverse(shape)
+            for name, values in shape_parameters(self.gaussians).items():
+                # Geometry that stays as it was is not traced anew.
+                if not _same(values, parameters[name]):
+                    parameters[name] = values
+            parameters.update()
+        for reference in self._media:
+            medium = reference()
+            if medium is not None:
+                medium.gaussians_changed()
+
+    def eval(self, si: mi.SurfaceInteraction3f, active: Any = True) -> mi.Spectrum:
+        """Power |a S|^2 that the Gaussian hit sends along the ray, unpolarised."""
+        g, index = self.gaussians, si.prim_index
+        direction = si.to_world(si.wi)
+        square, _, _ = passing(one(self._seen, index), list(si.p), list(direction))
+        amplitude = dr.select(active & (square < CUTOFF * CUTOFF), dr.exp(-0.5 * square), 0)
+        if g.opacity is not None:
+            amplitude *= dr.gather(mi.Float, g.opacity, index)
+        re, im = (dr.gather(mi.Float, part, index) * amplitude for part in g.signal)
+        return mi.depolarizer(mi.UnpolarizedSpectrum(re * re + im * im))
+
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: Any = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """No sample: density zero, so that rays that hit the Gaussians count in full."""
+        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> mi.Float:
+        """Density of `sample_direction`: zero."""
+        return mi.Float(0)
+
+    def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> mi.Spectrum:
+        """Radiance of a direction sample: none is ever made."""
+        return mi.Spectrum(0)
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        """That of the shape."""
+        shape = self.get_shape()
+        return mi.ScalarBoundingBox3f() if shape is None else shape.bbox()
+
+    def to_string(self) -> str:
+        """One line: model, number of Gaussians, transmitter."""
+        where = ", ".join(f"{x:g}" for x in dr.ravel(dr.detach(self.source.tx_position)))
+        model = type(self.source.field).__name__
+        return f"GaussianEmitter[{model}, {self.gaussians.count} Gaussians, transmitter at ({where}) m]"
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two arrays have the same numbers and no derivatives."""
+    if dr.width(a) != dr.width(b) or dr.grad_enabled(a) or dr.grad_enabled(b):
+        return False
+    return bool(dr.all(a == b))
+
+
+def gaussian_emitter(
+    field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike, name: str = "transmitter"
+) -> GaussianEmitter:
+    """The emitter of a model of your own, or of parameters that no run folder holds; an entry for ``mi.load_dict``.
+
+    Args:
+        field: any object with the method ``gaussians`` of `wrf_mi.field.WrfGsPlus`.
+        params: its parameters by name.
+        tx_position_m: three coordinates, world frame.
+        name: under which ``mi.traverse`` lists its parameters; use it as the key in dictionaries, too.
+
+    Raises:
+        InputError: a position of another shape or not finite.
+    """
+    emitter = GaussianEmitter(mi.Properties("wrf_gaussian_emitter"), source_of(field, params, tx_position_m))
+    emitter.set_id(name)
+    return emitter
+
+
+def _shape_of_emitter(props: mi.Properties) -> mi.Shape:
+    """The plugin `wrf_gaussians`: the built-in ``ellipsoids`` shape with the Gaussians of the emitter given to it."""
+    given = {key: props[key] for key in props if isinstance(props[key], mi.Object)}
+    emitters = [value for value in given.values() if isinstance(value, GaussianEmitter)]
+    if len(emitters) != 1:
+        raise InputError(f"wrf_gaussians: {len(emitters)} wrf_gaussian_emitter in it; give one, or a reference to one")
+    (emitter,) = emitters
+    entry = gaussian_shape(emitter.gaussians) | {"id": props.id(), emitter.id() or "emitter": emitter}
+    others = {key: value for key, value in given.items() if value is not emitter}
+    if not any(isinstance(value, mi.BSDF) for value in others.values()):
+        entry["bsdf"] = {"type": "null"}
+    # Mitsuba may be loading a scene in parallel at this moment: no second round of tasks within one of its own.
+    return mi.load_dict(entry | others, parallel=False)
+
+
+def register() -> None:
+    """Make `wrf_gaussian_emitter` and `wrf_gaussians` known to Mitsuba."""
+    mi.register_emitter("wrf_gaussian_emitter", GaussianEmitter)
+    mi.register_shape("wrf_gaussians", _shape_of_emitter)

@@ -1,0 +1,198 @@
+"""What the meshes of a Mitsuba scene let pass: radio materials of walls, and where rays cross them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from scipy.constants import speed_of_light  # noqa: E402
+
+from wrf_mi.core import InputError  # noqa: E402
+from wrf_mi.project.footprint import Pose  # noqa: E402
+from wrf_mi.splat.rays import Walls  # noqa: E402
+from wrf_mi.trace.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ  # noqa: E402
+
+from .shape import interleave  # noqa: E402
+
+ITU_PREFIX = "mat-itu_"
+"""Start of the id of a BSDF that stands for a material of ITU-R P.2040, as in Sionna RT's scene files."""
+
+MOST_CROSSINGS = 64
+"""Walls that a ray may cross; a scene where one crosses more is taken for a mistake (a terrain, say, or foliage)."""
+
+SMALLEST_SINE = 1e-6
+"""Below this sine of the angle of incidence there is no plane of incidence, and both polarisations pass alike."""
+
+
+@dataclass
+class Crossings:
+    """Where rays cross walls; ``k`` lists of arrays [rays], in order of distance. Nothing here has derivatives.
+
+    Attributes:
+        distance: from the receiver, metres; infinite where a ray crosses no further wall.
+        cosine: of the angle of incidence.
+        across: share of the power polarised across the plane of incidence (TE).
+        wall: number of the wall in the list of shapes.
+    """
+
+    distance: list[Any]
+    cosine: list[Any]
+    across: list[Any]
+    wall: list[Any]
+
+
+def wall_shapes(scene: Any) -> list[Any]:
+    """All shapes of a ``mi.Scene`` but ellipsoids and those of a ``null`` BSDF, the borders of media."""
+    lobes, nothing = mi.BSDFFlags.All.value, mi.BSDFFlags.Null.value
+    return [s for s in scene.shapes() if not s.is_ellipsoids() and s.bsdf().flags() & lobes != nothing]
+
+
+def wall_scene(shapes: list[Any]) -> Any:
+    """A ``mi.Scene`` of these shapes alone, which rays can be traced in without meeting Gaussians."""
+    return mi.load_dict({"type": "scene"} | {f"wall_{i}": shape for i, shape in enumerate(shapes)})
+
+
+def find_crossings(
+    scene: Any, shapes: list[Any], pose: Pose, direction: list[Any], polarization: list[float]
+) -> Crossings:
+    """Trace rays through walls, straight on.
+
+    Args:
+        scene: from `wall_scene`.
+        shapes: its shapes.
+        pose: of the receiver.
+        direction: unit vectors of the rays, receiver's frame, three arrays [rays].
+        polarization: of the receiver's antenna, receiver's frame.
+
+    Raises:
+        InputError: a ray crosses more than `MOST_CROSSINGS` walls.
+    """
+    d = _to_world(pose, direction)
+    field = _to_world(pose, [mi.Float(c) for c in polarization])
+    field -= dr.dot(field, d) * d
+    number = dr.zeros(mi.UInt32, max(_registry(s) for s in shapes) + 1)
+    for i, shape in enumerate(shapes):
+        dr.scatter(number, mi.UInt32(i), mi.UInt32(_registry(shape)))
+    origin = mi.Point3f(*(dr.detach(x) for x in pose.position))
+    ray, active, distance = mi.Ray3f(origin, d), mi.Bool(True), mi.Float(0)
+    dr.eval(ray, field, number)
+    found = Crossings([], [], [], [])
+    while True:
+        si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
+        active = active & si.is_valid()
+        # The next ray starts a little behind the wall.
+        distance = dr.select(active, dr.norm(si.p - origin), dr.inf)
+        cosine = dr.minimum(dr.abs(dr.dot(si.n, d)), 1)
+        te = dr.cross(d, si.n)
+        sine = dr.squared_norm(te) * dr.squared_norm(field)
+        across = dr.select(sine > SMALLEST_SINE**2, dr.square(dr.dot(field, te)) / sine, 0.5)
+        wall = dr.gather(mi.UInt32, number, dr.reinterpret_array(mi.UInt32, si.shape), active)
+        ray = dr.select(active, si.spawn_ray(d), ray)
+        dr.eval(active, distance, cosine, across, wall, ray)
+        if not dr.any(active):
+            return found
+        if len(found.distance) == MOST_CROSSINGS:
+            raise InputError(f"scene: a ray crosses more than {MOST_CROSSINGS} walls; simplify its meshes")
+        found.distance.append(distance)
+        found.cosine.append(cosine)
+        found.across.append(across)
+        found.wall.append(wall)
+
+
+def walls_of(
+    crossings: Crossings, shapes: list[Any], frequency_hz: Any, thickness_m: Mapping[str, float]
+) -> Walls | None:
+    """The complex transmission along rays, differentiable in the parameters of Sionna RT's radio materials.
+
+    Each wall is one slab, as in Sionna RT (ITU-R P.2040, eq. 43), and passes the receiver's polarisation by
+    T = T_TE s + T_TM (1 - s), where s is the share of it across the plane of incidence.
+
+    Args:
+        crossings: of the rays.
+        shapes: as they were given to `find_crossings`.
+        frequency_hz: of the carrier, ``mi.Float`` of width 1.
+        thickness_m: of materials known by a BSDF's id alone, by their name ``itu_*``; others are Sionna RT's default.
+
+    Raises:
+        InputError: a shape without a radio material, or one unknown at this frequency.
+    """
+    from sionna.rt.utils import complex_relative_permittivity, itu_coefficients_single_layer_slab
+
+    if not crossings.distance:
+        return None
+    constants = [radio_constants(shape, frequency_hz, thickness_m) for shape in shapes]
+    eta_r, sigma, slab = (interleave(list(column)) for column in zip(*constants, strict=True))
+    re, im = mi.Float(1), mi.Float(0)
+    passed = [(re, im)]
+    for distance, cosine, across, wall in zip(
+        crossings.distance, crossings.cosine, crossings.across, crossings.wall, strict=True
+    ):
+        own = [dr.gather(mi.Float, c, wall) for c in (eta_r, sigma, slab)]
+        eta = complex_relative_permittivity(own[0], own[1], dr.two_pi * frequency_hz)
+        _, _, te, tm = itu_coefficients_single_layer_slab(cosine, eta, own[2], speed_of_light / frequency_hz)
+        t = te * across + tm * (1 - across)
+        there = dr.isfinite(distance)
+        t_re, t_im = dr.select(there, t.real, 1), dr.select(there, t.imag, 0)
+        re, im = re * t_re - im * t_im, re * t_im + im * t_re
+        passed.append((re, im))
+    rays = dr.width(crossings.distance[0])
+    spread = [[part + dr.zeros(mi.Float, rays) for part in parts] for parts in zip(*passed, strict=True)]
+    result = Walls(
+        interleave(crossings.distance), interleave(spread[0]), interleave(spread[1]), len(crossings.distance)
+    )
+    dr.eval(result.distance, result.factor_re, result.factor_im)
+    return result
+
+
+def radio_constants(shape: Any, frequency_hz: Any, thickness_m: Mapping[str, float]) -> tuple[Any, Any, Any]:
+    """Relative permittivity, conductivity (S/m) and slab thickness (m) of a shape's material, of width 1.
+
+    A radio material of Sionna RT has its own, with derivatives. Any other BSDF whose id is ``mat-itu_*`` stands for the
+    material of ITU-R P.2040 of that name.
+
+    Raises:
+        InputError: neither, a material unknown at this frequency, or one that is set to another frequency.
+    """
+    from sionna.rt import RadioMaterial
+    from sionna.rt.constants import DEFAULT_THICKNESS
+
+    bsdf = shape.bsdf()
+    frequency = float(dr.detach(frequency_hz)[0])
+    if isinstance(bsdf, RadioMaterial):
+        if bsdf.scene is not None and abs(float(bsdf.scene.frequency[0]) / frequency - 1) > 1e-6:
+            own = float(bsdf.scene.frequency[0])
+            raise InputError(f"{bsdf.id()}: its scene is at {own:g} Hz, the integrator at {frequency:g} Hz; use one")
+        return bsdf.relative_permittivity, bsdf.conductivity, bsdf.thickness
+    name = bsdf.id()
+    if not name.startswith(ITU_PREFIX):
+        what = f"shape {shape.id() or 'without id'}: its BSDF {name or 'without id'} is no radio material"
+        raise InputError(f"{what}; name it {ITU_PREFIX}*, use one of Sionna RT, or set the integrator's walls to false")
+    eta_r, sigma = _itu(name.removeprefix(ITU_PREFIX), frequency)
+    thickness = thickness_m.get(name.removeprefix("mat-"), DEFAULT_THICKNESS)
+    return mi.Float(eta_r), mi.Float(sigma), mi.Float(thickness)
+
+
+def _itu(kind: str, frequency_hz: float) -> tuple[float, float]:
+    from sionna.rt.radio_materials.itu import itu_material
+
+    try:
+        return itu_material(kind, frequency_hz)
+    except ValueError as error:
+        if kind in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
+            return BELOW_1_GHZ[kind]
+        raise InputError(f"{ITU_PREFIX}{kind} at {frequency_hz:g} Hz: {error}; choose another material") from None
+
+
+def _to_world(pose: Pose, v: list[Any]) -> Any:
+    return mi.Vector3f(*(sum(dr.detach(pose.to_world[i][k]) * v[k] for k in range(3)) for i in range(3)))
+
+
+def _registry(shape: Any) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])

@@ -1,0 +1,45 @@
+"""Small fields for the plugins: untrained, as arrays and as run folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from small_fits import official, settings
+
+from wrf_mi.core import Receiver, Record
+from wrf_mi.field import Encoding, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.fit.folder import RunConfig, start_run, write_checkpoint
+
+RECEIVER = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+FIELDS = {
+    "wrf-gs": WrfGs(Encoding(3, 4.0, 3, 1.0), layers=2, width=8, signal_widths=(8, 8)),
+    "wrf-gs+": WrfGsPlus(Encoding(3, 4.0, 3, 1.0), layers=3, width=8, skip=1),
+}
+
+
+def weights_of(model: str, count: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
+    """Parameters of Gaussians of all shapes some metres around the origin."""
+    rng = np.random.default_rng(seed)
+    start = random_gaussians([RECEIVER], count, rng, distance_m=(1.0, 3.0), size_deg=10, opacity=0.4)
+    weights = FIELDS[model].init(start, rng)
+    weights["log_scale"] = (weights["log_scale"] + rng.normal(0, 0.3, (3, count))).astype(np.float32)
+    weights["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
+    return {name: np.asarray(values, np.float32) for name, values in weights.items()}
+
+
+def write_run(folder: Path, record: Record, model: str, *own: str) -> Path:
+    """A run folder after two steps of training, with settings of one's own."""
+    config = settings("steps=2", "log_every=1", "validate_every=2", *own, model=model)
+    split = official(record)
+    trainer = start_run(folder, record, split, RunConfig("made-here", split.name, None, config))
+    trainer.run()
+    write_checkpoint(folder, trainer)
+    return folder
+
+
+def plain(array: Any) -> np.ndarray:
+    """A Dr.Jit array as float64."""
+    return np.asarray(array.numpy(), float)

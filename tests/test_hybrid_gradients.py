@@ -1,0 +1,103 @@
+"""Gradients of both sides of a hybrid in one graph, against finite differences in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+
+from wrf_mi.hybrid import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver, TracedField, TracedOptions
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.field import Encoding, WrfGsPlus, random_gaussians
+from wrf_mi.hybrid.learned import learned_field
+from wrf_mi.splat.tiles import perception_plane
+from wrf_mi.trace import TraceOptions
+
+Float64 = dr.float64_array_t(mi.Float)
+Tensor64 = dr.tensor_t(Float64)
+
+TOLERANCE = 1e-5
+"""Relative; central differences in float64: rounding, 1e-13 of the loss over the step, and the step squared."""
+STEP = 1e-6
+LEAST_SLOPE = 0.05
+"""Of the median slope: one that is less, a metal's, is compared with this; rounding would drown it."""
+HEIGHT, WIDTH, BATCH = 12, 40, 2
+ELEMENTS_M = planar_array(3, 3, 0.16)
+
+MODELS: dict[str, Any] = {
+    "pixel": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent"),
+    "pixel-power": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "power"),
+    "array": ArrayReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent", instrument_scale=True),
+    "rssi": PowerReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ,), "coherent"),
+    "csi": CsiReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ, 1.01 * FREQUENCY_HZ)),
+}
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
+    """A traced side with reflections and transmissions, a learned one, and all their parameters, none round."""
+    rng = np.random.default_rng(5)
+    scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
+    own = receiver((30, 20, 10))
+    options = TraceOptions(max_depth=2, transmission=True, rays=4096)
+    traced = TracedField(scene, transmitters(BATCH), own, TracedOptions(options, pattern_degree=2, gain=300.0))
+    values = {name: value.astype(float) for name, value in traced.parameters().items()}
+    # A flat encoding of positions, which is detached on purpose.
+    encoding = Encoding(position_octaves=1, position_scale_m=1e6, tx_octaves=2)
+    field = WrfGsPlus(encoding=encoding, layers=3, width=16, skip=2)
+    start = field.init(random_gaussians([own], 25, rng, opacity=0.4), rng)
+    start["log_scale"] += rng.normal(0, 0.3, start["log_scale"].shape).astype(np.float32)
+    start["rotation"] = rng.standard_normal(start["rotation"].shape).astype(np.float32)
+    values |= {f"field.{name}": value.astype(float) for name, value in start.items()}
+    for name in ("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter"):
+        values[name] += rng.normal(0, 0.02, values[name].shape)
+    return traced, field, values
+
+
+def loss_of(
+    both: tuple[TracedField, WrfGsPlus, dict[str, Any]], model: Any, weight: Any
+) -> Callable[[dict[str, Any]], Any]:
+    traced, field, _ = both
+    plane, tx_pos = perception_plane(HEIGHT, WIDTH, Float64), Tensor64(np.ascontiguousarray(traced.tx_pos_m.T))
+
+    def loss(parameters: dict[str, Any]) -> Any:
+        own = {name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")}
+        learned = learned_field(field.gaussians(own, tx_pos), traced.pose(parameters, Float64), plane, model.sphere)
+        return dr.sum(model(traced(parameters), learned) * weight)
+
+    return loss
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, dict[str, Any]]) -> None:
+    model, rng = MODELS[name], np.random.default_rng(2)
+    size = BATCH * int(np.prod(model.shape))
+    loss = loss_of(both, model, Float64(rng.standard_normal(size)))
+    parameters = {n: Tensor64(value) for n, value in both[2].items()}
+    for p in parameters.values():
+        dr.enable_grad(p)
+    dr.backward(loss(parameters))
+    gradient = {n: dr.grad(p).numpy() for n, p in parameters.items()}
+    parameters = {n: dr.detach(p) for n, p in parameters.items()}
+    errors = {}
+    for n, p in parameters.items():
+        # Pixels that cross a footprint's edge and ReLUs that switch make some directions jump: the best of three.
+        tried = []
+        for _ in range(3):
+            direction = rng.standard_normal(p.shape)
+            ends = [loss(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)})[0] for s in (1, -1)]
+            numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[n] * direction).sum())
+            tried.append((abs(numeric - analytic), abs(numeric)))
+        errors[n] = min(tried)
+    least = LEAST_SLOPE * float(np.median([size for _, size in errors.values()]))
+    relative = {n: error / max(size, least) for n, (error, size) in errors.items()}
+    assert max(relative.values()) < TOLERANCE, relative

@@ -1,0 +1,161 @@
+"""The layout of the BLE signal-strength data: what is read, and every way in which a folder can be wrong."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wrf_mi.core import InputError
+from wrf_mi.measure import load, make_splits, read_ble_folder
+
+DATA = os.environ.get("WRF_MI_DATA")
+needs_data = pytest.mark.skipif(
+    not DATA or not Path(DATA, "flat-ble").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/"
+)
+FLOAT32 = 1e-5
+"""Rounding of powers of tens of dBm to float32."""
+
+ANCHORS = "id,x,y,z\n3,1.5,2,2.5\n1,0,-1,2\n"
+TRAINING = """,ts,x,heading,y,rssi_1,rssi_3
+0,1.6e18,0.5,3.1,1.5,-54.25,-60
+1,1.6e18,0.25,-40.5,1.75,,-61.5
+2,1.6e18,1,0,2,,
+3,1.6e18,1.25,0,2,-70,nan
+"""
+TEST = """ts,x,y,heading,rssi_3,rssi_1
+1.6e18,2,3,0.5,-80,-81
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "anchors.csv").write_text(ANCHORS)
+    (tmp_path / "calibration_df.csv").write_text(TRAINING)
+    (tmp_path / "test_robot_df.csv").write_text(TEST)
+    return tmp_path
+
+
+def test_reads_a_folder(folder: Path):
+    record = read_ble_folder(folder, "made-up")
+    assert (record.name, record.task, record.source) == ("made-up", "rssi", str(folder))
+    assert [r.name for r in record.receivers] == ["anchor3", "anchor1"]
+    np.testing.assert_array_equal(record.receivers[0].position_m, [1.5, 2, 2.5])
+    np.testing.assert_array_equal(record.receivers[0].to_world, np.eye(3))
+    np.testing.assert_array_equal(
+        record.tx_pos_m, [[0.5, 1.5, 1.3], [0.25, 1.75, 1.3], [1, 2, 1.3], [1.25, 2, 1.3], [2, 3, 1.3]]
+    )
+    assert record.observation.dtype == np.float32
+    np.testing.assert_array_equal(
+        record.observation, [[-60, -61.5, np.nan, np.nan, -80], [-54.25, np.nan, np.nan, -70, -81]]
+    )
+    np.testing.assert_array_equal(record.tx_heading_rad, [3.1, -40.5, 0, 0, 0.5])
+    assert record.official is not None
+    assert [part.tolist() for part in record.official] == [[0, 1, 2, 3], [4]]
+    np.testing.assert_array_equal(record.frequencies_hz, [2.44e9])
+    assert load(folder).task == "rssi"
+
+
+def test_rows_that_no_anchor_received_are_in_no_split(folder: Path):
+    (split,) = make_splits(read_ble_folder(folder), "official")
+    assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1, 3], [4])
+
+
+def text(name: str, old: str, new: str):
+    """Replace the first match of a pattern in a text file."""
+
+    def change(folder: Path) -> None:
+        path = folder / name
+        changed = re.sub(old, new, path.read_text(), count=1, flags=re.MULTILINE)
+        assert changed != path.read_text()
+        path.write_text(changed)
+
+    return change
+
+
+def write(name: str, content: str | bytes):
+    def change(folder: Path) -> None:
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def remove(name: str):
+    return lambda folder: (folder / name).unlink()
+
+
+TRAIN_FILE, TEST_FILE = "calibration_df.csv", "test_robot_df.csv"
+WRONG = {
+    "no anchors file": (remove("anchors.csv"), "anchors.csv", "missing"),
+    "no training rows file": (remove(TRAIN_FILE), TRAIN_FILE, "missing"),
+    "no test rows file": (remove(TEST_FILE), TEST_FILE, "missing"),
+    "empty file": (write(TEST_FILE, ""), TEST_FILE, "empty"),
+    "empty anchors": (write("anchors.csv", ""), "anchors.csv", "empty"),
+    "header alone": (write(TRAIN_FILE, TRAINING.splitlines()[0]), TRAIN_FILE, "no rows below the header"),
+    "not text": (write(TRAIN_FILE, b"\xff\xfe\x00"), TRAIN_FILE, "cannot be read"),
+    "no header": (text(TEST_FILE, r"^ts.*\n", "1,2,3,4,5,6\n"), TEST_FILE, "line 1: header '1,2,3,4,5,6' has no col"),
+    "no column x": (text(TRAIN_FILE, ",x,", ",X,"), TRAIN_FILE, "line 1: header .* has no column x;"),
+    "no heading": (text(TRAIN_FILE, "heading", "yaw"), TRAIN_FILE, "no column heading"),
+    "column twice": (text(TRAIN_FILE, "ts", "x"), TRAIN_FILE, "has twice the column x"),
+    "no z of anchors": (text("anchors.csv", "z", "height"), "anchors.csv", "no column z"),
+    "position of words": (text(TRAIN_FILE, "0.25", "here"), TRAIN_FILE, "row 2: x is 'here'; give a finite number"),
+    "NaN position": (text(TRAIN_FILE, "0.25", "nan"), TRAIN_FILE, "row 2: x is 'nan'; give a finite number$"),
+    "empty position": (text(TRAIN_FILE, "0.25", ""), TRAIN_FILE, "row 2: x is ''"),
+    "infinite position": (text(TEST_FILE, ",2,", ",inf,"), TEST_FILE, "row 1: x is 'inf'"),
+    "NaN heading": (text(TRAIN_FILE, "-40.5", "nan"), TRAIN_FILE, "row 2: heading is 'nan'"),
+    "power of words": (text(TRAIN_FILE, "-54.25", "weak"), TRAIN_FILE, "row 1: rssi_1 is 'weak'; .*leave it empty"),
+    "infinite power": (text(TRAIN_FILE, "-54.25", "-inf"), TRAIN_FILE, "row 1: rssi_1 is '-inf'"),
+    "field missing": (text(TRAIN_FILE, ",-60$", ""), TRAIN_FILE, "row 1: 6 fields, but the header has 7"),
+    "field too many": (text(TEST_FILE, ",-81$", ",-81,0"), TEST_FILE, "row 1: 7 fields, but the header has 6"),
+    "blank row": (text(TRAIN_FILE, "^1,", "\n1,"), TRAIN_FILE, "row 2: 0 fields"),
+    "quote left open": (text(TRAIN_FILE, "^1,", '"1,'), TRAIN_FILE, "not a CSV file"),
+    "anchor too few": (
+        text("anchors.csv", "^1,.*\n", ""),
+        TRAIN_FILE,
+        r"2 columns rssi_\*, but anchors.csv has 1 anchors \(rssi_1 belongs to none\)",
+    ),
+    "anchor too many": (
+        text("anchors.csv", "^1", "7,0,0,0\n1"),
+        TRAIN_FILE,
+        r"2 columns rssi_\*, but anchors.csv has 3 anchors \(rssi_7 is missing\)",
+    ),
+    "anchor with another id": (text(TEST_FILE, "rssi_3", "rssi_2"), TEST_FILE, r"rssi_2 belongs to none"),
+    "anchor twice": (text("anchors.csv", "^1", "3"), "anchors.csv", "row 2: id is '3'; number the anchors"),
+    "anchor with half a number": (text("anchors.csv", "^1", "1.5"), "anchors.csv", "row 2: id is '1.5'"),
+    "NaN anchor": (text("anchors.csv", "-1", "nan"), "anchors.csv", "row 2: y is 'nan'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_line_with_file_and_row(folder: Path, case: str):
+    change, file, message = WRONG[case]
+    change(folder)
+    with pytest.raises(InputError, match=message) as error:
+        read_ble_folder(folder)
+    line = str(error.value)
+    assert "\n" not in line
+    assert str(folder / file) in line
+    assert ";" in line, "no remedy"
+
+
+def test_not_a_folder(tmp_path: Path):
+    with pytest.raises(InputError, match=r"not a folder; give one that holds anchors\.csv"):
+        read_ble_folder(tmp_path / "nothing")
+
+
+@needs_data
+def test_the_real_data():
+    record = load("flat-ble")
+    assert record.observation.shape == (6, 4823)
+    assert record.official is not None
+    assert [len(part) for part in record.official] == [4104, 719]
+    # As NumPy reads the file.
+    table = np.genfromtxt(Path(DATA or "", "flat-ble", TRAIN_FILE), delimiter=",", skip_header=1)
+    np.testing.assert_allclose(record.observation[:, :4104], table[:, 5:].T, atol=FLOAT32)
+    np.testing.assert_array_equal(record.tx_pos_m[:4104, :2], table[:, [2, 4]])
+    missing = np.isnan(record.observation)
+    assert missing.sum(axis=1).tolist() == [162, 267, 253, 444, 591, 630]
+    assert not missing.all(axis=0).any()
+    for split in make_splits(record, "blocked"):
+        assert len(split.test) > 400

@@ -1,0 +1,57 @@
+"""Against MATLAB's image method in real rooms, and the checks that the comparison itself makes."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from traced_rooms import SHOEBOX, receiver, room
+from wrf_mi_scenes.build_laboratory import sheet
+
+from wrf_mi.report.bench_trace import confirm_paths, image_method_agreement, match_paths
+from wrf_mi.trace import TraceOptions, trace_paths
+from wrf_mi.trace.surfaces import scene_surfaces
+
+DATA = Path(os.environ.get("WRF_MI_DATA", "")) / "newrf"
+SHARE = 0.99
+"""Of MATLAB's paths; what is missing has a segment below 1 cm or meets a face of square millimetres."""
+CEA_DB = 30.0
+
+
+@pytest.mark.parametrize("name", ["conference", "office"])
+def test_the_paths_of_another_ray_tracer_are_found(name: str):
+    if not (DATA / f"{name}.npz").is_file():
+        pytest.skip("newrf is not in WRF_MI_DATA")
+    found = image_method_agreement(DATA / f"{name}.npz", rays=1 << 17)
+    assert found["share_found"] >= SHARE
+    assert found["length_error_m"] < 1e-3
+    assert found["cea_db"]["median"] >= CEA_DB
+    assert found["cea_db_where_matlab_lacks_none"]["p10"] >= CEA_DB
+    # What MATLAB lacks is there, by brute force in float64.
+    assert found["of_these_confirmed"] == found["paths_matlab_lacks"]
+
+
+def test_matching_is_one_to_one():
+    length, point = np.array([1.0, 1.0004, 2.0]), np.zeros((3, 3))
+    ours = np.array([0, 0, 1]), length, point
+    theirs = np.array([0, 0, 1, 1]), np.array([1.0003, 1.0001, 2.0, 2.5]), np.zeros((4, 3))
+    mine, other = match_paths(ours, theirs)
+    assert sorted(zip(mine.tolist(), other.tolist(), strict=True)) == [(0, 1), (1, 0), (2, 2)]
+    far = theirs[0], theirs[1], theirs[2] + 0.1
+    assert not len(match_paths(ours, far)[0])
+
+
+def test_confirmation_sees_what_is_wrong_with_a_path(tmp_path: Path):
+    partition = {"partition": ("itu_wood", sheet(0, 3.0, (0.0, 4.0), (0.0, 2.0)))}
+    scene = room(tmp_path / "open", SHOEBOX)
+    tx, rx = np.array([[1.3, 2, 1]]), np.array([4.4, 3.1, 1.7])
+    paths = trace_paths(scene, tx, receiver(rx), TraceOptions(upright=True, max_depth=2)).paths
+    triangles = scene_surfaces(scene).triangles
+    assert confirm_paths(paths, tx, rx, triangles).all()
+    moved = replace(paths, vertices_m=paths.vertices_m + np.array([0.01, 0.02, 0.01]))
+    np.testing.assert_array_equal(confirm_paths(moved, tx, rx, triangles), paths.bounces == 0)
+    divided = scene_surfaces(room(tmp_path / "divided", {**SHOEBOX, **partition})).triangles
+    kept = confirm_paths(paths, tx, rx, divided)
+    assert not kept[0]
+    assert kept.any()

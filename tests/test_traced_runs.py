@@ -1,0 +1,226 @@
+"""The ray-tracing baseline as a run folder: scores, offsets, saved paths, prediction, the command."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.constants import speed_of_light
+
+from wrf_mi.core import InputError, Record
+from wrf_mi.measure import load
+from wrf_mi.report.compare import compare
+from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.runs import evaluate_run
+from wrf_mi.report.traced import trace_run
+from wrf_mi.scene.make import make_scene
+from wrf_mi.trace import TraceOptions, load_trace
+from wrf_mi.trace.offsets import fit_offsets
+from wrf_mi.trace.options import with_kinds
+from wrf_mi.trace.tracer import RayTracer, instrument_of
+
+DIRECT = TraceOptions(reflection=False, max_depth=0)
+FLOAT32_DB = 1e-4
+"""Predictions are stored as float32; gains come from float32 amplitudes."""
+
+
+@pytest.fixture(scope="module")
+def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flat's plan, extruded."""
+    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+@pytest.fixture(scope="module")
+def run(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trace_run(room, flat_folder, tmp_path_factory.mktemp("runs") / "traced", DIRECT)
+
+
+def friis_dbm(record: Record) -> np.ndarray:
+    """Free-space loss between upright isotropic antennas, [n_rx, n]."""
+    assert record.frequencies_hz is not None
+    rx = np.stack([receiver.position_m for receiver in record.receivers])
+    separation = record.tx_pos_m[None] - rx[:, None]
+    distance = np.linalg.norm(separation, axis=-1)
+    return 20 * np.log10(speed_of_light / record.frequencies_hz[0] / (4 * np.pi * distance))
+
+
+def test_line_of_sight_in_a_room_is_free_space_with_one_offset_each(flat_folder: Path, run: Path) -> None:
+    record, read = load(flat_folder), read_run(run)
+    loss, official = friis_dbm(record), record.official
+    assert official is not None
+    offset = np.median(record.observation[:, official[0]] - loss[:, official[0]], axis=1)
+    assert read.prediction == pytest.approx(loss[:, read.row] + offset[:, None], abs=FLOAT32_DB)
+    assert read.metrics["model"] == "ray-tracing"
+    assert read.metrics["task"] == "rssi"
+    assert set(read.metrics["receivers"]) == {"anchor1", "anchor2"}
+    assert read.metrics["abs_error_db"]["median"] == pytest.approx(np.median(read.score))
+
+
+def test_scoring_again_needs_no_tracing_and_says_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = json.loads((run / "metrics.json").read_text())
+    predictions = (run / "predictions.npz").read_bytes()
+    again = evaluate_run(run)
+    for key in ("abs_error_db", "reference", "n_test", "trace_seconds", "paths", "rays"):
+        assert again[key] == before[key], key
+    assert (run / "predictions.npz").read_bytes() == predictions
+    other = evaluate_run(run, "trajectory")
+    assert other["split"] == "trajectory"
+    assert json.loads((run / "metrics.json").read_text())["split"] == "official"
+
+
+def test_saved_paths_are_those_of_the_record(flat_folder: Path, run: Path) -> None:
+    traced = load_trace(run / "paths.npz")
+    record = load(flat_folder)
+    np.testing.assert_array_equal(traced.tx_pos_m, record.tx_pos_m)
+    assert traced.paths.n_rx == len(record.receivers)
+    assert traced.options == TraceOptions(reflection=False, max_depth=0, upright=True)
+
+
+def test_calibration_is_kept_and_scores_again_and_predicts(
+    flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = trace_run(room, flat_folder, tmp_path / "run", DIRECT, calibration="patterns")
+    read = read_run(out)
+    assert read.metrics["calibration"] == "patterns"
+    assert read.metrics["train_seconds"] > 0
+    assert not np.allclose(read.prediction, read_run(run).prediction, atol=0.1)
+    assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
+    with pytest.raises(InputError, match="calibrated on the training rows of official"):
+        evaluate_run(out, "random")
+    positions = tmp_path / "tx.csv"
+    positions.write_text("x,y,z\n1,1,1.3\n")
+    status, _, err = call(["predict", out, "--tx", positions, "--out", tmp_path / "p.npz"], capsys)
+    assert status == 0, err
+    for wrong, scene, message in (("everything", room, "unknown; choose from patterns, all"),):
+        with pytest.raises(InputError, match=message):
+            trace_run(scene, flat_folder, tmp_path / "other", DIRECT, calibration=wrong)
+
+
+def test_every_block_is_held_out_in_turn(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    out = trace_run(room, flat_folder, tmp_path / "run", DIRECT, split="blocked")
+    read = read_run(out)
+    assert sorted(read.row) == list(range(len(load(flat_folder))))
+    assert len(list(out.glob("fold*/split.npz"))) == 5
+    assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
+
+
+def test_command_traces_predicts_and_compares(
+    flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    asked = ["--paths", "line-of-sight, reflection", "--depth", "1", "--rays", "1000", "--seed", "3"]
+    status, printed, err = call(["trace", room, flat_folder, "--out", out, "--json", *asked], capsys)
+    assert status == 0, err
+    metrics = json.loads(printed)
+    assert metrics["rays"] == 1000
+    assert metrics["paths"] > read_run(run).metrics["paths"]
+    record = load(flat_folder)
+    positions = tmp_path / "tx.csv"
+    rows = [",".join(map(str, p)) for p in record.tx_pos_m[read_run(out).row]]
+    positions.write_text("\n".join(["x,y,z", *rows]) + "\n")
+    status, _, err = call(["predict", out, "--tx", positions, "--out", tmp_path / "p.npz"], capsys)
+    assert status == 0, err
+    with np.load(tmp_path / "p.npz") as stored:
+        assert stored["prediction"] == pytest.approx(read_run(out).prediction, abs=FLOAT32_DB)
+        assert stored["receiver_name"].tolist() == ["anchor1", "anchor2"]
+    page = compare([run, out], tmp_path / "compare").read_text()
+    assert page.count("ray-tracing") == 2
+    assert "idw100" in page
+
+
+def test_train_and_trace_are_one_for_the_ray_tracer(
+    flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named = ["train", flat_folder, "--model", "ray-tracing", "--out", tmp_path / "run", "--json"]
+    status, out, err = call([*named, "--scene", room, "--paths", "line-of-sight", "--depth", "0"], capsys)
+    assert status == 0, err
+    assert json.loads(out)["abs_error_db"] == read_run(run).metrics["abs_error_db"]
+    for wrong in (named, [*named, "--scene", room, "--set", "steps=1"], ["train", flat_folder, "--depth", "1"]):
+        status, _, err = call(wrong, capsys)
+        assert (status, err.count("\n")) == (2, 1)
+        assert "ray-tracing" in err
+
+
+def test_comparison_shows_the_scene_while_it_is_there(
+    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7)
+    run = trace_run(scene.folder, flat_folder, tmp_path / "run", DIRECT)
+    assert "Mesh, traced paths" in compare([run], tmp_path / "with").read_text()
+    with Image.open(tmp_path / "with" / "flat-scene.png") as picture:
+        assert np.ptp(np.asarray(picture.convert("L"))) > 100
+    shutil.rmtree(scene.folder)
+    capsys.readouterr()
+    assert "Mesh, traced paths" not in compare([run], tmp_path / "without").read_text()
+    err = capsys.readouterr().err
+    assert err.startswith("no picture of the scene of run: ")
+    assert err.count("\n") == 1
+
+
+def test_traced_spectra_are_those_of_the_array(folder: Path, tmp_path: Path) -> None:
+    """A spectrum's instrument is known only where the data state carrier and array."""
+    with pytest.raises(InputError, match="carrier frequency unknown; state frequency_hz in its gateway_info"):
+        trace_run("laboratory", folder, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_written_where_something_is_wrong(
+    flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    for arguments, message in [
+        (["trace", tmp_path / "no.xml", flat_folder], "no such scene file"),
+        (["trace", room, tmp_path / "none"], "no such folder"),
+        (["trace", room, flat_folder, "--material", "brick"], "has radio materials of its own"),
+        (["trace", room, flat_folder, "--paths", "echo"], "kind of path 'echo': unknown"),
+        (["trace", room, flat_folder, "--rays", "many"], "give a whole number"),
+        (["trace", room, flat_folder, "--depth", "99"], "max_depth 99"),
+    ]:
+        status, _, err = call([*arguments, "--out", out], capsys)
+        assert status == 2, err
+        assert message in err
+        assert err.count("\n") == 1
+        assert not out.exists()
+    status, _, err = call(["trace", room, flat_folder, "--out", run], capsys)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "exists and is not empty" in err
+
+
+@given(
+    st.lists(st.floats(-90, -30), min_size=3, max_size=30),
+    st.floats(-40, 40),
+)
+def test_offset_is_the_median_whatever_it_is(traced: list[float], shift: float) -> None:
+    strength = np.array([traced, traced])
+    measured = strength + shift
+    measured[1, 0] = np.nan
+    offsets = fit_offsets(strength, measured)
+    assert offsets.offset_db == pytest.approx([shift, shift], abs=1e-9)
+    # No path: the weakest strength that this receiver reports.
+    assert offsets([[np.nan], [np.nan]])[:, 0] == pytest.approx(np.nanmin(measured, axis=1))
+
+
+def test_receiver_that_no_path_reaches_is_named() -> None:
+    with pytest.raises(InputError, match="receiver 1: no training row is both received and reached"):
+        fit_offsets([[-50.0], [np.nan]], [[-40.0], [-40.0]])
+
+
+def test_kinds_of_path_are_switched_one_by_one() -> None:
+    options = with_kinds(TraceOptions(), "transmission,diffraction", rays="auto", max_depth=2)
+    assert options == TraceOptions(
+        line_of_sight=False, reflection=False, transmission=True, diffraction=True, rays="auto", max_depth=2
+    )
+    assert with_kinds(TraceOptions()) == TraceOptions()
+
+
+def test_tracer_reports_as_the_record_does(flat_folder: Path, room: Path) -> None:
+    record = load(flat_folder)
+    tracer = RayTracer(room, instrument_of(record), DIRECT)
+    assert tracer(record.tx_pos_m[:4]).shape == record.observation[:, :4].shape

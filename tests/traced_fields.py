@@ -1,0 +1,67 @@
+"""Gaussians of all kinds for the traced evaluation, and what a ray meets of them in float64 NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import Receiver, rotation_matrix, unit_vectors
+from wrf_mi.project.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.splat import oracle
+
+RECEIVER = Receiver(
+    "receiver", np.array([0.3, -1.2, 2.0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
+)
+
+
+def any_field(count: int, seed: int = 0, size: float = 0.25) -> dict[str, np.ndarray]:
+    """Needles, discs and balls all around the receiver, near and far, some that contain it, some nearer than 5 cm."""
+    rng = np.random.default_rng(seed)
+    direction = rng.standard_normal((count, 3))
+    distance = np.exp(rng.uniform(np.log(0.03), np.log(8), count))
+    direction *= (distance / np.linalg.norm(direction, axis=1))[:, None]
+    # One on the zenith and one across the azimuth seam.
+    direction[0], direction[1] = RECEIVER.to_world @ [0, 0, 3.0], RECEIVER.to_world @ (2 * unit_vectors(0.0, 0.2))
+    distance[:2] = 3.0, 2.0
+    scale = size * np.maximum(distance, 0.3)[:, None] * np.exp(rng.normal(-0.5, 0.8, (count, 3)))
+    delta = rng.uniform(0, 0.95, count) * np.exp(1j * rng.uniform(0, 2 * np.pi, count))
+    return {
+        "position": RECEIVER.position_m + direction,
+        "scale": scale,
+        "rotation": rng.standard_normal((count, 4)),
+        "signal": rng.standard_normal((count, 2)),
+        "opacity": rng.uniform(0, 0.9, (count, 1)),
+        "attenuation": np.stack([delta.real, delta.imag], axis=1),
+    }
+
+
+def seen(field: dict[str, np.ndarray], directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By the definition, no tangent plane: Gaussians near to far, and for each and each direction [..., 3] of the
+    receiver's frame its largest response on the ray (zero beyond the cut-off) and where on the ray that is."""
+    offset = field["position"] - RECEIVER.position_m
+    depth = np.linalg.norm(offset, axis=1)
+    x, y, z = field["position"].T
+    order = np.lexsort((z, y, x, depth))
+    order = order[depth[order] >= NEAR_M]
+    world = directions @ RECEIVER.to_world.T
+    responses, peaks = [], []
+    for i in order:
+        scale = np.sqrt(field["scale"][i] ** 2 + (LOW_PASS_RAD * depth[i]) ** 2)
+        whiten = rotation_matrix(field["rotation"][i]).T / scale[:, None]
+        start, along = -whiten @ offset[i], world @ whiten.T
+        t = np.maximum(-(along @ start) / (along**2).sum(-1), 0)
+        square = ((start + t[..., None] * along) ** 2).sum(-1)
+        inside = (square < CUTOFF**2) & (world @ offset[i] / depth[i] > MIN_COSINE)
+        responses.append(np.where(inside, np.exp(-square / 2), 0))
+        peaks.append(t)
+    return order, np.array(responses), np.array(peaks)
+
+
+def blended(field: dict[str, np.ndarray], blending: str, directions: np.ndarray) -> Any:
+    """The field along each ray, without walls."""
+    order, responses, _ = seen(field, directions)
+    signal, delta = (field[name][order] @ [1, 1j] for name in ("signal", "attenuation"))
+    if blending == "alpha":
+        return oracle.blend_alpha(responses, signal, field["opacity"][order, 0])
+    return oracle.blend_product(responses, signal, delta)

@@ -1,0 +1,89 @@
+"""Small scenes of sheets for the tests of the tracer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.constants import speed_of_light
+from wrf_mi_scenes.build_laboratory import sheet
+
+from wrf_mi.core import Receiver
+from wrf_mi.trace import open_scene
+
+FREQUENCY_HZ = 2.4e9
+WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
+LENGTH, WIDTH, HEIGHT = 6.0, 5.0, 3.0
+THICKNESS_M = {"itu_concrete": 0.2, "itu_brick": 0.1, "itu_plasterboard": 0.05}
+
+Parts = Mapping[str, tuple[str, trimesh.Trimesh]]
+SHOEBOX: Parts = {
+    "floor": ("itu_concrete", sheet(2, 0.0, (0.0, LENGTH), (0.0, WIDTH))),
+    "ceiling": ("itu_plasterboard", sheet(2, HEIGHT, (0.0, LENGTH), (0.0, WIDTH))),
+    "west": ("itu_brick", sheet(0, 0.0, (0.0, WIDTH), (0.0, HEIGHT))),
+    "east": ("itu_brick", sheet(0, LENGTH, (0.0, WIDTH), (0.0, HEIGHT))),
+    "south": ("itu_concrete", sheet(1, 0.0, (0.0, LENGTH), (0.0, HEIGHT))),
+    "north": ("itu_concrete", sheet(1, WIDTH, (0.0, LENGTH), (0.0, HEIGHT))),
+}
+PARTITION: Parts = {"partition": ("itu_plasterboard", sheet(0, 3.0, (0.0, 4.0), (0.0, 2.5)))}
+
+
+def write_xml(folder: Path, parts: Parts) -> Path:
+    """A Mitsuba scene file of named parts, each of a material and a mesh."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [f'<bsdf type="diffuse" id="mat-{material}"/>' for material in sorted({m for m, _ in parts.values()})]
+    for name, (_, mesh) in parts.items():
+        mesh.export(folder / f"{name}.ply")
+    for name, (material, _) in parts.items():
+        lines.append(
+            f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
+            f'<boolean name="face_normals" value="true"/><ref id="mat-{material}" name="bsdf"/></shape>'
+        )
+    path = folder / "scene.xml"
+    path.write_text("\n".join(['<scene version="3.0.0">', *lines, "</scene>"]))
+    return path
+
+
+def room(folder: Path, parts: Parts = SHOEBOX) -> Any:
+    """The same opened at `FREQUENCY_HZ`."""
+    return open_scene(write_xml(folder, parts), FREQUENCY_HZ, THICKNESS_M)
+
+
+def receiver(position: Any, name: str = "rx") -> Receiver:
+    """A receiver whose array looks up."""
+    return Receiver(name, np.asarray(position, float), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def inside(count: int, seed: int = 0) -> np.ndarray:
+    """Positions [count, 3] in the shoebox, away from its walls."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform([0.3, 0.3, 0.3], [LENGTH - 0.3, WIDTH - 0.3, HEIGHT - 0.3], (count, 3))
+
+
+def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int) -> np.ndarray:
+    """Unfolded lengths of all paths of up to ``depth`` reflections in the shoebox, sorted: the mirror images.
+
+    Paths with a segment below 1 cm are left out, as Sionna RT does.
+
+    Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
+    """
+    found = []
+    span = range(-depth, depth + 1)
+    for n in np.array(np.meshgrid(span, span, span)).reshape(3, -1).T:
+        if np.abs(n).sum() > depth:
+            continue
+        size = np.array([LENGTH, WIDTH, HEIGHT])
+        # After |n| reflections along an axis the image is at n size + x or, for odd n, at (n + 1) size - x.
+        image = np.where(n % 2 == 0, n * size + tx, (n + 1) * size - tx)
+        way = image - rx
+        walls = np.arange(-depth - 1, depth + 2)[:, None] * size  # unfolded: the box again and again
+        with np.errstate(divide="ignore"):
+            crossed = ((walls - rx) / way).ravel()
+        points = np.sort(np.append(crossed[(crossed > 0) & (crossed < 1)], [0, 1]))
+        assert len(points) == np.abs(n).sum() + 2
+        if np.diff(points).min() * np.linalg.norm(way) > 0.01:
+            found.append(np.linalg.norm(way))
+    return np.sort(found)

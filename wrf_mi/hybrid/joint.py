@@ -1,0 +1,326 @@
+"""One fit of both sides: one graph, one loss, one optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+from numpy.typing import ArrayLike, NDArray
+
+from ..core import Receiver
+from ..core.angles import FloatArray
+from ..field import InitialGaussians
+from ..field.device import on_device, to_tensor
+from ..splat.tiles import perception_plane
+from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from .learned import Field, learned_field
+from .materials import physical
+from .pose import pose_parameters, receiver_pose
+from .traced import TracedField
+
+Model = PixelReceiver | CsiReceiver
+Loss = Callable[..., Any]
+"""``loss(prediction, truth, batch, *shape)`` of flat arrays, a Dr.Jit float of one value; `spectrum_loss` is one."""
+
+FIELD = "field."
+MATCHING = 3
+"""Passes of `JointFit.match_gain`: in the first, magnitudes may be below the receiver's floor."""
+RATES: Mapping[str, float] = {
+    "material.*": 0.05,
+    "receiver.*.gain": 0.02,
+    "pattern.*": 0.01,
+    "field.position": 0.005,
+    "field.log_scale": 0.005,
+    "field.rotation": 0.002,
+    "field.opacity": 0.02,
+    "field.signal": 0.01,
+    "field.*": 0.001,
+}
+"""Learning rates by pattern of names; the first that fits counts. A pose is held unless a rate is given for it."""
+
+
+def absolute_error(prediction: Any, truth: Any, batch: int, *shape: int) -> Any:
+    """Mean absolute difference over what was received (truth not NaN)."""
+    known = dr.isfinite(truth)
+    count = dr.sum(dr.select(known, type(truth)(1), 0))
+    return dr.sum(dr.select(known, dr.abs(prediction - dr.select(known, truth, 0)), 0)) / dr.maximum(count, 1)
+
+
+@dataclass(frozen=True)
+class View:
+    """One receiver of a joint fit.
+
+    Attributes:
+        receiver: stated pose.
+        model: how it reports.
+        observation: [n, *shape of a report], NaN where nothing was received; complex for a CSI receiver.
+        traced: the traced side to this receiver, or None.
+    """
+
+    receiver: Receiver
+    model: Model
+    observation: NDArray[Any]
+    traced: TracedField | None = None
+
+
+class JointFit:
+    """Materials, antennas, poses and Gaussians fitted together by Adam, each parameter at its own rate.
+
+    Args:
+        tx_pos_m: transmitters [n, 3], world frame, metres.
+        views: one for each receiver; they share materials, patterns and the learned field.
+        field: the learned side, or None for the traced one alone.
+        initial: starting Gaussians; needed with a field.
+        rates: learning rates by pattern of names (`fnmatch`), before those of `RATES`; 0 holds a parameter.
+        loss: see `Loss`.
+        batch: transmitters of a step; None: all.
+        seed: of the field's starting values and of the batches.
+
+    Attributes:
+        adam: Dr.Jit's optimiser, which owns the parameters; ``fixed`` are those at rate 0.
+        losses: of each step so far, before the step.
+
+    Raises:
+        ValueError: shapes that do not belong together, nothing to fit, or a rate's pattern that fits no parameter.
+    """
+
+    def __init__(
+        self,
+        tx_pos_m: ArrayLike,
+        views: Sequence[View],
+        field: Field | None = None,
+        initial: InitialGaussians | None = None,
+        *,
+        rates: Mapping[str, float] | None = None,
+        loss: Loss = absolute_error,
+        batch: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
+        self.views, self.field, self._loss = tuple(views), field, loss
+        for view in self.views:
+            _check(view, self.tx_pos_m)
+        if not self.views or (field is None and any(view.traced is None for view in self.views)):
+            raise ValueError("JointFit: no view, or one with neither a traced nor a learned side")
+        if field is not None and initial is None:
+            raise ValueError("JointFit: a learned field needs initial Gaussians")
+        self._rng = np.random.default_rng([seed, 1])
+        values: dict[str, NDArray[np.float32]] = {}
+        for view in self.views:
+            values |= pose_parameters(view.receiver) if view.traced is None else view.traced.parameters()
+        if field is not None and initial is not None:
+            start = field.init(initial, np.random.default_rng([seed, 0]))
+            values |= {FIELD + name: value for name, value in start.items()}
+        self.rates = _rates(values, rates or {})
+        self.adam = Adam(lr=0.0)
+        self.adam.update({name: to_tensor(value) for name, value in values.items() if self.rates[name] > 0})
+        self.fixed = {name: to_tensor(value) for name, value in values.items() if self.rates[name] == 0}
+        self.batch = len(self.tx_pos_m) if batch is None else min(batch, len(self.tx_pos_m))
+        self.losses: list[float] = []
+        self._truth = [_flat(view.observation) for view in self.views]
+        self._order = np.zeros(0, int)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters by name, as Dr.Jit tensors; those that are fitted carry gradients."""
+        return {**self.fixed, **dict(self.adam.items())}
+
+    def values(self) -> dict[str, NDArray[np.float32]]:
+        """All parameters by name, as NumPy arrays."""
+        return {name: dr.detach(value).numpy().copy() for name, value in self.parameters.items()}
+
+    def set_values(self, values: Mapping[str, ArrayLike]) -> None:
+        """Set parameters by name, from `values` of a fit of the same form; Adam forgets its moments of those.
+
+        Raises:
+            ValueError: a name or shape that this fit has not.
+        """
+        present = self.parameters
+        for name, value in values.items():
+            if name not in present or np.shape(value) != present[name].shape:
+                raise ValueError(f"set_values: {name} {np.shape(value)} is not a parameter of this fit")
+        for name, value in values.items():
+            if name in self.adam:
+                self.adam[name] = to_tensor(value)
+            else:
+                self.fixed[name] = to_tensor(value)
+
+    def match_gain(self) -> None:
+        """Set each instrument's gain so that the traced side alone reports what was observed, on average.
+
+        The mean over all rows: of magnitudes, of dB, of powers of complex channels; for spectra that the instrument
+        scales to 0..1, so that unscaled ones peak at 1.
+        """
+        for view in self.views:
+            if view.traced is None:
+                continue
+            name = view.traced.gain_name
+            for _ in range(MATCHING):
+                change = np.array([_missing_gain(view, view.traced, self.parameters), 0], np.float32)
+                self.set_values({name: self.values()[name] + change})
+
+    def materials(self) -> dict[str, float]:
+        """Relative permittivities and conductivities (S/m), by parameter name."""
+        return physical(self.values())
+
+    def step(self, factor: float = 1.0) -> float:
+        """One step on the next batch, receivers in turn.
+
+        Args:
+            factor: multiplies all learning rates.
+
+        Returns:
+            The loss before the step.
+
+        Raises:
+            FloatingPointError: the loss or a gradient is not finite; the parameters are as before.
+        """
+        number = len(self.losses) % len(self.views)
+        view, rows = self.views[number], self._next_rows()
+        parameters = self.parameters
+        if view.traced is not None:
+            view.traced.refresh(parameters)
+        prediction = self._report(view, parameters, rows, self.tx_pos_m[rows], view.traced)
+        loss = self._loss(prediction, self._truth_of(number, rows), len(rows), *view.model.shape)
+        dr.backward(loss)
+        health = dr.detach(loss)
+        for name in self.adam:
+            health = health + dr.sum(dr.abs(dr.grad(parameters[name]).array))
+        finite = dr.isfinite(health)
+        # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
+        self.adam.set_learning_rate({name: mi.Float(self.rates[name] * factor) for name in self.adam})
+        self.adam.step(active=finite)
+        if not finite[0]:
+            raise FloatingPointError(f"step {len(self.losses)}: loss or gradient not finite; lower the learning rates")
+        self.losses.append(float(dr.detach(loss)[0]))
+        return self.losses[-1]
+
+    def run(self, steps: int, final_factor: float = 1.0, listen: Callable[[int, float], None] | None = None) -> float:
+        """Take steps; learning rates fall geometrically to ``final_factor`` of theirs.
+
+        Args:
+            steps: how many.
+            final_factor: of the learning rates at the end.
+            listen: hears of each step's number and loss.
+
+        Returns:
+            Mean loss of the last tenth of the steps.
+
+        Raises:
+            FloatingPointError: see `step`.
+        """
+        for i in range(steps):
+            loss = self.step(final_factor ** (i / max(steps - 1, 1)))
+            if listen is not None:
+                listen(len(self.losses), loss)
+        last = self.losses[len(self.losses) - max(steps // 10, 1) :]
+        return float(np.mean(last)) if steps else float("nan")
+
+    def predict(self, tx_pos_m: ArrayLike | None = None, view: int = 0) -> NDArray[np.float64]:
+        """What a receiver reports, [n, *shape], with the present parameters.
+
+        Args:
+            tx_pos_m: transmitters [n, 3], metres; None: those of the fit.
+            view: number of the receiver.
+        """
+        own, parameters = self.views[view], self.parameters
+        positions = self.tx_pos_m if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
+        traced = own.traced
+        with dr.suspend_grad():
+            if traced is not None:
+                traced = traced if tx_pos_m is None else traced.at(positions)
+                traced.refresh(parameters)
+            report = self._report(own, parameters, np.arange(len(positions)), positions, traced)
+            return np.asarray(report.numpy(), float).reshape(len(positions), *own.model.shape)
+
+    def learned(self, tx_pos_m: ArrayLike | None = None, view: int = 0) -> NDArray[np.complex128]:
+        """The learned signal R on the receiver's directions, [n, directions] (see `learned_field`).
+
+        Raises:
+            ValueError: no learned side.
+        """
+        own = self.views[view]
+        positions = self.tx_pos_m if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
+        with dr.suspend_grad():
+            signal = self._learned(own, self.parameters, positions)
+        if signal is None:
+            raise ValueError("learned: this fit has no learned side")
+        return (signal[0].numpy() + 1j * signal[1].numpy().astype(float)).reshape(len(positions), -1)
+
+    def _learned(self, view: View, parameters: Mapping[str, Any], tx_pos_m: FloatArray) -> Any:
+        if self.field is None:
+            return None
+        own = {name.removeprefix(FIELD): value for name, value in parameters.items() if name.startswith(FIELD)}
+        gaussians = self.field.gaussians(own, to_tensor(np.ascontiguousarray(tx_pos_m.T)))
+        plane = perception_plane(view.model.height, view.model.width, mi.Float)
+        return learned_field(gaussians, receiver_pose(view.receiver, parameters, mi.Float), plane, view.model.sphere)
+
+    def _report(
+        self, view: View, parameters: Mapping[str, Any], rows: Any, tx_pos_m: FloatArray, traced: TracedField | None
+    ) -> Any:
+        paths = None if traced is None else traced(parameters, on_device(rows, mi.UInt32))
+        return view.model(paths, self._learned(view, parameters, tx_pos_m))
+
+    def _truth_of(self, view: int, rows: NDArray[np.int64]) -> Any:
+        size = dr.width(self._truth[view]) // len(self.tx_pos_m)
+        lane = dr.arange(mi.UInt32, len(rows) * size)
+        row = dr.gather(mi.UInt32, on_device(rows, mi.UInt32), lane // size)
+        return dr.gather(mi.Float, self._truth[view], row * size + lane % size)
+
+    def _next_rows(self) -> NDArray[np.int64]:
+        """The next batch: every row once before any comes again."""
+        if self.batch == len(self.tx_pos_m):
+            return np.arange(self.batch)
+        if len(self._order) < self.batch:
+            self._order = np.concatenate([self._order, self._rng.permutation(len(self.tx_pos_m))])
+        rows, self._order = self._order[: self.batch], self._order[self.batch :]
+        return rows
+
+
+def _check(view: View, tx_pos_m: FloatArray) -> None:
+    given, asked = np.shape(view.observation), (len(tx_pos_m), *view.model.shape)
+    complex_given = np.iscomplexobj(view.observation)
+    if (*given, 2) != asked if complex_given else given != asked:
+        raise ValueError(f"JointFit: observation of {view.receiver.name} has shape {given}, the model reports {asked}")
+    if view.traced is not None and not np.array_equal(view.traced.tx_pos_m, tx_pos_m):
+        raise ValueError(f"JointFit: the traced side of {view.receiver.name} has other transmitters than the fit")
+
+
+def _missing_gain(view: View, traced: TracedField, parameters: Mapping[str, Any]) -> float:
+    """Logarithm of the amplitude that the traced side lacks."""
+    model, observed = view.model, np.asarray(view.observation)
+    scales = isinstance(model, ArrayReceiver) and model.instrument_scale
+    if isinstance(model, ArrayReceiver):
+        model = replace(model, instrument_scale=False)
+    with dr.suspend_grad():
+        report = model(traced(parameters), None).numpy().astype(float)
+    if scales:
+        return float(-np.log(report.reshape(len(observed), -1).max(axis=1).mean()))
+    if isinstance(model, PowerReceiver):
+        return float((np.nanmean(observed) - report.mean()) * np.log(10) / 20)
+    if isinstance(model, CsiReceiver):
+        return float(np.log(np.nanmean(np.abs(observed) ** 2) / (2 * (report**2).mean())) / 2)
+    return float(np.log(np.nanmean(observed) / report.mean()))
+
+
+def _rates(values: Mapping[str, Any], asked: Mapping[str, float]) -> dict[str, float]:
+    """Rate of each parameter by the first pattern that fits, those asked for before `RATES`; else 0."""
+    idle = [pattern for pattern in asked if not any(fnmatchcase(name, pattern) for name in values)]
+    if idle:
+        raise ValueError(f"JointFit: rate for {', '.join(idle)}, but the parameters are {', '.join(values)}")
+    patterns = [*asked.items(), *RATES.items()]
+    return {name: next((rate for p, rate in patterns if fnmatchcase(name, p)), 0.0) for name in values}
+
+
+def _flat(values: NDArray[Any]) -> Any:
+    """All values in a row on the device; complex ones as real and imaginary part in turn."""
+    array = np.ascontiguousarray(values)
+    if np.iscomplexobj(array):
+        array = np.stack([array.real, array.imag], axis=-1)
+    return to_tensor(array).array

@@ -1,0 +1,61 @@
+"""The learned side of a hybrid: a field of Gaussians splatted on the directions that a receiver model asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+
+from ..core.angles import FloatArray, pixel_directions
+from ..field import Gaussians, InitialGaussians
+from ..project.footprint import Pose
+from ..splat.render import splat
+from ..splat.tiles import Plane
+from .follow import Complex
+
+
+class Field(Protocol):
+    """What a learned field is, see `wrf_mi.field.WrfGs` and `wrf_mi.field.WrfGsPlus`."""
+
+    def init(self, initial: InitialGaussians, rng: Any) -> dict[str, Any]:
+        """Parameters as NumPy arrays."""
+        ...
+
+    def gaussians(self, params: Mapping[str, Any], tx_pos: Any) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        ...
+
+
+def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:
+    """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
+
+    Args:
+        gaussians: of one field for a batch of transmitters.
+        pose: of the receiver.
+        plane: pixels of a hemisphere.
+        sphere: the lower hemisphere too: what a receiver turned about its x axis by half a turn sees.
+
+    Returns:
+        Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
+        hemisphere, then those of the lower one, see `sphere_directions`.
+    """
+    upper = splat(gaussians, pose, plane)
+    if not sphere:
+        return upper
+    turned = Pose(pose.position, [[row[0], -row[1], -row[2]] for row in pose.to_world])
+    lower = splat(gaussians, turned, plane)
+    tensor_type: Any = dr.tensor_t(type(upper[0]))
+    shape = (gaussians.batch, plane.pixels)
+    re, im = (
+        dr.concat([tensor_type(half, shape) for half in halves], axis=1).array
+        for halves in zip(upper, lower, strict=True)
+    )
+    return re, im
+
+
+def sphere_directions(height: int, width: int) -> FloatArray:
+    """Unit vectors [2 * height * width, 3] of the upper, then the lower hemisphere, receiver's frame."""
+    upper = pixel_directions(height, width).reshape(-1, 3)
+    return np.concatenate([upper, upper * [1, -1, -1]])

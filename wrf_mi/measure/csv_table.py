@@ -1,0 +1,78 @@
+"""Columns of numbers in CSV files, with errors that name the row."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.files import one_line, text_lines
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """A CSV file with a header.
+
+    Attributes:
+        path: of the file, for messages.
+        header: names of the columns.
+        rows: text of each field, one list per row, each as long as the header.
+    """
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+
+    def numbers(self, column: str, may_be_empty: bool = False) -> FloatArray:
+        """Numbers of a column, shape [rows].
+
+        Args:
+            column: its name.
+            may_be_empty: read an empty field (or ``nan``) as NaN.
+
+        Raises:
+            InputError: no such column, or a field that is not a finite number.
+        """
+        if self.header.count(column) != 1:
+            what = "has no column" if column not in self.header else "has twice the column"
+            text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
+            raise InputError(f"{self.path}: {text}; the first line must name each column once")
+        place, values = self.header.index(column), np.full(len(self.rows), np.nan)
+        for row, fields in enumerate(self.rows):
+            text = fields[place].strip()
+            if may_be_empty and text.lower() in ("", "nan"):
+                continue
+            try:
+                values[row] = float(text)
+            except ValueError:
+                values[row] = np.nan
+            if not np.isfinite(values[row]):
+                remedy = "give a finite number, or leave it empty" if may_be_empty else "give a finite number"
+                raise InputError(f"{self.path}: row {row + 1}: {column} is {text[:40]!r}; {remedy}")
+        return values
+
+
+def read_csv(path: Path) -> CsvTable:
+    """Read a CSV file whose first line is its header.
+
+    Raises:
+        InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
+    """
+    lines = text_lines(path)
+    if not lines:
+        raise InputError(f"{path}: empty; give a header and one row per measurement")
+    try:
+        header, *rows = csv.reader(lines, strict=True)
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({one_line(error)}); correct it") from None
+    if not rows:
+        raise InputError(f"{path}: no rows below the header; give one per measurement")
+    for row, fields in enumerate(rows, start=1):
+        if len(fields) != len(header):
+            text = f"{len(fields)} fields, but the header has {len(header)}"
+            raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
+    return CsvTable(path, [name.strip() for name in header], rows)

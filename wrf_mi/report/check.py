@@ -1,0 +1,31 @@
+"""Runs one check of the benchmark in a process of its own: ``python -m wrf_mi.report.check MODULE:FUNCTION FILE``."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+from ..core import InputError
+from ..core.files import write_atomically
+
+
+def main(function: str, out: str) -> int:
+    """Call ``function`` (``module:name`` below ``wrf_mi.report``) and write what it returns as JSON.
+
+    Returns:
+        The exit status: 2 with one line where data are missing.
+    """
+    module, _, name = function.partition(":")
+    try:
+        figures = getattr(importlib.import_module(f"wrf_mi.report.{module}"), name)()
+    except InputError as error:
+        print(f"wrf-mi: {error}", file=sys.stderr)
+        return 2
+    write_atomically(Path(out), json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,275 @@
+"""The ray-tracing baseline as a run: paths, fitted offsets, scores, in the run folder of a learned model.
+
+config.yaml      data set, split, seed, versions, scene and what is traced
+split.npz        rows that fitted and rows that score (in ``fold0``, ... for several splits)
+paths.npz        every path, to be used again for other materials (`wrf_mi.trace.load_trace`, ``recompute``)
+metrics.json, predictions.npz
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..core import InputError, Record, Split
+from ..core.angles import FloatArray
+from ..core.files import one_line, write_atomically
+from ..core.types import IntArray
+from ..fit.folder import CONFIG, SPLIT, load_rows, versions
+from ..fit.trainer import peak_memory_mb
+from ..measure import make_splits, save_split
+from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_trace
+from ..trace.calibrate import CalibrationOptions, calibrate
+from ..trace.calibration import calibrated_rssi, load_calibration, save_calibration
+from ..trace.offsets import fit_offsets
+from ..trace.tracer import RayTracer, instrument_of
+from .evaluate import evaluate, milliseconds_per_sample, pool, stored_metrics, write_results
+
+MODEL = "ray-tracing"
+PATHS, CALIBRATION = "paths.npz", "calibration.json"
+CALIBRATIONS = {"patterns": CalibrationOptions(materials=False), "all": CalibrationOptions()}
+"""What can be fitted beside offsets."""
+
+
+@dataclass(frozen=True)
+class TraceConfig:
+    """What ``config.yaml`` says of a traced run.
+
+    Attributes:
+        dataset: name or folder that was loaded.
+        scene: name, scene folder, Mitsuba XML or mesh.
+        material: of a bare mesh, or None.
+        split: its name.
+        n_train: number or fraction of training rows; None: all.
+        seed: of the split.
+        options: what is traced.
+        calibration: what is fitted to the training rows beside offsets, a key of `CALIBRATIONS`; None: nothing.
+    """
+
+    dataset: str
+    scene: str
+    material: str | None
+    split: str
+    n_train: float | None
+    seed: int
+    options: TraceOptions
+    calibration: str | None = None
+
+
+def is_traced(folder: Path) -> bool:
+    """Whether a folder is a run of the ray tracer."""
+    try:
+        return yaml.safe_load((folder / CONFIG).read_text()).get("model") == MODEL
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
+        return False
+
+
+def read_trace_config(folder: Path) -> TraceConfig:
+    """Read ``config.yaml`` of a traced run.
+
+    Raises:
+        InputError: missing, not YAML, or not of a traced run.
+    """
+    path = folder / CONFIG
+    try:
+        content = yaml.safe_load(path.read_text())
+        names = ("dataset", "scene", "material", "split", "n_train", "seed", "calibration")
+        return TraceConfig(**{name: content[name] for name in names}, options=TraceOptions(**content["options"]))
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no {CONFIG}, so not a run folder; give one made by trace") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not readable ({one_line(error)}); restore it") from None
+
+
+def trace_run(
+    scene: str | Path,
+    dataset: str | Path | Record,
+    out: str | Path,
+    options: TraceOptions | None = None,
+    *,
+    material: str | None = None,
+    split: str = "official",
+    n_train: int | float | None = None,
+    seed: int = 0,
+    calibration: str | None = None,
+    progress: bool = False,
+) -> Path:
+    """Trace a scene for every row of a data set and score it as a learned model is scored.
+
+    Nothing is fitted, but for signal strengths one offset per receiver on the training rows
+    (`wrf_mi.trace.offsets`), because their scale is not calibrated; or all that `wrf_mi.trace.calibrate` fits.
+
+    Args:
+        scene: name, scene folder, Mitsuba XML or mesh.
+        dataset: name, folder, or a record that was loaded.
+        out: run folder to make; must not exist or be empty.
+        options: what is traced; None: the defaults.
+        material: of a bare mesh.
+        split: name of a split; ``blocked`` scores every fold in turn and pools.
+        n_train: number or fraction of the training rows to use; None: all.
+        seed: of the split. The rays have theirs in ``options``.
+        calibration: what to fit to the training rows by gradients, beside offsets: ``"patterns"`` of the antennas,
+            or ``"all"``, materials too (a step takes fifty times as long). Signal strengths alone.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        InputError: data, scene, settings or folder that cannot be used.
+    """
+    folder = Path(out)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not empty; choose another --out")
+    record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
+    source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
+    splits = make_splits(record, split, seed, n_train)
+    if calibration is not None and calibration not in CALIBRATIONS:
+        raise InputError(f"calibration {calibration!r}: unknown; choose from {', '.join(CALIBRATIONS)}")
+    if calibration is not None and record.task != "rssi":
+        raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
+    config = TraceConfig(source, str(scene), material, split, n_train, seed, options or TraceOptions(), calibration)
+    tracer = RayTracer(scene, instrument_of(record), config.options, material)
+
+    start = time.perf_counter()
+    traced = tracer.trace(record.tx_pos_m, progress)
+    seconds = time.perf_counter() - start
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / CONFIG, _config_text(config))
+    save_trace(folder / PATHS, traced)
+    start = time.perf_counter()
+    for part, rows in _parts(folder, splits):
+        part.mkdir(exist_ok=True)
+        save_split(part / SPLIT, rows)
+        if calibration is not None:
+            wanted = CALIBRATIONS[calibration]
+            fitted = calibrate(traced, tracer.scene, record, rows.all_train, wanted, progress)
+            save_calibration(part / CALIBRATION, fitted)
+    spent = {"trace_seconds": seconds, "train_seconds": time.perf_counter() - start if calibration else 0.0}
+    metrics, arrays = _score(folder, record, splits, tracer, traced)
+    write_results(folder, _header(config, traced) | spent | metrics, arrays)
+    return folder
+
+
+def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
+    """Score a traced run again from its saved paths, without tracing.
+
+    Args:
+        folder: the run; without ``split`` its ``metrics.json`` and ``predictions.npz`` are written anew.
+        split: score on the test rows of another split instead; nothing is written.
+
+    Returns:
+        The metrics.
+
+    Raises:
+        InputError: not a traced run, or files in it that are missing or damaged.
+    """
+    config = read_trace_config(folder)
+    record = load_record(config.dataset)
+    tracer = RayTracer(config.scene, instrument_of(record), config.options, config.material)
+    traced = load_trace(folder / PATHS)
+    if split is None:
+        names = [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"))
+        splits = [load_rows(part, record) for part in names]
+    elif config.calibration is not None:
+        raise InputError(f"{folder}: calibrated on the training rows of {config.split}; leave --split away")
+    else:
+        splits = make_splits(record, split, config.seed)
+        config = replace(config, split=split)
+    metrics, arrays = _score(folder if split is None else None, record, splits, tracer, traced)
+    known = stored_metrics(folder)
+    stored = {key: known[key] for key in ("trace_seconds", "train_seconds") if key in known}
+    merged = _header(config, traced) | stored | metrics
+    if split is None:
+        write_results(folder, merged, arrays)
+    return merged
+
+
+def predict_traced(folder: Path, tx_pos_m: FloatArray) -> tuple[NDArray[Any], tuple[str, ...]]:
+    """What the receivers of a traced run report of new transmitter positions.
+
+    Args:
+        folder: the run, with one split.
+        tx_pos_m: positions [m, 3], metres.
+
+    Returns:
+        Observations [n_rx, m, ...], and the receivers' names.
+
+    Raises:
+        InputError: not a traced run, or one over several splits whose offsets differ.
+    """
+    config = read_trace_config(folder)
+    record = load_record(config.dataset)
+    instrument = instrument_of(record)
+    tracer = RayTracer(config.scene, instrument, config.options, config.material)
+    new = tracer.trace(tx_pos_m)
+    names = tuple(receiver.name for receiver in instrument.receivers)
+    if record.task != "rssi":
+        return instrument.observe(new.paths), names
+    if not (folder / SPLIT).exists():
+        raise InputError(f"{folder}: offsets for each block; trace with --split official to predict")
+    rows = load_rows(folder, record)
+    if config.calibration is not None:
+        calibration = load_calibration(folder / CALIBRATION)
+        return _with_floor(calibrated_rssi(calibration, new, tracer.scene), record, rows), names
+    old = instrument.observe(load_trace(folder / PATHS).paths)
+    known = rows.all_train
+    return fit_offsets(old[:, known], record.observation[:, known])(instrument.observe(new.paths)), names
+
+
+def _parts(folder: Path, splits: list[Split]) -> list[tuple[Path, Split]]:
+    """Where each split is kept."""
+    if len(splits) == 1:
+        return [(folder, splits[0])]
+    return [(folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
+
+
+def _score(
+    folder: Path | None, record: Record, splits: list[Split], tracer: RayTracer, traced: TraceResult
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Scores over all splits; with the calibrations that lie in ``folder``, if there are any."""
+    observed = tracer.instrument.observe(traced.paths)
+    parts = []
+    for k, rows in enumerate(splits):
+        place = folder if folder is None or len(splits) == 1 else folder / f"fold{k}"
+        values = observed
+        if place is not None and (place / CALIBRATION).exists():
+            calibration = load_calibration(place / CALIBRATION)
+            values = calibrated_rssi(calibration, traced, tracer.scene, record.tx_heading_rad)
+            values = _with_floor(values, record, rows)
+        elif record.task == "rssi":
+            known = rows.all_train
+            values = fit_offsets(observed[:, known], record.observation[:, known])(observed)
+        parts.append(evaluate(record, rows, partial(_reported, values)))
+    metrics, arrays = parts[0] if len(parts) == 1 else pool(parts)
+    # The rows above are read from one trace of all; a single sample is traced anew, search included.
+    single = milliseconds_per_sample(lambda rows, _: tracer(record.tx_pos_m[rows]), splits[0].test)
+    return metrics | {"ms_per_sample": single, "peak_memory_mb": peak_memory_mb()}, arrays
+
+
+def _reported(values: NDArray[Any], rows: IntArray, receiver: int) -> NDArray[Any]:
+    return values[receiver, rows]
+
+
+def _with_floor(values: FloatArray, record: Record, rows: Split) -> FloatArray:
+    """Strengths [n_rx, n] with the weakest that each receiver reported in place of what no path reaches."""
+    floor = np.nanmin(record.observation[:, rows.all_train], axis=1)
+    return np.where(np.isnan(values), floor[:, None], values)
+
+
+def _header(config: TraceConfig, traced: TraceResult) -> dict[str, Any]:
+    known = {"dataset": config.dataset, "scene": config.scene, "split": config.split, "seed": config.seed}
+    known |= {"calibration": config.calibration}
+    return {"model": MODEL, **known, "train_seconds": 0.0, "paths": len(traced.paths), "rays": traced.rays}
+
+
+def _config_text(config: TraceConfig) -> str:
+    content = {"model": MODEL, **{k: v for k, v in asdict(config).items() if k != "options"}}
+    return yaml.safe_dump(content | {"versions": versions(), "options": asdict(config.options)}, sort_keys=False)

@@ -1,0 +1,201 @@
+"""Scene folders: one room as meshes, materials and a file that Mitsuba and Sionna RT both open.
+
+``scene.xml`` and ``meshes/*.ply`` are the scene, ``materials.yml`` the file to edit, ``scene.yml`` what is known about
+it, ``preview.png`` a picture.
+"""
+
+from __future__ import annotations
+
+import logging
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import yaml
+from numpy.typing import ArrayLike
+from wrf_mi_scenes.mitsuba_xml import scene_xml
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.files import atomic_folder, one_line, text_lines, write_atomically
+from .materials import FILE as MATERIALS_FILE
+from .materials import Materials, materials_text, read_materials
+from .surfaces import Surface
+
+logger = logging.getLogger(__name__)
+
+XML_FILE = "scene.xml"
+FACTS_FILE = "scene.yml"
+PREVIEW_FILE = "preview.png"
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A scene folder that was read.
+
+    Attributes:
+        folder: where it is.
+        xml: its scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
+        materials: complete: every rule, surface and thickness.
+        description: one line.
+        frame: axes and origin of the coordinates.
+        source: the file it was made from.
+        registration: 4 x 4 matrix that took the source's frame to the scene's, or None.
+        counts: numbers of surfaces, faces and, of a scan, points.
+    """
+
+    folder: Path
+    xml: Path
+    materials: Materials
+    description: str
+    frame: str
+    source: str
+    registration: FloatArray | None
+    counts: Mapping[str, int]
+
+    @property
+    def thickness_m(self) -> Mapping[str, float]:
+        """Slab thickness of each radio material (``itu_*``), metres; ``scene.xml`` cannot hold it."""
+        return self.materials.thickness_m
+
+
+def write_scene(
+    folder: str | Path,
+    surfaces: Sequence[Surface],
+    *,
+    frame: str,
+    source: str,
+    materials: Materials | None = None,
+    registration: ArrayLike | None = None,
+    description: str = "",
+    points_m: ArrayLike | None = None,
+    counts: Mapping[str, int] | None = None,
+    replace: bool = False,
+) -> Path:
+    """Write a scene folder whole or not at all.
+
+    Args:
+        folder: to make.
+        surfaces: in the scene's frame, metres.
+        frame: axes and origin of the coordinates, one line.
+        source: the file that the surfaces were made from.
+        materials: rules and exceptions; None takes the default rules.
+        registration: 4 x 4 matrix from the source's frame to the scene's that has been applied already, or None.
+        description: one line.
+        points_m: a sample of the scan [n, 3] or [n, 2] in the scene's frame for the preview.
+        counts: further numbers to state.
+        replace: let it take the place of an existing folder.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names a surface
+            that is not there.
+    """
+    from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
+
+    folder = Path(folder)
+    if not surfaces:
+        raise InputError(f"{source}: no surface was found in it; a scene needs at least one")
+    names = [surface.name for surface in surfaces]
+    if len(set(names)) < len(names):
+        raise ValueError("write_scene: two surfaces have the same name")
+    given = materials or Materials()
+    if unknown := [name for name in given.surfaces if name not in names]:
+        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
+    full = given.complete({surface.name: surface.kind for surface in surfaces})
+    matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
+    facts = {
+        "description": description or f"{len(surfaces)} surfaces made from {Path(source).name}",
+        "frame": frame,
+        "units": "m",
+        "xml": XML_FILE,
+        "source": source,
+        "registration": None if matrix is None else matrix.tolist(),
+        "counts": {
+            "surfaces": len(surfaces),
+            "faces": sum(len(surface.faces) for surface in surfaces),
+            **{key: int(value) for key, value in (counts or {}).items()},
+        },
+    }
+    with atomic_folder(folder, replace=replace) as part:
+        (part / "meshes").mkdir()
+        for surface in surfaces:
+            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+            mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
+        _write(part / XML_FILE, _xml(full))
+        _write(part / MATERIALS_FILE, materials_text(full))
+        _write(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
+        draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
+    return folder
+
+
+def read_scene_folder(folder: str | Path) -> SceneFolder:
+    """Read a scene folder and let ``scene.xml`` follow ``materials.yml``.
+
+    Where the two name different materials, ``scene.xml`` is written anew (and what was added to it by hand is lost).
+
+    Raises:
+        InputError: a file is missing or damaged, a surface has no mesh, or the scene file cannot be written.
+    """
+    folder = Path(folder)
+    facts = _facts(folder / FACTS_FILE)
+    materials = read_materials(folder / MATERIALS_FILE)
+    xml = folder / facts["xml"]
+    meshes = {path.stem for path in (folder / "meshes").glob("*.ply")}
+    if odd := sorted(meshes ^ set(materials.surfaces)):
+        which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
+        raise InputError(f"{folder}: surface {odd[0]!r} has {which}; write the scene anew")
+    full = materials.complete(materials.surfaces)
+    if _materials_in(xml) != {name: full.of(name, "other") for name in full.surfaces}:
+        logger.info("%s: materials changed in %s, written anew", xml, MATERIALS_FILE)
+        try:
+            write_atomically(xml, _xml(full))
+        except OSError as error:
+            raise InputError(f"{xml}: cannot be written ({one_line(error)}); copy the folder and open that") from None
+    registration = facts.get("registration")
+    return SceneFolder(
+        folder=folder,
+        xml=xml,
+        materials=full,
+        description=str(facts["description"]),
+        frame=str(facts["frame"]),
+        source=str(facts["source"]),
+        registration=None if registration is None else np.asarray(registration, float),
+        counts=facts.get("counts", {}),
+    )
+
+
+def _xml(materials: Materials) -> str:
+    return scene_xml({name: materials.of(name, "other") for name in materials.surfaces})
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    try:
+        facts = yaml.safe_load("\n".join(text_lines(path)))
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML ({one_line(error)})") from None
+    if not isinstance(facts, dict):
+        facts = {}
+    if missing := [key for key in ("description", "frame", "xml", "source") if key not in facts]:
+        raise InputError(f"{path}: no {missing[0]} in it; write the scene anew")
+    return facts
+
+
+def _materials_in(xml: Path) -> dict[str, str]:
+    """Material of each shape of a scene file, by the shape's name."""
+    try:
+        shapes = ElementTree.parse(xml).getroot().findall("shape")
+    except (OSError, ElementTree.ParseError):
+        return {}
+    references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in shapes}
+    return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")

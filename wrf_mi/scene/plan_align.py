@@ -1,0 +1,265 @@
+"""Scans of one floor laid on one another, where the sensor stood, and what it saw empty.
+
+Poses from a robot's own positioning blur a map by decimetres and turn parts of it. Each scan by itself is sharp. So
+scans taken while standing still are put together, each such stop is matched to the map of those before it (correlative
+scan matching: Olson 2009, ICRA), and all are refined against all others. Where the sensor stood need not be known:
+every return was seen, so from there none lies behind another in the same direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.draw import line
+
+from ..core.angles import FloatArray
+from .plan_lines import rotation_2d
+from .plan_sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
+
+STANDING_S = 1.0
+"""Scans that follow one another faster may be of one stop."""
+SAME_STOP = 0.6
+"""Least match of a scan with the stop before it; two scans of one place match to 0.8 or more."""
+SAME_PLACE = 0.5
+"""Least match of a stop with the map; with less it stays where it was."""
+STAYS = 0.2
+"""Least share of a stop's scans that see a cell: what moves and what is noise is seen once."""
+POSE_DEVIATION_M, POSE_DEVIATION_RAD = 0.4, np.radians(8)
+"""What a robot's positioning may be off by, one standard deviation; holds back matches with the wrong wall."""
+POSE_WEIGHT = 0.05
+HIDDEN_SHARE = 0.15
+"""Largest share of a scan's returns that may lie behind others as seen from the sensor."""
+BEHIND_M = 0.15
+"""A return this much farther than another one in the same direction lies behind it: more than an edge's slope does."""
+BEARINGS = 240
+"""Directions in which returns hide one another."""
+SECTORS = 36
+"""Sectors over which returns are spread evenly."""
+SEARCH_M = 0.1
+"""Step of the search for the sensor."""
+ROUNDS = 3
+
+Step = tuple[float, float, float, float]
+"""Half-width and step of a search over shifts (metres) and over turns (degrees)."""
+WITHIN_STOP: tuple[Step, ...] = ((0.2, 0.05, 3, 1), (0.04, 0.01, 0.6, 0.2))
+COARSE: Step = (0.6, 0.15, 12, 3)
+FINE: tuple[Step, ...] = ((0.15, 0.05, 3, 1), (0.05, 0.0125, 0.75, 0.25))
+REFINING: tuple[Step, ...] = ((0.1, 0.05, 2, 1), (0.05, 0.0125, 0.5, 0.25))
+COARSE_POINTS = 120
+
+
+@dataclass(eq=False)
+class _Stop:
+    """Returns seen from one place, in one frame; the pose (x, y, angle) moves them about their middle."""
+
+    points: FloatArray
+    sensor: FloatArray | None
+    pose: FloatArray
+
+    def moved(self, points: FloatArray, pose: FloatArray | None = None) -> FloatArray:
+        return _moved(points, self.pose if pose is None else pose, self.points.mean(axis=0))
+
+
+def _moved(points: FloatArray, pose: FloatArray, middle: FloatArray) -> FloatArray:
+    return (points - middle) @ rotation_2d(pose[2]).T + middle + pose[:2]
+
+
+class _Canvas:
+    """Pictures of points in cells of one grid; axes x, y."""
+
+    def __init__(self, xy_m: FloatArray, cell_m: float = POINT_CELL_M) -> None:
+        self.cell = cell_m
+        self.low = xy_m.min(axis=0) - 2 * COARSE[0]
+        self.shape = tuple(np.ceil((xy_m.max(axis=0) + 2 * COARSE[0] - self.low) / cell_m).astype(int) + 1)
+
+    def cells(self, points: FloatArray) -> NDArray[np.intp]:
+        """Indices [n, 2], clipped to the picture."""
+        return np.clip(np.floor((points - self.low) / self.cell).astype(int), 0, np.array(self.shape) - 1)
+
+    def image(self, points: FloatArray) -> Mask:
+        """Cells that hold a point."""
+        image = np.zeros(self.shape, bool)
+        image[tuple(self.cells(points).T)] = True
+        return image
+
+    def closeness(self, image: Mask, deviation_m: float) -> FloatArray:
+        """1 in cells of the image, falling with the distance from them as a Gaussian."""
+        away = ndimage.distance_transform_edt(~image) * self.cell
+        return np.exp(-0.5 * (away / deviation_m) ** 2)
+
+    def match(
+        self, field: FloatArray, points: FloatArray, middle: FloatArray, start: FloatArray, step: Step, weight: float
+    ) -> tuple[FloatArray, float]:
+        """The pose near a start that lays points best on a field, and the mean of the field there."""
+        reach, pitch, turn, turn_pitch = step
+        shifts = np.arange(-reach, reach + 1e-9, pitch)
+        shift = np.stack(np.meshgrid(shifts, shifts, indexing="ij"), axis=-1).reshape(-1, 2)
+        best, found, mean = -np.inf, start, 0.0
+        for angle in start[2] + np.radians(np.arange(-turn, turn + 1e-9, turn_pitch)):
+            turned = _moved(points, np.array([start[0], start[1], angle]), middle)
+            at = (turned[None] + shift[:, None] - self.low) / self.cell - 0.5
+            value = ndimage.map_coordinates(field, at.reshape(-1, 2).T, order=1).reshape(len(shift), -1).mean(axis=1)
+            off = ((start[:2] + shift) ** 2).sum(axis=1) / POSE_DEVIATION_M**2 + (angle / POSE_DEVIATION_RAD) ** 2
+            score = value - weight * off
+            i = int(np.argmax(score))
+            if score[i] > best:
+                best, mean = float(score[i]), float(value[i])
+                found = np.array([*(start[:2] + shift[i]), angle])
+        return found, mean
+
+
+def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -> PlanGrid:
+    """A map from scans: cells that were hit, and cells that beams went through.
+
+    Args:
+        xy_m: returns [n, 2] in one frame, each scan moved by its pose, which may be off by some decimetres.
+        time_s: of each return's scan, shape [n]; equal for the returns of a scan.
+        name: of the source, for errors.
+
+    Returns:
+        Cells of `wrf_mi.scene.plan_sources.POINT_CELL_M`; free ones only where the sensor's place could be told.
+
+    Raises:
+        InputError: see `wrf_mi.scene.plan_sources.grid_from_points`.
+    """
+    # Refuses what no grid can be made of before the search.
+    grid_from_points(xy_m, None, name)
+    canvas = _Canvas(xy_m)
+    stops = _stops(xy_m, time_s, canvas)
+    _place(stops, canvas)
+    for _ in range(ROUNDS):
+        _refine(stops, canvas)
+    return _voted(stops, name)
+
+
+def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]:
+    """Scans of one stop laid on the first of them, then all of them where they were on average."""
+    times, scan = np.unique(time_s, return_inverse=True)
+    groups: list[list[tuple[FloatArray, FloatArray]]] = []
+    field, pose = np.zeros(canvas.shape), np.zeros(3)
+    for i in range(len(times)):
+        raw = xy_m[scan == i]
+        if i and times[i] - times[i - 1] <= STANDING_S:
+            middle = raw.mean(axis=0)
+            found = pose
+            for step in WITHIN_STOP:
+                found, mean = canvas.match(field, raw, middle, found, step, 0.0)
+            if mean >= SAME_STOP:
+                pose = found
+                groups[-1].append((raw, _moved(raw, pose, middle)))
+                continue
+        pose = np.zeros(3)
+        groups.append([(raw, raw)])
+        field = canvas.closeness(canvas.image(raw), 0.07)
+    stops = []
+    for group in groups:
+        back = np.median([(raw - moved).mean(axis=0) for raw, moved in group], axis=0)
+        scans = [moved + back for _, moved in group]
+        stops.append(_Stop(_lasting(scans, canvas), sensor_of(max(scans, key=len)), np.zeros(3)))
+    return stops
+
+
+def _lasting(scans: Sequence[FloatArray], canvas: _Canvas) -> FloatArray:
+    """One return of each cell that enough of the scans hit."""
+    count = np.sum([canvas.image(points) for points in scans], axis=0)
+    points = np.concatenate(scans)
+    cells = canvas.cells(points)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    often = count[tuple(cells[first].T)] >= max(1, STAYS * len(scans))
+    return np.asarray(points[first[often]])
+
+
+def sensor_of(scan_m: FloatArray) -> FloatArray | None:
+    """Where the sensor of a scan stood: the place from which the fewest returns lie behind others.
+
+    From many places in a convex room all of them are seen; of these it is the one from which they are spread most
+    evenly over the directions, because a sensor turns at a constant rate.
+
+    Args:
+        scan_m: returns [n, 2] of one turn of the sensor.
+
+    Returns:
+        Shape [2], or None where no place sees enough of them.
+    """
+    # Most returns surround the sensor, few come from far away.
+    low, high = np.percentile(scan_m, (2, 98), axis=0)
+    axes = [np.linspace(a, b, min(100, max(2, int((b - a) / SEARCH_M)))) for a, b in zip(low, high, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    hidden, uneven = np.array([_seen_from(scan_m, place) for place in places]).T
+    if hidden.min() > HIDDEN_SHARE * len(scan_m):
+        return None
+    possible = hidden <= hidden.min() + 0.01 * len(scan_m)
+    return np.asarray(places[possible][np.argmin(uneven[possible])])
+
+
+def _seen_from(scan_m: FloatArray, place: FloatArray) -> tuple[int, int]:
+    """How many returns lie behind another one as seen from a place, or at it; and how unevenly they are spread."""
+    away = scan_m - place
+    distance = np.hypot(away[:, 0], away[:, 1])
+    turn = np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5
+    bearing = (turn * BEARINGS).astype(int) % BEARINGS
+    nearest = np.full(BEARINGS, np.inf)
+    np.minimum.at(nearest, bearing, distance)
+    hidden = np.count_nonzero((distance > nearest[bearing] + BEHIND_M) | (distance < BEHIND_M))
+    sectors = np.bincount((turn * SECTORS).astype(int) % SECTORS, minlength=SECTORS)
+    return int(hidden), int((sectors**2).sum())
+
+
+def _place(stops: list[_Stop], canvas: _Canvas) -> None:
+    """Poses of stops, from the largest on, each matched to the map of those placed; next is who overlaps it most."""
+    rest = sorted(stops, key=lambda s: -len(s.points))
+    image = canvas.image(rest.pop(0).points)
+    while rest:
+        rough = canvas.closeness(image, 0.12)
+        stop = max(rest, key=lambda s: float(rough[tuple(canvas.cells(s.points).T)].mean()))
+        rest.remove(stop)
+        middle = stop.points.mean(axis=0)
+        some = stop.points[:: max(1, len(stop.points) // COARSE_POINTS)]
+        pose, _ = canvas.match(rough, some, middle, stop.pose, COARSE, POSE_WEIGHT)
+        field = canvas.closeness(image, 0.08)
+        for step in FINE:
+            pose, mean = canvas.match(field, stop.points, middle, pose, step, POSE_WEIGHT)
+        if mean >= SAME_PLACE:
+            stop.pose = pose
+        image |= canvas.image(stop.moved(stop.points))
+
+
+def _refine(stops: list[_Stop], canvas: _Canvas) -> None:
+    """Each pose once more against the map of all other stops."""
+    count = np.sum([canvas.image(stop.moved(stop.points)) for stop in stops], axis=0)
+    for stop in stops:
+        count = count - canvas.image(stop.moved(stop.points))
+        if count.any():
+            field, middle = canvas.closeness(count > 0, 0.07), stop.points.mean(axis=0)
+            pose = stop.pose
+            for step in REFINING:
+                pose, mean = canvas.match(field, stop.points, middle, pose, step, POSE_WEIGHT)
+            if mean >= SAME_PLACE:
+                stop.pose = pose
+        count = count + canvas.image(stop.moved(stop.points))
+
+
+def _voted(stops: list[_Stop], name: str) -> PlanGrid:
+    """Occupied where at least half as many stops hit a cell as looked through it, free elsewhere if any did."""
+    clouds = [stop.moved(stop.points) for stop in stops]
+    grid = grid_from_points(np.concatenate(clouds), None, name)
+    hits, passes = np.zeros(grid.occupied.shape, int), np.zeros(grid.occupied.shape, int)
+    for stop, cloud in zip(stops, clouds, strict=True):
+        column, row = ((cloud - grid.origin_m) / grid.resolution_m).astype(int).T
+        hit = np.zeros(grid.occupied.shape, bool)
+        hit[row, column] = True
+        hits += hit
+        if stop.sensor is None:
+            continue
+        begin = ((stop.moved(stop.sensor[None])[0] - grid.origin_m) / grid.resolution_m).astype(int)
+        through = np.zeros_like(hit)
+        for end_row, end_column in zip(row, column, strict=True):
+            rows, columns = line(begin[1], begin[0], end_row, end_column)
+            through[rows[:-2], columns[:-2]] = True
+        passes += through & ~hit
+    occupied = (hits > 0) & (2 * hits >= passes)
+    return PlanGrid(occupied, (passes > 0) & ~occupied, grid.resolution_m, grid.origin_m)

@@ -1,0 +1,292 @@
+"""Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices.
+
+Everything that walls are looked for in becomes a `PlanGrid`: cells that a wall may fill, cells that were seen empty,
+and the rest, of which nothing is known. Rows of the files run from the top, as in a picture and as in a map of ROS;
+rows of a `PlanGrid` run with y.
+"""
+
+from __future__ import annotations
+
+import csv
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.files import one_line, text_lines
+
+Mask = NDArray[np.bool_]
+
+OCCUPIED_PROBABILITY = 0.65
+"""A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
+FREE_PROBABILITY = 0.196
+"""A cell less likely than this is free (``free_thresh`` there)."""
+POINT_CELL_M = 0.05
+"""Cells that points are counted in: what is usual for maps of indoor robots."""
+LARGEST_GRID_CELLS = 4_000_000
+"""100 m x 100 m in cells of 5 cm; more is a slip of units or a stray point far away."""
+
+
+@dataclass(frozen=True)
+class PlanGrid:
+    """A plan in square cells; cell (row, column) has its centre at origin + resolution (column + 1/2, row + 1/2).
+
+    Attributes:
+        occupied: something stands there, shape [rows, columns].
+        free: seen empty, same shape; without any free cell nothing is known about openings and hidden places.
+        resolution_m: side of a cell.
+        origin_m: lower left corner, shape [2].
+    """
+
+    occupied: Mask
+    free: Mask
+    resolution_m: float
+    origin_m: FloatArray
+
+    def centres_m(self, mask: Mask) -> FloatArray:
+        """Centres [n, 2] of the cells of a mask."""
+        row, column = np.nonzero(mask)
+        return self.origin_m + self.resolution_m * (np.stack([column, row], axis=-1) + 0.5)
+
+
+@dataclass(frozen=True)
+class PlanPoints:
+    """LiDAR returns in a horizontal plane.
+
+    Attributes:
+        xy_m: shape [n, 2].
+        time_s: when the scan of each was taken, shape [n], or None. Returns with the same time are one scan.
+    """
+
+    xy_m: FloatArray
+    time_s: FloatArray | None = None
+
+
+def grid_from_probability(
+    probability: ArrayLike, resolution_m: float, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
+) -> PlanGrid:
+    """A grid from the probability that a cell is occupied.
+
+    Args:
+        probability: shape [rows, columns], the first row on top (largest y); NaN where nothing is known.
+        resolution_m: side of a cell.
+        origin_m: lower left corner of the lower left cell, shape [2].
+        name: of the source, for errors.
+
+    Raises:
+        InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
+    """
+    p = np.asarray(probability, float)
+    if p.ndim != 2 or not p.size:
+        raise InputError(f"{name}: an occupancy grid has two axes (rows, columns), this one has shape {p.shape}")
+    if not (np.isfinite(resolution_m) and resolution_m > 0):
+        raise InputError(f"{name}: the resolution is {resolution_m}; give the side of a cell in metres, above zero")
+    p = p[::-1]
+    with np.errstate(invalid="ignore"):
+        occupied, free = p > OCCUPIED_PROBABILITY, p < FREE_PROBABILITY
+    if not occupied.any():
+        what = "every cell is NaN" if np.isnan(p).all() else "no cell is occupied"
+        raise InputError(f"{name}: {what}; there is no wall to find, give another map")
+    return PlanGrid(occupied, free, float(resolution_m), np.asarray(origin_m, float))
+
+
+def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: str = "points") -> PlanGrid:
+    """A grid of the cells that hold points; none is free, since points do not tell what was seen empty.
+
+    Args:
+        xy_m: shape [n, 2].
+        resolution_m: side of a cell, by default `POINT_CELL_M`.
+        name: of the source, for errors.
+
+    Raises:
+        InputError: no points, or more cells than `LARGEST_GRID_CELLS`.
+    """
+    xy = np.asarray(xy_m, float)
+    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
+        raise InputError(f"{name}: points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
+    if not np.isfinite(xy).all():
+        bad = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
+        raise InputError(f"{name}: point {bad} is not finite; leave such points out")
+    cell = POINT_CELL_M if resolution_m is None else float(resolution_m)
+    # An empty rim keeps every window of the search inside.
+    low = (np.floor(xy.min(axis=0) / cell) - 2) * cell
+    columns, rows = (np.floor((xy.max(axis=0) - low) / cell).astype(int) + 3).tolist()
+    if rows * columns > LARGEST_GRID_CELLS:
+        size = np.ptp(xy, axis=0)
+        raise InputError(
+            f"{name}: {size[0]:.0f} m x {size[1]:.0f} m in cells of {cell} m are too many; are the units metres? "
+            "Remove stray points or give a coarser resolution"
+        )
+    occupied = np.zeros((rows, columns), bool)
+    column, row = ((xy - low) / cell).astype(int).T
+    occupied[row, column] = True
+    return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
+
+
+def read_plan_arrays(path: Path, resolution_m: float | None = None) -> PlanGrid | PlanPoints:
+    """A plan in an NPZ file: an occupancy grid or points.
+
+    Grid: ``log_odds`` [rows, columns], optionally ``resolution_m`` and ``origin_m`` [2]. Values that all lie in 0..1
+    are taken as probabilities (log odds of free cells are negative). Points: ``xy_m`` [n, 2], optionally ``time_s``
+    [n], the same for all returns of a scan.
+
+    Args:
+        path: of the file.
+        resolution_m: side of a cell; wins over the file's.
+
+    Raises:
+        InputError: unreadable, neither of both, or a grid without a resolution.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            content: dict[str, Any] = {key: arrays[key] for key in arrays.files}
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
+    if "log_odds" in content:
+        values = _numbers(content["log_odds"], path, "log_odds")
+        if resolution_m is None:
+            if "resolution_m" not in content:
+                raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
+            resolution_m = float(_numbers(content["resolution_m"], path, "resolution_m").reshape(-1)[0])
+        origin = _numbers(content.get("origin_m", np.zeros(2)), path, "origin_m")
+        return grid_from_probability(_probability(values), resolution_m, origin, str(path))
+    if "xy_m" in content:
+        xy = _numbers(content["xy_m"], path, "xy_m")
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
+        time = _numbers(content["time_s"], path, "time_s") if "time_s" in content else None
+        if time is not None and time.shape != xy.shape[:1]:
+            raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
+        return PlanPoints(xy, time)
+    raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
+
+
+def _numbers(values: NDArray[Any], path: Path, key: str) -> FloatArray:
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"{path}: {key} holds no numbers but {values.dtype}")
+    return values.astype(float)
+
+
+def _probability(values: FloatArray) -> FloatArray:
+    """Probabilities from log odds, or what are probabilities already."""
+    known = values[~np.isnan(values)]
+    if not known.size or (known.min() >= 0 and known.max() <= 1):
+        return values
+    return 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+
+
+def read_plan_picture(path: Path, resolution_m: float | None = None) -> PlanGrid:
+    """A map as a grey picture, dark where occupied: PGM or PNG, with the YAML file of a ROS map beside it or without.
+
+    The YAML file has the picture's name or is given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw],
+    ``negate`` (https://wiki.ros.org/map_server); the yaw has to be zero. Its thresholds are not used.
+
+    Raises:
+        InputError: unreadable, no resolution, or a turned origin.
+    """
+    from PIL import Image
+
+    facts: dict[str, Any] = {}
+    sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
+    if sheet.is_file():
+        try:
+            facts = yaml.safe_load("\n".join(text_lines(sheet)))
+            path = sheet.parent / facts["image"] if path == sheet else path
+            origin = np.array(facts["origin"][:2], float)
+            yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
+            resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
+        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{sheet}: not the YAML of a ROS map ({one_line(error)}); it needs image, resolution, origin"
+            ) from None
+        if yaw:
+            raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
+    else:
+        origin = np.zeros(2)
+    if resolution_m is None:
+        raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
+    try:
+        with Image.open(path) as picture:
+            grey = np.asarray(picture.convert("L"), float) / 255
+    except OSError as error:
+        raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
+    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, origin, str(path))
+
+
+def read_plan_text(path: Path) -> PlanPoints:
+    """Points in a text file with two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
+
+    Raises:
+        InputError: a row has not two numbers.
+    """
+    rows = []
+    for number, line in enumerate(text_lines(path), 1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            rows.append(_pair(words, path, number))
+    if not rows:
+        raise InputError(f"{path}: no points; give rows x y in metres")
+    return PlanPoints(np.array(rows))
+
+
+def read_layout(path: str | Path) -> FloatArray:
+    """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
+
+    Raises:
+        InputError: missing file, header or number, or no wall in it.
+    """
+    path = Path(path)
+    rows = list(csv.reader(text_lines(path)))
+    if not rows or [word.strip().lower() for word in rows[0]] != ["x", "y"]:
+        raise InputError(f"{path}: line 1: the header is not x,y; a layout lists consecutive wall vertices in metres")
+    vertices = np.array([_pair(row, path, number) for number, row in enumerate(rows[1:], 2)]).reshape(-1, 2)
+    if not np.any(np.diff(vertices, axis=0)):
+        raise InputError(f"{path}: no wall; give at least two different vertices")
+    return vertices
+
+
+def _pair(words: list[str], path: Path, number: int) -> tuple[float, float]:
+    try:
+        x, y = (float(word) for word in words)
+        if not np.isfinite([x, y]).all():
+            raise ValueError("not finite")
+    except ValueError:
+        raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}") from None
+    return x, y
+
+
+def read_plan(path: str | Path, resolution_m: float | None = None) -> PlanGrid | PlanPoints | FloatArray:
+    """Any file that shows a plan, told by its ending and its content.
+
+    ``.npz`` with ``log_odds`` or ``xy_m``; ``.png``, ``.pgm``, ``.yaml`` (ROS map); ``.csv`` with the header ``x,y``
+    (wall vertices); ``.xyz`` or ``.txt`` with two columns.
+
+    Args:
+        path: of the file.
+        resolution_m: side of a cell of a grid; wins over what the file says.
+
+    Returns:
+        A grid, points, or wall vertices [n, 2].
+
+    Raises:
+        InputError: see the readers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .yaml, .csv or .xyz")
+    match path.suffix.lower():
+        case ".npz":
+            return read_plan_arrays(path, resolution_m)
+        case ".png" | ".pgm" | ".yaml" | ".yml":
+            return read_plan_picture(path, resolution_m)
+        case ".csv":
+            return read_layout(path)
+        case ".xyz" | ".txt":
+            return read_plan_text(path)
+    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .yaml, .csv or .xyz")

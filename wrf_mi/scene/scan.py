@@ -1,0 +1,78 @@
+"""A simulated LiDAR scan of a scene: points for benchmarks, tests and people without a scanner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import backend
+from ..core import InputError
+from ..core.angles import FloatArray
+
+RAYS_PER_POSE = 300_000
+RANGE_NOISE_M = 0.02
+"""Standard deviation of a range, metres: a phone or a mobile scanner; one on a tripod has a tenth of it."""
+OUTLIERS = 0.01
+"""Share of the returns that come from nowhere: edges, glass, people walking by."""
+
+
+def simulate_scan(
+    scene: Any,
+    poses_m: ArrayLike,
+    *,
+    rays_per_pose: int = RAYS_PER_POSE,
+    range_noise_m: float = RANGE_NOISE_M,
+    outliers: float = OUTLIERS,
+    seed: int = 1,
+) -> FloatArray:
+    """Points that a LiDAR at some positions would see.
+
+    From each position rays go out evenly over the sphere (a Fibonacci lattice, turned at random); each return
+    is moved along its ray by Gaussian noise, and a share of them to a uniform random part of its range.
+
+    Args:
+        scene: a Mitsuba scene file, or a ``mi.Scene`` (of a ``sionna.rt.Scene``: its ``mi_scene``).
+        poses_m: scanner positions [k, 3], metres.
+        rays_per_pose: rays from each position.
+        range_noise_m: standard deviation of the range, metres.
+        outliers: share of the returns, 0 to 1.
+        seed: of the noise; the same seed gives the same points.
+
+    Returns:
+        Points [n, 3] in metres; rays that meet nothing leave none.
+
+    Raises:
+        InputError: no ray met anything.
+    """
+    backend.init()
+    import mitsuba as mi
+
+    if isinstance(scene, str | Path):
+        scene = mi.load_file(str(scene))
+    rng = np.random.default_rng(seed)
+    parts = []
+    for pose in np.asarray(poses_m, float).reshape(-1, 3):
+        directions = _sphere(rays_per_pose, rng)
+        ray = mi.Ray3f(mi.Point3f(*pose.tolist()), mi.Vector3f(directions.T.astype(np.float32)))
+        distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
+        seen = np.isfinite(distance)
+        distance = distance[seen] + rng.normal(0, range_noise_m, np.count_nonzero(seen))
+        stray = rng.random(len(distance)) < outliers
+        distance[stray] *= rng.random(np.count_nonzero(stray))
+        parts.append(pose + directions[seen] * distance[:, None])
+    points = np.concatenate(parts)
+    if not len(points):
+        raise InputError("simulated scan: no ray met the scene; put the scanner inside it")
+    return points
+
+
+def _sphere(count: int, rng: np.random.Generator) -> FloatArray:
+    """Directions [count, 3] spread evenly over the sphere (Gonzalez 2010, Math. Geosci. 42)."""
+    index = np.arange(count) + rng.random()
+    z = 1 - 2 * index / (count + 1)
+    azimuth = index * (np.pi * (3 - np.sqrt(5))) + rng.random() * 2 * np.pi
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)

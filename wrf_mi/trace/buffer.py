@@ -1,0 +1,168 @@
+"""Our plain arrays to and from Sionna RT's ``PathsBuffer``, and its two stages that work on one.
+
+Sionna RT's path solver is three stages: a search for candidates, the image method that makes exact paths of them, and
+the field calculator. Only this module touches the attributes of ``PathsBuffer`` that have no setter; the version is
+pinned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .surfaces import Surfaces
+
+SPECULAR, TRANSMISSION = 1, 4
+"""Values of Sionna RT's ``InteractionType``."""
+
+ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
+"""Fields of `Legs` with a value, or a row, for each path."""
+WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
+"""Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
+
+
+@dataclass(frozen=True)
+class Legs:
+    """What Sionna RT's stages need to know of p paths, from source to target.
+
+    Attributes:
+        source, target: which point each path joins, shape [p].
+        interactions: ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last.
+        face: index into `Surfaces.triangles` of what is met, shape [p, depth], -1 beyond the last.
+        vertices_m: interaction points [p, depth, 3], NaN beyond the last.
+        probability: with which a random search chose the interaction, shape [p, depth]; 1 in an exhaustive one.
+        wedge: edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction.
+    """
+
+    source: IntArray
+    target: IntArray
+    interactions: NDArray[np.uint8]
+    face: IntArray
+    vertices_m: FloatArray
+    probability: NDArray[np.float32]
+    wedge: dict[str, NDArray[Any]]
+
+    def __len__(self) -> int:
+        """Number of paths."""
+        return len(self.source)
+
+    def select(self, which: NDArray[Any] | slice) -> Legs:
+        """Those of a mask or of indices."""
+        wedge = {name: array[which] for name, array in self.wedge.items()}
+        return Legs(**{name: getattr(self, name)[which] for name in ARRAYS}, wedge=wedge)
+
+    def reverse(self) -> Legs:
+        """The same paths from target to source; edges of diffraction keep the faces of the original direction."""
+        depth = self.interactions.shape[1]
+        last = np.count_nonzero(self.interactions, axis=1)[:, None] - 1
+        level = np.arange(depth)
+        place = np.arange(len(self))[:, None], np.where(level <= last, last - level, level)
+        return replace(
+            self,
+            source=self.target,
+            target=self.source,
+            interactions=self.interactions[place],
+            face=self.face[place],
+            vertices_m=self.vertices_m[place],
+            probability=self.probability[place],
+        )
+
+
+def specular_legs(
+    source: IntArray, target: IntArray, interactions: NDArray[np.uint8], face: IntArray, vertices_m: FloatArray
+) -> Legs:
+    """Paths without random choices."""
+    return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
+
+
+def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
+    """A ``PathsBuffer`` of these paths, as candidates for the image method or (``valid``) as found.
+
+    A transmission without a face is a place holder: any will do.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+    count, depth = legs.face.shape
+    buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
+    used = legs.interactions != 0
+    face = np.where(used, np.maximum(legs.face, 0), 0)
+    thing = surfaces.object_of(face)
+    shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
+    shape[used] = surfaces.shape_ids[thing[used]]
+    primitive[used] = (face - surfaces.first_face[thing])[used]
+    buffer._valid = dr.full(mi.Bool, valid, count)
+    buffer._src_indices = mi.UInt32(legs.source.astype(np.uint32))
+    buffer._tgt_indices = mi.UInt32(legs.target.astype(np.uint32))
+    integers: Any = mi.TensorXu
+    buffer._interaction_types = integers(legs.interactions.astype(np.uint32))
+    buffer._shapes, buffer._primitives = integers(shape), integers(primitive)
+    buffer._probs = mi.TensorXf(legs.probability.astype(np.float32))
+    vertices = np.nan_to_num(legs.vertices_m, nan=0.0).astype(np.float32)
+    for level in range(1, depth):  # beyond the last interaction Sionna RT reads the last point, and adds its distance
+        vertices[:, level] = np.where(used[:, level, None], vertices[:, level], vertices[:, level - 1])
+    for axis, name in enumerate(("_vertices_x", "_vertices_y", "_vertices_z")):
+        setattr(buffer, name, mi.TensorXf(np.ascontiguousarray(vertices[..., axis])))
+    if legs.wedge:
+        for name in WEDGE:
+            kind: Any = type(getattr(buffer._diffracting_wedges, name))
+            setattr(buffer._diffracting_wedges, name, kind(np.ascontiguousarray(legs.wedge[name].T)))
+    buffer._paths_counter = mi.UInt32(count)
+    return buffer
+
+
+def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
+    """The valid paths of a buffer and their places in it."""
+    import drjit as dr
+
+    buffer.schedule()
+    dr.eval()
+    kept = np.flatnonzero(buffer.valid.numpy())
+    types = buffer.interaction_types.numpy()[kept].astype(np.uint8)
+    used = types != 0
+    first = np.zeros(int(surfaces.shape_ids.max(initial=0)) + 1, np.int64)
+    first[surfaces.shape_ids] = surfaces.first_face[:-1]
+    shape, primitive = (tensor.numpy()[kept].astype(np.int64) for tensor in (buffer.shapes, buffer.primitives))
+    face = np.full(shape.shape, -1, np.int64)
+    face[used] = first[shape[used]] + primitive[used]
+    vertices = np.stack([getattr(buffer, f"vertices_{axis}").numpy()[kept] for axis in "xyz"], axis=-1).astype(float)
+    vertices[~used] = np.nan
+    wedges = buffer.diffracting_wedges
+    wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[kept] for name in WEDGE}
+    source, target = (index.numpy()[kept].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
+    return kept, Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
+
+
+def exact_paths(scene: Any, surfaces: Surfaces, buffer: Any, sources_m: Any, targets_m: Any) -> tuple[IntArray, Legs]:
+    """Sionna RT's image method on candidates: which of them exist, unobstructed, with the faces really met."""
+    from sionna.rt.path_solvers.image_method import ImageMethod
+
+    done = ImageMethod()(
+        scene=scene.mi_scene,
+        paths=buffer,
+        diffraction=buffer.diffracting_wedges is not None,
+        diffraction_lit_region=True,
+        src_positions=sources_m,
+        tgt_positions=targets_m,
+    )
+    return from_buffer(done, surfaces)
+
+
+def join(parts: list[Legs], depth: int) -> Legs:
+    """All of them in a row; an empty list gives no path of that depth."""
+    if not parts:
+        none = np.zeros(0, np.int64)
+        return specular_legs(
+            none, none, np.zeros((0, depth), np.uint8), np.zeros((0, depth), np.int64), np.zeros((0, depth, 3))
+        )
+    wedge: dict[str, NDArray[Any]] = {}
+    for name, like in ((name, part.wedge[name]) for part in parts for name in part.wedge):
+        empty = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
+        wedge[name] = np.concatenate([part.wedge.get(name, e) for part, e in zip(parts, empty, strict=True)])
+    return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)

@@ -1,0 +1,106 @@
+"""Whether antennas stand where waves can reach them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .surfaces import Surfaces
+
+logger = logging.getLogger(__name__)
+
+SOLID_M = 0.5
+"""A closed body is an object, not a room, if it is thinner on average: 2 volume / area. Walls have their thickness, a
+cabinet 0.3 m, a room of 3 x 3 x 2.5 m 0.94 m."""
+NEAREST_M = 0.01
+"""Sionna RT drops paths with a shorter segment."""
+PAIRS_AT_ONCE = 1 << 20
+
+
+def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
+    """Refuse antennas inside a solid object; warn of those so close to a surface that paths are lost.
+
+    Args:
+        surfaces: of the scene.
+        positions_m: shape [n, 3].
+        names: what to call each, such as ``transmitter 3``.
+
+    Raises:
+        InputError: naming the first such antenna.
+    """
+    thing = np.full(len(positions_m), -1)
+    for face in solids(surfaces):
+        thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
+    if (thing >= 0).any():
+        first = int(np.argmax(thing >= 0))
+        place = ", ".join(f"{x:.2f}" for x in positions_m[first])
+        what = surfaces.names[thing[first]]
+        raise InputError(f"{names[first]} at ({place}) m is inside the solid {what!r}; move one of them")
+    near = np.flatnonzero(_near(surfaces, positions_m))
+    if len(near):
+        text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
+        logger.warning(text, len(near), len(positions_m), names[near[0]])
+
+
+def solids(surfaces: Surfaces) -> list[IntArray]:
+    """Faces of each closed body that is an object rather than a room; sheets that are not turned alike are no body."""
+    count = len(surfaces.triangles)
+    if not count:
+        return []
+    _, corner = np.unique(np.round(surfaces.triangles.reshape(-1, 3), 5), axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
+    _, edge, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    # Neighbours that are turned alike run along their common edge in opposite directions.
+    turned = np.bincount(edge.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]))
+    face = np.repeat(np.arange(count), 3)
+    joint = coo_array((np.ones(3 * count), (face, count + edge.reshape(-1))), shape=(count + len(uses),) * 2)
+    _, body = connected_components(joint, directed=False)
+    body = np.unique(body[:count], return_inverse=True)[1].reshape(-1)
+    a, b, c = surfaces.triangles.transpose(1, 0, 2)
+    volume = np.abs(np.bincount(body, (a * np.cross(b, c)).sum(axis=1) / 6))
+    area = np.bincount(body, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    open_edges = np.bincount(body[face], ((uses != 2) | (turned != 0))[edge.reshape(-1)])
+    thin = (open_edges == 0) & (volume > 0) & (2 * volume < SOLID_M * area)
+    order = np.argsort(body, kind="stable")
+    starts = np.searchsorted(body[order], np.arange(len(thin) + 1))
+    return [order[starts[k] : starts[k + 1]] for k in np.flatnonzero(thin)]
+
+
+def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
+    """How often a closed surface winds round each point, without sign: 1 inside, 0 outside; shape [n].
+
+    Source: van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), IEEE Trans. Biomed. Eng. 30(2).
+    """
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    number = np.zeros(len(points))
+    candidates = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    step = max(1, PAIRS_AT_ONCE // len(triangles))
+    for start in range(0, len(candidates), step):
+        part = candidates[start : start + step]
+        a, b, c = (triangles[None, :, k] - points[part, None] for k in range(3))
+        la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+        dot = lambda u, v: (u * v).sum(axis=-1)  # noqa: E731
+        solid = np.arctan2(dot(a, np.cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
+        number[part] = np.abs(solid.sum(axis=1)) / (2 * np.pi)
+    return number
+
+
+def _near(surfaces: Surfaces, points: FloatArray) -> FloatArray:
+    """Which points have a plane's bounds within `NEAREST_M`."""
+    close = np.zeros(len(points), bool)
+    step = max(1, PAIRS_AT_ONCE // max(len(surfaces.normal), 1))
+    for start in range(0, len(points), step):
+        part = points[start : start + step]
+        point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < NEAREST_M)
+        along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
+        within = ((along > surfaces.low[plane] - NEAREST_M) & (along < surfaces.high[plane] + NEAREST_M)).all(axis=1)
+        close[start + point[within]] = True
+    return close

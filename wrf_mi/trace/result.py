@@ -1,0 +1,155 @@
+"""A trace: paths with all that gains for other materials or antennas need, and the file that keeps them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Paths, Receiver
+from ..core.angles import FloatArray
+from ..core.paths import read_paths_file, save_paths
+from .buffer import Legs
+from .fields import UPRIGHT, path_gains, scattering_materials, sionna_orientation
+from .options import TraceOptions
+from .surfaces import Surfaces, scene_surfaces
+
+
+@dataclass(frozen=True)
+class TraceResult:
+    """Paths and how they were found.
+
+    Attributes:
+        paths: the paths, p of them.
+        tx_pos_m: transmitters [n_tx, 3], metres.
+        receivers: the ``n_rx`` receivers.
+        primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
+        probability: see `wrf_mi.trace.buffer.Legs`.
+        wedge: see `wrf_mi.trace.buffer.Legs`; empty without diffraction.
+        options: as asked for.
+        rays: that searched from each source; differs from ``options.rays`` where that is ``"auto"``.
+        from_receivers: the search went from receivers to transmitters.
+        frequency_hz: of the carrier.
+    """
+
+    paths: Paths
+    tx_pos_m: FloatArray
+    receivers: tuple[Receiver, ...]
+    primitives: NDArray[np.int32]
+    probability: NDArray[np.float32]
+    wedge: dict[str, NDArray[Any]]
+    options: TraceOptions
+    rays: int
+    from_receivers: bool
+    frequency_hz: float
+
+    def select(self, which: NDArray[Any]) -> TraceResult:
+        """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
+        wedge = {name: values[which] for name, values in self.wedge.items()}
+        kept = self.primitives[which], self.probability[which]
+        return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
+
+    def legs(self, surfaces: Surfaces) -> Legs:
+        """The paths in the direction of the search, for Sionna RT.
+
+        Raises:
+            InputError: the scene lacks an object, or has another one by that name.
+        """
+        paths, first = self.paths, np.zeros(len(self.paths.object_names), np.int64)
+        for index, name in enumerate(paths.object_names):
+            own = paths.objects == index
+            if not own.any():
+                continue
+            if name not in surfaces.names:
+                raise InputError(f"scene: no object {name!r}, which the saved paths meet; open the scene they are of")
+            place = surfaces.names.index(name)
+            first[index] = surfaces.first_face[place]
+            if self.primitives[own].max() >= surfaces.first_face[place + 1] - first[index]:
+                raise InputError(f"scene: object {name!r} is not the one that the saved paths meet; trace them anew")
+        face = np.where(paths.objects >= 0, first[paths.objects] + self.primitives, -1)
+        legs = Legs(paths.tx, paths.rx, paths.interactions, face, paths.vertices_m, self.probability, self.wedge)
+        return legs.reverse() if self.from_receivers else legs
+
+    def ends(self) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+        """Positions and Sionna RT's angles of sources and of targets, in the direction of the search."""
+        positions, angles = device_ends(self.tx_pos_m, self.receivers, self.options.upright)
+        if self.from_receivers:
+            return (positions[1], positions[0]), (angles[1], angles[0])
+        return positions, angles
+
+
+def device_ends(
+    tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], upright: bool
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Positions of transmitters and receivers, and Sionna RT's angles of both."""
+    rx = np.stack([receiver.position_m for receiver in receivers])
+    turned = [UPRIGHT if upright else sionna_orientation(receiver.orientation_xyzw) for receiver in receivers]
+    return (tx_pos_m, rx), (np.zeros((len(tx_pos_m), 3)), np.asarray(turned, float))
+
+
+def recompute(traced: TraceResult, scene: Any, pattern: str = "iso") -> TraceResult:
+    """Gains of the same paths with the scene's present materials (and frequency), without tracing again.
+
+    Args:
+        traced: from `wrf_mi.trace.trace_paths` or `load_trace`.
+        scene: a ``sionna.rt.Scene`` of the same geometry.
+        pattern: Sionna RT's name of the antenna pattern of both ends (``"iso"``, ``"dipole"``, ``"hw_dipole"``, ...).
+
+    Returns:
+        The same paths with other gains.
+
+    Raises:
+        InputError: the scene lacks an object that a path meets.
+    """
+    surfaces = scene_surfaces(scene)
+    with scattering_materials(scene, traced.options):
+        gain = path_gains(scene, surfaces, traced.legs(surfaces), *traced.ends(), traced.rays, pattern)
+    return replace(traced, paths=replace(traced.paths, gain=gain), frequency_hz=float(scene.frequency[0]))
+
+
+def save_trace(file: str | Path, traced: TraceResult) -> Path:
+    """Write to an ``.npz`` of plain arrays that `wrf_mi.core.load_paths` reads too."""
+    receivers = traced.receivers
+    extra = {
+        "tx_pos_m": traced.tx_pos_m,
+        "receiver_name": np.asarray([r.name for r in receivers]),
+        "receiver_position_m": np.stack([r.position_m for r in receivers]),
+        "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in receivers]),
+        "primitives": traced.primitives,
+        "probability": traced.probability,
+        "options": json.dumps(asdict(traced.options)),
+        "rays": traced.rays,
+        "from_receivers": traced.from_receivers,
+        "frequency_hz": traced.frequency_hz,
+    }
+    return save_paths(file, traced.paths, extra | {f"wedge/{name}": values for name, values in traced.wedge.items()})
+
+
+def load_trace(file: str | Path) -> TraceResult:
+    """Read what `save_trace` wrote.
+
+    Raises:
+        InputError: missing, damaged, or without what tells how the paths were traced.
+    """
+    paths, extra = read_paths_file(file)
+    try:
+        keys = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
+        receivers = tuple(Receiver(str(n), p, q) for n, p, q in zip(*(extra[key] for key in keys), strict=True))
+        return TraceResult(
+            paths,
+            extra["tx_pos_m"],
+            receivers,
+            extra["primitives"],
+            extra["probability"],
+            {key.removeprefix("wedge/"): values for key, values in extra.items() if key.startswith("wedge/")},
+            TraceOptions(**json.loads(str(extra["options"]))),
+            int(extra["rays"]),
+            bool(extra["from_receivers"]),
+            float(extra["frequency_hz"]),
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None

@@ -1,0 +1,132 @@
+"""Any description of a room as a Sionna RT scene: a name, a scene folder, a Mitsuba XML or a bare mesh."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import trimesh
+import yaml
+from wrf_mi_scenes import scenes
+from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
+
+from .. import backend
+from ..core import InputError
+from ..core.files import one_line
+from ..scene.folder import FACTS_FILE, read_scene_folder
+from ..scene.materials import FILE as MATERIALS_FILE
+from .materials import PERFECT, perfect_reflector, set_frequency
+
+MESHES = (".stl", ".ply", ".obj", ".glb")
+HIGHEST_M = 500.0
+"""A scene higher than that is taken for one in millimetres."""
+
+
+def open_scene(
+    source: str | Path,
+    frequency_hz: float,
+    thickness_m: Mapping[str, float] | None = None,
+    material: str | None = None,
+) -> Any:
+    """Open a scene in Sionna RT at a carrier frequency.
+
+    Args:
+        source: name of a scene that comes with the package, a scene folder, a Mitsuba XML whose BSDFs are radio
+            materials (``mat-itu_*``), or a mesh (``.stl``, ``.ply``, ``.obj``, ``.glb``).
+        frequency_hz: of the carrier; below a material's range see `set_frequency`.
+        thickness_m: slab thickness of materials by name, metres, before what the scene itself states.
+        material: of a mesh: a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect`` (a conductor).
+
+    Returns:
+        A ``sionna.rt.Scene``.
+
+    Raises:
+        InputError: nothing of that name, a file that cannot be opened, no surface, coordinates in millimetres, or a
+            material that is missing, unknown or superfluous.
+    """
+    backend.init()
+    path = Path(source)
+    if not path.exists() and (known := scenes().get(str(source))):
+        path, own = known.xml, known.thickness_m
+    elif path.is_dir():
+        path, own = _folder(path)
+    else:
+        own = {}
+    if not path.is_file():
+        ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
+        raise InputError(f"{source}: no such scene file; give {ways}")
+    mesh = path.suffix.lower() in MESHES
+    if mesh and material is None:
+        raise InputError(f"{source}: a mesh has no radio material; give one, such as concrete, or {PERFECT}")
+    if not mesh and material is not None:
+        raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
+    scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
+    _check_size(scene, source)
+    set_frequency(scene, frequency_hz, {**own, **(thickness_m or {})})
+    return scene
+
+
+def _folder(folder: Path) -> tuple[Path, Mapping[str, float]]:
+    """Scene file and thicknesses of a scene folder, from a scan or like those that come with the package."""
+    if (folder / MATERIALS_FILE).is_file():
+        read = read_scene_folder(folder)
+        return read.xml, read.thickness_m
+    try:
+        facts = yaml.safe_load((folder / FACTS_FILE).read_text(encoding="utf-8"))
+        return folder / facts["xml"], facts.get("thickness_m", {})
+    except FileNotFoundError:
+        raise InputError(f"{folder}: no {FACTS_FILE} in it, so not a scene folder; give one, or a file") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise InputError(f"{folder / FACTS_FILE}: not readable ({one_line(error)}); restore it") from None
+
+
+def _from_xml(path: Path) -> Any:
+    from sionna import rt
+
+    try:
+        # Merged shapes come in another order each time, and with them the paths.
+        return rt.load_scene(str(path), merge_shapes=False)
+    except (RuntimeError, ValueError, SyntaxError, TypeError) as error:
+        raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
+
+
+def _from_mesh(path: Path, material: str) -> Any:
+    from sionna import rt
+
+    if material == PERFECT:
+        radio_material: Any = perfect_reflector()
+    else:
+        name = f"itu_{material.removeprefix('itu_')}"
+        if name not in THICKNESS_M:
+            known = ", ".join(one.removeprefix("itu_") for one in THICKNESS_M)
+            raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {known}")
+        kind = name.removeprefix("itu_")
+        radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
+    try:
+        loaded: list[Any] = trimesh.load_scene(str(path)).dump()
+        parts = [part for part in loaded if len(getattr(part, "faces", ()))]
+    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
+        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
+    scene = rt.load_scene()
+    with tempfile.TemporaryDirectory() as folder:
+        objects = []
+        for index, part in enumerate(parts):
+            # Corners and faces alone: Mitsuba warns of attributes that it does not know.
+            file = Path(folder) / f"{index}.ply"
+            trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)
+            name = path.stem if len(parts) == 1 else f"{path.stem}_{index}"
+            objects.append(rt.SceneObject(fname=str(file), name=name, radio_material=radio_material))
+        if objects:
+            scene.edit(add=objects)
+    return scene
+
+
+def _check_size(scene: Any, source: str | Path) -> None:
+    if not scene.objects:
+        raise InputError(f"{source}: holds no surface; give a scene with triangles")
+    height = float(scene.mi_scene.bbox().max.z - scene.mi_scene.bbox().min.z)
+    if height > HIGHEST_M:
+        text = f"{height:.0f} m high, as if in millimetres"
+        raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")

@@ -1,0 +1,253 @@
+"""Which surfaces a wave may be reflected at, one after the other: chains of planes, found by rays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .surfaces import Surfaces
+
+PAIRS_AT_ONCE = 1 << 24
+"""Pairs of chain and position tested at once: 64 MiB of single-precision numbers for each of a few."""
+RAYS_AT_ONCE = 1 << 20
+"""Rays in flight at once."""
+END_M = 1e-4
+"""What lies so close to the end of a segment is the surface that reflects there."""
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Sequences of reflecting planes seen from one source; c chains.
+
+    Attributes:
+        plane: from the source on, shape [c, depth], -1 beyond the last.
+        image: of the source after each reflection, shape [c, depth, 3], metres, float64.
+    """
+
+    plane: IntArray
+    image: FloatArray
+
+    def __len__(self) -> int:
+        """Number of chains."""
+        return len(self.plane)
+
+    @property
+    def length(self) -> IntArray:
+        """Reflections of each chain, shape [c]."""
+        return np.count_nonzero(self.plane >= 0, axis=1)
+
+
+def shoot(
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, depth: int, reflections: int, seed: int
+) -> IntArray:
+    """Planes at which rays from a point are reflected, each sequence once and with all its beginnings.
+
+    Rays leave on a Fibonacci lattice turned at random. Where waves also go straight on (``depth`` is more than
+    ``reflections``), the rays are shot once for each choice of the hits that reflect.
+
+    Args:
+        scene: ``sionna.rt.Scene``.
+        surfaces: of that scene.
+        source_m: shape [3].
+        rays: number of rays.
+        depth: surfaces met at most.
+        reflections: at most.
+        seed: of the turn.
+
+    Returns:
+        Shape [c, reflections], -1 beyond the last; in lexical order.
+    """
+    found = [np.zeros((0, reflections), np.int64)]
+    if not len(surfaces.plane) or not reflections:
+        return found[0]
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    for reflecting in _patterns(depth, reflections):
+        for start in range(0, rays, RAYS_AT_ONCE):
+            stop = min(start + RAYS_AT_ONCE, rays)
+            sequence = np.full((stop - start, reflections), -1, np.int64)
+            hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
+            for column, level in enumerate(reflecting):
+                sequence[:, column] = hits[level]
+            found.append(unique_chains(sequence))
+    return unique_chains(np.concatenate(found))
+
+
+def _patterns(depth: int, reflections: int) -> list[tuple[int, ...]]:
+    """Which hits reflect: all choices that are not the beginning of another one."""
+    full = list(combinations(range(depth), reflections))
+    fewer = [pattern for r in range(1, reflections) for pattern in combinations(range(depth), r)]
+    return full + [pattern for pattern in fewer if depth - 1 - pattern[-1] < reflections - len(pattern)]
+
+
+def lattice(start: int, stop: int, count: int) -> FloatArray:
+    """Directions [3, stop - start] of the Fibonacci lattice of ``count`` points on the sphere.
+
+    Source: Gonzalez, "Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices" (2010), Math.
+    Geosciences 42.
+    """
+    index = np.arange(start, stop)
+    z = 1 - (2 * index + 1) / count
+    angle = 2 * np.pi * ((index * (2 / (1 + np.sqrt(5)))) % 1)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+def _shoot(
+    scene: Any,
+    surfaces: Surfaces,
+    directions: FloatArray,
+    source_m: FloatArray,
+    depth: int,
+    reflecting: tuple[int, ...],
+) -> IntArray:
+    """Plane of each hit [depth, rays], -1 once a ray has left the scene; the hits ``reflecting`` turn the ray."""
+    import drjit as dr
+    import mitsuba as mi
+
+    ray = mi.Ray3f(_columns(mi.Point3f, source_m[None]), mi.Vector3f(np.ascontiguousarray(directions, np.float32)))
+    lookup = np.zeros(int(surfaces.shape_ids.max()) + 1, np.uint32)
+    lookup[surfaces.shape_ids] = surfaces.first_face[:-1]
+    first, plane = mi.UInt32(lookup), mi.Int32(surfaces.plane.astype(np.int32))
+    # As data, not as code: one kernel serves every pattern.
+    pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
+    active = dr.full(mi.Bool, True, directions.shape[1])
+    planes: list[Any] = []
+    for level in range(depth):
+        hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=level == 0, active=active)
+        active &= hit.is_valid()
+        shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
+        face = dr.gather(mi.UInt32, first, shape, active) + hit.prim_index
+        planes.append(dr.select(active, dr.gather(mi.Int32, plane, face, active), -1))
+        mirrored = ray.d - 2 * dr.dot(ray.d, hit.n) * hit.n
+        ray = hit.spawn_ray(dr.select((pattern >> level) & 1 == 1, mirrored, ray.d))
+    dr.eval(planes)
+    return np.stack([np.asarray(hits, np.int64) for hits in planes])
+
+
+def unique_chains(sequence: IntArray) -> IntArray:
+    """Each sequence of planes [n, depth] once, with all its beginnings, in lexical order; empty ones left out."""
+    once = _unique_rows(sequence)
+    beginnings = [once]
+    for level in range(1, sequence.shape[1]):
+        beginnings.append(once.copy())
+        beginnings[-1][:, level:] = -1
+    together = _unique_rows(np.concatenate(beginnings))
+    return together[(together >= 0).any(axis=1)]
+
+
+def _unique_rows(rows: IntArray) -> IntArray:
+    """Each row once, in lexical order. Rows are sorted as numbers, ten times faster than by `numpy.unique(axis=0)`."""
+    code, width = np.zeros(len(rows), np.int64), int(rows.max(initial=-1)) + 2
+    for level in range(rows.shape[1]):
+        if int(code.max(initial=0)) >= np.iinfo(np.int64).max // width - 1:
+            code = np.unique(code, return_inverse=True)[1].reshape(-1)
+        code = code * width + rows[:, level] + 1
+    return rows[np.unique(code, return_index=True)[1]]
+
+
+def with_images(surfaces: Surfaces, source_m: FloatArray, plane: IntArray) -> Chains:
+    """Mirror a source at the planes of each chain, one after the other.
+
+    Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
+    """
+    image = np.full((*plane.shape, 3), np.nan)
+    here = np.broadcast_to(source_m, (len(plane), 3)).copy()
+    for level in range(plane.shape[1]):
+        used = plane[:, level] >= 0
+        n, d = surfaces.normal[plane[used, level]], surfaces.offset[plane[used, level]]
+        here[used] -= 2 * ((here[used] * n).sum(axis=1) - d)[:, None] * n
+        image[used, level] = here[used]
+    return Chains(plane, image)
+
+
+def possible(
+    surfaces: Surfaces, chains: Chains, targets_m: FloatArray, margin_m: float = 1e-3
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
+
+    Pure arithmetic, no ray is traced: it leaves a few in a thousand for that.
+
+    Args:
+        surfaces: of the scene.
+        chains: from one source.
+        targets_m: shape [n, 3].
+        margin_m: slack of the bounds.
+
+    Yields:
+        Indices of chains and of targets, in parts.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    length, count = chains.length, len(targets_m)
+    targets = _columns(mi.Point3f, targets_m)
+    planes: tuple[Any, ...] = (
+        _columns(mi.Vector3f, surfaces.normal),
+        mi.Float(surfaces.offset.astype(np.float32)),
+        _columns(mi.Vector3f, surfaces.axes[:, 0]),
+        _columns(mi.Vector3f, surfaces.axes[:, 1]),
+        _columns(mi.Point2f, surfaces.low - margin_m),
+        _columns(mi.Point2f, surfaces.high + margin_m),
+    )
+    step = max(1, PAIRS_AT_ONCE // count)
+    for reflections in range(1, chains.plane.shape[1] + 1):
+        members = np.flatnonzero(length == reflections)
+        for start in range(0, len(members), step):
+            part = members[start : start + step]
+            lane = dr.arange(mi.UInt32, len(part) * count)
+            row: Any = lane // count
+            place: Any = dr.gather(mi.Point3f, targets, lane - row * count)
+            valid: Any = dr.full(mi.Bool, True, len(part) * count)
+            for level in reversed(range(reflections)):
+                plane = dr.gather(mi.UInt32, mi.UInt32(chains.plane[part, level].astype(np.uint32)), row)
+                image: Any = dr.gather(mi.Point3f, _columns(mi.Point3f, chains.image[part, level]), row)
+                n, d, u, v, low, high = (dr.gather(type(values), values, plane) for values in planes)
+                here, there = dr.dot(n, place) - d, dr.dot(n, image) - d
+                valid &= here * there < 0
+                place += (image - place) * (here / (here - there))
+                along = mi.Point2f(dr.dot(u, place), dr.dot(v, place))
+                valid &= dr.all(along >= low) & dr.all(along <= high)
+            kept = np.asarray(dr.compress(valid), np.int64)
+            yield part[kept // count], kept % count
+
+
+def _columns(kind: Any, rows: FloatArray) -> Any:
+    """Dr.Jit vectors of rows [n, 2 or 3]."""
+    return kind(np.ascontiguousarray(rows.T, np.float32))
+
+
+def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
+    """How many surfaces lie between two points of each row, ends left out; ``most + 1`` stands for more.
+
+    Args:
+        scene: ``sionna.rt.Scene``.
+        start_m: shape [n, 3].
+        end_m: shape [n, 3].
+        most: crossings of interest.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if not len(start_m) or not scene.objects:
+        return np.zeros(len(start_m), np.int64)
+    start, end = _columns(mi.Point3f, start_m), _columns(mi.Point3f, end_m)
+    way = end - start
+    length = dr.norm(way)
+    direction = way / length
+    ray = mi.Ray3f(start + direction * END_M, direction)
+    active: Any = length > 2 * END_M
+    crossings: Any = dr.zeros(mi.UInt32, len(start_m))
+    for _ in range(most + 1):
+        hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
+        # From the start, not from the ray's own origin, which is moved off the last surface by up to a millimetre.
+        active &= hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
+        crossings += dr.select(active, mi.UInt32(1), mi.UInt32(0))
+        ray = hit.spawn_ray(direction)
+    return np.asarray(crossings, np.int64)

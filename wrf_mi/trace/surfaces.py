@@ -1,0 +1,142 @@
+"""The triangles of a Sionna RT scene in float64, and the planes they lie in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+
+COPLANAR_M = 2e-5
+"""A face belongs to a plane when its three corners are this close: 30 times the rounding of float32 at 10 m."""
+COPLANAR_COS = 0.99
+"""... and its normal within 8 degrees, which a sliver's rounded normal needs and a thin object's rim has not."""
+MERGED_M2 = 0.01
+"""Planes of less area are not looked for among rounded normals."""
+MERGED_COUNT = 1000
+"""Largest planes that take in others' faces: bounds the time for meshes without planes."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Faces of all objects in a row, and their planes; f faces, q planes, b objects.
+
+    Attributes:
+        names: of the objects.
+        shape_ids: Mitsuba's registry index of each object's mesh, shape [b].
+        first_face: where each object's faces begin, shape [b + 1]; face = first_face[object] + primitive.
+        triangles: corners [f, 3, 3], metres.
+        plane: plane of each face, shape [f].
+        normal: unit normals [q, 3].
+        offset: n . x of each plane, shape [q], metres.
+        face: largest face of each plane, shape [q].
+        axes: two unit vectors in each plane [q, 2, 3].
+        low, high: bounds of the plane's faces along ``axes``, shape [q, 2], metres.
+    """
+
+    names: tuple[str, ...]
+    shape_ids: NDArray[np.uint32]
+    first_face: IntArray
+    triangles: FloatArray
+    plane: IntArray
+    normal: FloatArray
+    offset: FloatArray
+    face: IntArray
+    axes: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    def object_of(self, face: IntArray) -> IntArray:
+        """Object of each face."""
+        return np.searchsorted(self.first_face, face, side="right") - 1
+
+
+def scene_surfaces(scene: Any) -> Surfaces:
+    """Read the triangles of a ``sionna.rt.Scene`` and find its planes."""
+    import drjit as dr
+    import mitsuba as mi
+
+    names = tuple(scene.objects)
+    ids, triangles = [], [np.zeros((0, 3, 3))]
+    for name in names:
+        mesh = scene.objects[name].mi_mesh
+        parameters = mi.traverse(mesh)
+        corners = np.asarray(parameters["vertex_positions"], float).reshape(-1, 3)
+        triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
+        pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mesh))
+        ids.append(int(pointer[0]))
+    first = np.cumsum([len(part) for part in triangles])
+    return find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
+
+
+def find_planes(
+    names: tuple[str, ...], shape_ids: NDArray[np.uint32], first_face: IntArray, triangles: FloatArray
+) -> Surfaces:
+    """Group faces into planes: first by rounded normal and offset, then the largest take in all that lie in them.
+
+    The second step makes one plane of a wall whose slivers have rounded normals of their own.
+    """
+    corner, centre = triangles[:, 0], triangles.mean(axis=1)
+    cross = np.cross(triangles[:, 1] - corner, triangles[:, 2] - corner)
+    double_area = np.linalg.norm(cross, axis=1)
+    area = double_area / 2
+    normal = np.divide(
+        cross, double_area[:, None], out=np.tile([0.0, 0.0, 1.0], (len(cross), 1)), where=area[:, None] > 0
+    )
+    largest = np.abs(normal).argmax(axis=1)[:, None]
+    normal *= np.sign(np.take_along_axis(normal, largest, axis=1))  # both sides of a sheet have one normal
+    offset = (normal * centre).sum(axis=1)
+
+    rounded = np.round(np.column_stack([normal, offset]) / COPLANAR_M).astype(np.int64)
+    _, plane = np.unique(rounded, axis=0, return_inverse=True)
+    plane = plane.reshape(-1)
+    total = np.bincount(plane, area)
+    seeds = np.argsort(-total, kind="stable")[:MERGED_COUNT]
+    biggest = _largest_face(plane, area)
+    free = np.ones(len(plane), bool)
+    for seed in seeds[total[seeds] >= MERGED_M2]:
+        face = biggest[seed]
+        if not free[face]:
+            continue
+        candidates = np.flatnonzero(free & (np.abs(centre @ normal[face] - offset[face]) < COPLANAR_M))
+        near = np.abs(triangles[candidates] @ normal[face] - offset[face]).max(axis=1) < COPLANAR_M
+        near &= np.abs(normal[candidates] @ normal[face]) > COPLANAR_COS
+        near |= candidates == face
+        plane[candidates[near]] = seed
+        free[candidates[near]] = False
+    labels, plane = np.unique(plane, return_inverse=True)
+    plane = plane.reshape(-1)
+    # The plane is that of the face which took the others in: theirs may be tilted, though within the tolerance.
+    kept = plane[biggest[labels]] == np.arange(len(labels))
+    face = np.where(kept, biggest[labels], _largest_face(plane, area))
+    return _bounded(names, shape_ids, first_face, triangles, plane, normal[face], offset[face], face)
+
+
+def _largest_face(plane: IntArray, area: FloatArray) -> IntArray:
+    """Largest face of each plane; the first of equals."""
+    order = np.lexsort((-area, plane))
+    return order[np.searchsorted(plane[order], np.arange(plane.max(initial=-1) + 1))]
+
+
+def _bounded(
+    names: tuple[str, ...],
+    shape_ids: NDArray[np.uint32],
+    first_face: IntArray,
+    triangles: FloatArray,
+    plane: IntArray,
+    normal: FloatArray,
+    offset: FloatArray,
+    face: IntArray,
+) -> Surfaces:
+    edge = triangles[face][:, 1] - triangles[face][:, 0]
+    edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
+    axes = np.stack([edge, np.cross(normal, edge)], axis=1)
+    along = np.einsum("fcx,fax->fca", triangles, axes[plane])
+    low, high = np.full((len(face), 2), np.inf), np.full((len(face), 2), -np.inf)
+    np.minimum.at(low, plane, along.min(axis=1))
+    np.maximum.at(high, plane, along.max(axis=1))
+    return Surfaces(names, shape_ids, first_face, triangles, plane, normal, offset, face, axes, low, high)
