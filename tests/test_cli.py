@@ -167,7 +167,7 @@ def test_predict(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     (tmp_path / "tx.csv").write_text(f"Z, X,name,Y\n{rows}\n\n")
     np.savez(tmp_path / "tx.npz", tx_pos=positions)
     status, out, err = call(["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "a.npz"], capsys)
-    assert (status, out, err) == (0, f"3 spectra: {tmp_path / 'a.npz'}\n", "")
+    assert (status, out, err) == (0, f"3 predictions: {tmp_path / 'a.npz'}\n", "")
     arguments = ["predict", run, "--input", tmp_path / "tx.npz", "--out", tmp_path / "new" / "b.npz", "--json"]
     status, out, _ = call(arguments, capsys)
     assert status == 0

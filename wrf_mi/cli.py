@@ -191,7 +191,7 @@ def _predict(a: Arguments) -> int:
     if a.json:
         _print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
-        print(f"{shapes['tx_pos'][0]} spectra: {a.out}")
+        print(f"{shapes['tx_pos'][0]} predictions: {a.out}")
     return 0
 
 
@@ -303,7 +303,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("run", metavar="RUN")
     sub.add_argument("--split", help="score on another split's test rows that the run has not seen; writes nothing")
 
-    sub = command("predict", _predict, "spectra at new transmitter positions")
+    sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
     given = sub.add_mutually_exclusive_group(required=True)
     given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres, with a header")

@@ -27,12 +27,12 @@ REPEATS = 20
 """Single predictions that are timed; the median is stated."""
 
 
-def milliseconds_per_sample(predict: Predict, rows: IntArray) -> float:
+def milliseconds_per_sample(predict: Predict, rows: IntArray, repeats: int = REPEATS) -> float:
     """Median time of one prediction at one transmitter position, warm, in ms."""
     one = rows[:1]
     predict(one, 0)
     times = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         start = time.perf_counter()
         predict(one, 0)
         times.append(time.perf_counter() - start)
