@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from traced_rooms import write_xml
 from trimesh import Trimesh
 from wrf_mi_scenes.build_laboratory import sheet
 
@@ -32,17 +33,7 @@ PARTITION: Mapping[str, tuple[str, Trimesh]] = {
 
 def room(folder: Path, parts: Mapping[str, tuple[str, Trimesh]]) -> Any:
     """A ``sionna.rt.Scene`` of named parts, each of a material and a mesh."""
-    folder.mkdir(exist_ok=True)
-    lines = [f'<bsdf type="diffuse" id="mat-{material}"/>' for material in sorted({m for m, _ in parts.values()})]
-    for name, (material, mesh) in parts.items():
-        mesh.export(folder / f"{name}.ply")
-        lines.append(
-            f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
-            f'<boolean name="face_normals" value="true"/><ref id="mat-{material}" name="bsdf"/></shape>'
-        )
-    path = folder / "scene.xml"
-    path.write_text("\n".join(['<scene version="3.0.0">', *lines, "</scene>"]))
-    return open_scene(path, FREQUENCY_HZ, THICKNESS_M)
+    return open_scene(write_xml(folder, parts), FREQUENCY_HZ, THICKNESS_M)
 
 
 def receiver(turn: tuple[float, float, float] = (0.0, 2.0, 0.0), position: Any = (4.2, 2.9, 0.4)) -> Receiver:

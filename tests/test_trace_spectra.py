@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
+from traced_rooms import write_xml
 from wrf_mi_scenes import content_sha256, scenes
 from wrf_mi_scenes.build_laboratory import build, sheet
 
@@ -50,19 +51,6 @@ def upright(turn_deg: float, position: tuple[float, float, float]) -> Receiver:
     return Receiver("gateway1", np.array(position), turned.as_quat())
 
 
-def write_scene(folder: Path, parts: dict[str, tuple[str, trimesh.Trimesh]]) -> Path:
-    lines = [f'<bsdf type="diffuse" id="mat-{material}"/>' for material in {material for material, _ in parts.values()}]
-    for name, (material, mesh) in parts.items():
-        mesh.export(folder / f"{name}.ply")
-        lines.append(
-            f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
-            f'<boolean name="face_normals" value="true"/><ref id="mat-{material}" name="bsdf"/></shape>'
-        )
-    path = folder / "scene.xml"
-    path.write_text("\n".join(['<scene version="3.0.0">', *lines, "</scene>"]))
-    return path
-
-
 @pytest.fixture(scope="module")
 def empty() -> Any:
     backend.init()
@@ -77,7 +65,7 @@ def empty() -> Any:
 def ground(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A large sheet of metal at z = 0."""
     parts = {"ground": ("itu_metal", sheet(2, 0.0, (-100.0, 100.0), (-100.0, 100.0)))}
-    return open_scene(write_scene(tmp_path_factory.mktemp("ground"), parts), FREQUENCY_HZ, {"itu_metal": 0.1})
+    return open_scene(write_xml(tmp_path_factory.mktemp("ground"), parts), FREQUENCY_HZ, {"itu_metal": 0.1})
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +138,7 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
         "west": ("itu_brick", sheet(0, 0.0, (0.0, 5.0), (0.0, 3.0))),
         "south": ("itu_glass", sheet(1, 0.0, (0.0, 6.0), (0.0, 3.0))),
     }
-    scene = open_scene(write_scene(tmp_path, walls), FREQUENCY_HZ)
+    scene = open_scene(write_xml(tmp_path, walls), FREQUENCY_HZ)
     receiver = upright(195, (5.0, 2.4, 1.2))
     source = np.array([1.3, 2.9, 1.6])
     paths = trace_paths(scene, source[None], receiver).paths
@@ -192,7 +180,7 @@ def test_materials_below_their_range(tmp_path: Path, caplog: pytest.LogCaptureFi
         "a": ("itu_brick", sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0))),
         "b": ("itu_wood", sheet(2, 1.0, (0.0, 1.0), (0.0, 1.0))),
     }
-    xml = write_scene(tmp_path, parts)
+    xml = write_xml(tmp_path, parts)
     with caplog.at_level(logging.INFO, "wrf_mi.trace.materials"):
         scene = open_scene(xml, 915e6, {"itu_brick": 0.2})
     assert caplog.messages == ["915 MHz is below the range of ITU-R P.2040 for brick: constant values of 1 GHz used"]
