@@ -20,7 +20,7 @@ as_root() {
     fi
 }
 
-# Installs one Debian package; a small system may have no package lists yet, or old ones.
+# Installs Debian packages; a small system may have no package lists yet, or old ones.
 apt_install() {
     install="env DEBIAN_FRONTEND=noninteractive apt-get install -yq --no-install-recommends $1"
     command -v apt-get >/dev/null && { as_root $install || { as_root apt-get update -q && as_root $install; }; }
@@ -49,10 +49,11 @@ if ! { new_enough "$venv/bin/python" && "$venv/bin/python" -m pip --version >/de
 fi
 echo "set-up: installing the package and its dependencies into $venv (a minute or two)" >&2
 "$venv/bin/python" -m pip install -q -e '.[dev]'
-# Open3D, which `wrf-mi mesh` uses, is linked against libusb for the sake of depth cameras.
+# Open3D, which `wrf-mi mesh` uses, is linked against what depth cameras and windows need.
+open3d_needs="libusb-1.0-0 libgl1 libegl1 libx11-6"
 if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
-    apt_install libusb-1.0-0 || true
+    apt_install "$open3d_needs" || true
     "$venv/bin/python" -c 'import open3d' 2>/dev/null ||
-        stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y libusb-1.0-0"
+        stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y $open3d_needs"
 fi
 "$venv/bin/python" -m wrf_mi.doctor --install-llvm
