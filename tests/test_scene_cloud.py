@@ -148,5 +148,5 @@ def test_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert packages.import_module is importlib.import_module
     monkeypatch.setattr(packages, "import_module", missing)
-    with pytest.raises(InputError, match=r"open3d .*pip install 'wrf-mi\[lidar\]'"):
+    with pytest.raises(InputError, match=r"need open3d: pip install 'wrf-mi\[lidar\]'"):
         surfaces_from_points(np.zeros((100, 3)))
