@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,10 @@ from wrf_mi.core import InputError, Record
 from wrf_mi.measure import load
 from wrf_mi.report.compare import compare
 from wrf_mi.report.run_folder import read_run
-from wrf_mi.report.runs import evaluate_run
+from wrf_mi.report.runs import evaluate_run, predict_to_file
 from wrf_mi.report.traced import trace_run
 from wrf_mi.scene.make import make_scene
-from wrf_mi.trace import TraceOptions, load_trace
+from wrf_mi.trace import TraceOptions, load_trace, solve
 from wrf_mi.trace.offsets import fit_offsets
 from wrf_mi.trace.options import with_kinds
 from wrf_mi.trace.tracer import RayTracer, instrument_of
@@ -101,6 +102,26 @@ def test_calibration_is_kept_and_scores_again_and_predicts(
     for wrong, scene, message in (("everything", room, "unknown; choose from patterns, all"),):
         with pytest.raises(InputError, match=message):
             trace_run(scene, flat_folder, tmp_path / "other", DIRECT, calibration=wrong)
+
+
+def test_rays_are_counted_once_for_a_run(
+    flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither single samples nor scoring again nor new positions search for another number."""
+    calls = []
+    converged = solve.converged_rays
+
+    def counted(*arguments: Any) -> int:
+        calls.append(arguments)
+        return converged(*arguments)
+
+    monkeypatch.setattr(solve, "converged_rays", counted)
+    out = trace_run(room, flat_folder, tmp_path / "run", TraceOptions(max_depth=1, rays="auto"))
+    assert len(calls) == 1
+    before = read_run(out).metrics
+    assert evaluate_run(out)["abs_error_db"] == before["abs_error_db"]
+    predict_to_file(out, np.array([[1.0, 1.0, 1.3]]), tmp_path / "p.npz")
+    assert len(calls) == 1
 
 
 def test_every_block_is_held_out_in_turn(flat_folder: Path, room: Path, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_tra
 from ..trace.calibrate import CalibrationOptions, calibrate
 from ..trace.calibration import calibrated_rssi, load_calibration, save_calibration
 from ..trace.offsets import fit_offsets
-from ..trace.tracer import RayTracer, instrument_of
+from ..trace.tracer import Instrument, RayTracer, instrument_of
 from .evaluate import evaluate, milliseconds_per_sample, pool, stored_metrics, write_results
 
 MODEL = "ray-tracing"
@@ -175,8 +175,8 @@ def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
     """
     config = read_trace_config(folder)
     record = load_record(config.dataset)
-    tracer = RayTracer(config.scene, instrument_of(record), config.options, config.material)
     traced = load_trace(folder / PATHS)
+    tracer = _tracer_of(config, traced, instrument_of(record))
     if split is None:
         names = [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"))
         splits = [load_rows(part, record) for part in names]
@@ -210,7 +210,8 @@ def predict_traced(folder: Path, tx_pos_m: FloatArray) -> tuple[NDArray[Any], tu
     config = read_trace_config(folder)
     record = load_record(config.dataset)
     instrument = instrument_of(record)
-    tracer = RayTracer(config.scene, instrument, config.options, config.material)
+    traced = load_trace(folder / PATHS)
+    tracer = _tracer_of(config, traced, instrument)
     new = tracer.trace(tx_pos_m)
     names = tuple(receiver.name for receiver in instrument.receivers)
     if record.task != "rssi":
@@ -221,9 +222,14 @@ def predict_traced(folder: Path, tx_pos_m: FloatArray) -> tuple[NDArray[Any], tu
     if config.calibration is not None:
         calibration = load_calibration(folder / CALIBRATION)
         return _with_floor(calibrated_rssi(calibration, new, tracer.scene), record, rows), names
-    old = instrument.observe(load_trace(folder / PATHS).paths)
+    old = instrument.observe(traced.paths)
     known = rows.all_train
     return fit_offsets(old[:, known], record.observation[:, known])(instrument.observe(new.paths)), names
+
+
+def _tracer_of(config: TraceConfig, traced: TraceResult, instrument: Instrument) -> RayTracer:
+    """The tracer of a run, with the number of rays that the run settled on, not one that new positions would."""
+    return RayTracer(config.scene, instrument, replace(config.options, rays=traced.rays), config.material)
 
 
 def _parts(folder: Path, splits: list[Split]) -> list[tuple[Path, Split]]:

@@ -47,6 +47,15 @@ class Prepared:
         self.surfaces = scene_surfaces(scene)
         self._scene = scene
         self._found: dict[tuple[bytes, TraceOptions, int], Any] = {}
+        self._rays: dict[TraceOptions, int] = {}
+
+    def rays(self, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
+        """How many rays search; for ``"auto"``, what converged for the first positions that were asked for."""
+        if options.rays != "auto":
+            return options.rays
+        if options not in self._rays:
+            self._rays[options] = converged_rays(self._scene, self.surfaces, sources_m, targets_m, options)
+        return self._rays[options]
 
     def chains(self, source: FloatArray, options: TraceOptions, rays: int) -> Any:
         """Sequences of planes that rays from a place [3] meet."""
@@ -109,7 +118,7 @@ def trace_paths(
     swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not (options.diffraction and options.sampled)
     if swap:
         ends, angles = (ends[1], ends[0]), (angles[1], angles[0])
-    rays = converged_rays(scene, surfaces, *ends, options) if options.rays == "auto" else options.rays
+    rays = kept.rays(*ends, options)
     with scattering_materials(scene, options):
         legs = _search(scene, kept, ends, options, rays, progress)
         gain = path_gains(scene, surfaces, legs, ends, angles, rays)
