@@ -1,0 +1,148 @@
+"""Lags: the few real numbers that a squared Bartlett spectrum consists of.
+
+The squared magnitude of sum_m h_m exp(-j k p_m . u) depends on differences of element positions alone,
+
+    P(u) = sum_l r_l exp(-j k l . u),   r_l = sum over pairs p_m - p_n = l of h_m conj(h_n),
+
+and r_-l = conj(r_l). So P is linear in the real vector (r_0, sqrt2 Re r_l, sqrt2 Im r_l) over half of the lags, which
+has as many numbers as the array has differences: (2 a - 1)(2 b - 1) of a regular a x b array, 49 of a 4 x 4. Signals
+that are not coherent add in r, not in h: lags also describe the mean of many snapshots.
+
+Lags are unique only where the directions tell them apart: neighbours half a wavelength apart or less, and in the plane,
+as elements of a planar array do not tell u_z from -u_z.
+
+Source: Van Trees, "Optimum Array Processing" (2002), sections 3.1.3 and 5.1 (difference co-array).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.constants import speed_of_light
+from scipy.linalg import solve_triangular
+
+from ..core import InputError
+from ..core.angles import FloatArray, azimuth_rad, elevation_rad, unit_vectors
+from ..core.types import IntArray
+
+SAME_LAG = 1e-6
+"""Differences closer than this share of the array's extent are one lag: positions in files have six digits."""
+LEAST_CONDITION = 1e-7
+"""Singular values below this share of the greatest: the directions do not tell the lags apart."""
+
+
+class Lags:
+    """The linear map between lags and squared spectra of one array on one grid of directions.
+
+    Args:
+        elements_m: elements [m, 3] in the array's frame, metres; any planar or other arrangement.
+        frequency_hz: of the carrier.
+        height: elevations over the upper hemisphere.
+        width: azimuths over the full circle.
+        row_offset: rows by which the first one lies above the horizon.
+
+    Raises:
+        InputError: element positions that are not finite [m, 3].
+    """
+
+    def __init__(
+        self, elements_m: ArrayLike, frequency_hz: float, height: int, width: int, row_offset: float = 0.0
+    ) -> None:
+        elements = np.asarray(elements_m, float)
+        if elements.ndim != 2 or elements.shape[1:] != (3,) or not len(elements) or not np.isfinite(elements).all():
+            raise InputError(f"lags: elements of shape {elements.shape}; give finite [m, 3] in metres")
+        self.shape = height, width
+        self.elements = len(elements)
+        self.lag_m, self._pair, self._side = _differences(elements)
+        wavenumber = 2 * np.pi * frequency_hz / speed_of_light
+        rise = row_offset * np.pi / 2 / height
+        directions = unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None] + rise)
+        phase = wavenumber * (directions.reshape(-1, 3) @ self.lag_m.T)
+        # cos for the real part; Re(r exp(-j phase)) has + sin for the imaginary one.
+        parts = [np.ones((len(phase), 1)), np.sqrt(2) * np.cos(phase[:, 1:]), np.sqrt(2) * np.sin(phase[:, 1:])]
+        self.basis: FloatArray = np.concatenate(parts, axis=1)
+
+    @property
+    def count(self) -> int:
+        """Real numbers in a vector of lags."""
+        return self.basis.shape[1]
+
+    def of_signals(self, signals: ArrayLike) -> FloatArray:
+        """Lags [..., count] of one snapshot of complex element signals [..., m]; snapshots' lags may be averaged."""
+        h = np.asarray(signals, complex)
+        products = (h[..., :, None] * h[..., None, :].conj()).reshape(*h.shape[:-1], -1)
+        return products.real @ self.pairs[0] + products.imag @ self.pairs[1]
+
+    @cached_property
+    def pairs(self) -> FloatArray:
+        """Matrices [2, m * m, count] that add real and imaginary parts of products h_m conj(h_n) up to lags."""
+        half, place, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
+        matrices = np.zeros((2, len(place), self.count))
+        for pair in np.flatnonzero(side > 0):
+            lag = place[pair]
+            matrices[0, pair, lag] = np.sqrt(2) if lag else 1
+            if lag:
+                matrices[1, pair, half + lag] = np.sqrt(2)
+        return matrices
+
+    def squared(self, lags: ArrayLike) -> FloatArray:
+        """Squared spectra [..., height, width] of lags [..., count]; below 0 where no signals have such lags."""
+        values = np.asarray(lags, float)
+        return (values @ self.basis.T).reshape(*values.shape[:-1], *self.shape)
+
+    def of_squared(self, squared: ArrayLike) -> FloatArray:
+        """Lags [..., count] whose squared spectrum is nearest, in the mean over pixels, to [..., height, width].
+
+        Raises:
+            InputError: an array whose lags this grid does not tell apart.
+        """
+        return solve_triangular(self._triangle, self.coordinates(squared)[..., None], lower=False)[..., 0]
+
+    def coordinates(self, squared: ArrayLike) -> FloatArray:
+        """Coordinates [..., count] in an orthonormal basis of all squared spectra: distances are those of pixels."""
+        values = np.asarray(squared, float)
+        if values.shape[-2:] != self.shape:
+            raise InputError(f"lags: image {values.shape[-2:]}, not {self.shape}; build the lags for its grid")
+        coordinates: FloatArray = values.reshape(*values.shape[:-2], -1) @ self._orthonormal
+        return coordinates
+
+    def to_coordinates(self, lags: ArrayLike) -> FloatArray:
+        """`coordinates` of the squared spectra of lags [..., count], without computing them."""
+        return np.asarray(lags, float) @ self._triangle.T
+
+    def residual(self, image: ArrayLike) -> FloatArray:
+        """What no squared spectrum of this array can have, of images [..., height, width]; the same shape."""
+        values = np.asarray(image, float)
+        return values - (self.coordinates(values) @ self._orthonormal.T).reshape(values.shape)
+
+    @cached_property
+    def _factors(self) -> tuple[FloatArray, FloatArray]:
+        orthonormal, triangle = np.linalg.qr(self.basis)
+        values = np.linalg.svd(triangle, compute_uv=False)
+        if len(values) < self.count or values[-1] < LEAST_CONDITION * values[0]:
+            text = f"{self.count} lags on {self.shape[0]} x {self.shape[1]} directions cannot be told apart"
+            raise InputError(f"lags: {text}; take more directions, or elements no further apart than half a wavelength")
+        return orthonormal, triangle
+
+    @property
+    def _orthonormal(self) -> FloatArray:
+        return self._factors[0]
+
+    @property
+    def _triangle(self) -> FloatArray:
+        return self._factors[1]
+
+
+def _differences(elements_m: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Lags [l, 3] of a half space, zero first; which lag a pair is, [m, m], and 1 or, in the other half, -1."""
+    count = len(elements_m)
+    difference = (elements_m[:, None, :] - elements_m[None, :, :]).reshape(-1, 3)
+    grain = SAME_LAG * max(float(np.ptp(elements_m, axis=0).max()), np.finfo(float).tiny)
+    steps = np.rint(difference / grain)
+    first = np.argmax(steps != 0, axis=1)
+    side = np.where(steps[np.arange(len(steps)), first] < 0, -1, 1)
+    # Each leads with a positive number, so zero sorts first.
+    _, index, place = np.unique(side[:, None] * steps, axis=0, return_index=True, return_inverse=True)
+    return side[index, None] * difference[index], place.reshape(count, count), side.reshape(count, count)
