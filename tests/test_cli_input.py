@@ -10,7 +10,7 @@ from calling import SET, refused
 
 from wrf_mi.cli import main
 from wrf_mi.core import InputError
-from wrf_mi.report.tx_file import read_tx_positions
+from wrf_mi.report.tx_file import read_transmitters
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_positions_that_are_refused(name: str, run: Path, tmp_path: Path, capsys
 def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "tx.npz", **arrays)
     with pytest.raises(InputError, match=message):
-        read_tx_positions(None, tmp_path / "tx.npz")
+        read_transmitters(None, tmp_path / "tx.npz")
 
 
 def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

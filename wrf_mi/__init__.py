@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .measure import fetch, make_splits
     from .report.compare import compare
     from .report.figures import spectrum_table
+    from .report.hybrid_run import train_hybrid
     from .report.runs import Run, evaluate_run, resume, train
     from .report.traced import trace_run
     from .report.view import scene_view
@@ -46,6 +47,7 @@ _HOME = {
     "spectrum_table": "report.figures",
     "trace_run": "report.traced",
     "train": "report.runs",
+    "train_hybrid": "report.hybrid_run",
     "with_settings": "fit.config",
 }
 
@@ -70,6 +72,7 @@ __all__ = [
     "spectrum_table",
     "trace_run",
     "train",
+    "train_hybrid",
     "with_settings",
 ]
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__
+from .cli_train import print_json, progress_bar, show_metrics, trace_command, train_command
 from .core import BackendError, InputError
 
 Arguments = argparse.Namespace
-
-
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=1, default=str))
 
 
 def _doctor(a: Arguments) -> int:
@@ -26,7 +22,7 @@ def _doctor(a: Arguments) -> int:
         doctor.install_llvm()
     found = doctor.report()
     if a.json:
-        _print_json(found)
+        print_json(found)
     else:
         print(doctor.render(found))
     return 0 if found["ok"] else 1
@@ -46,7 +42,7 @@ def _data_list(a: Arguments) -> int:
         for s in datasets()
     ]
     if a.json:
-        _print_json(rows)
+        print_json(rows)
         return 0
     for row in rows:
         print(f"{row['name']:<17}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
@@ -85,111 +81,27 @@ def _mesh(a: Arguments) -> int:
     kinds = list(scene.materials.surfaces.values())
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     if a.json:
-        _print_json({"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts})
+        print_json({"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts})
     else:
         print(", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}")
         print(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
     return 0
 
 
-def _train(a: Arguments) -> int:
-    from .fit.config import PRESETS, TrainConfig, describe, with_settings
-    from .report.runs import resume, train
-
-    if a.help_settings:
-        print(describe())
-        return 0
-    traced = (a.scene, a.material, a.paths, a.depth, a.reflections, a.rays, a.calibrate)
-    if a.model == "ray-tracing":
-        if not (a.scene and a.dataset and a.out) or a.resume or a.set or a.preset or a.deterministic:
-            raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
-        return _trace(a)
-    if any(value is not None for value in traced):
-        raise InputError("--scene and what is traced in it belong to --model ray-tracing")
-    with _watch() as watch:
-        if a.resume:
-            given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset)
-            if any(value is not None for value in given) or a.set or a.deterministic:
-                raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
-            folder = Path(a.resume)
-            run = resume(folder, watch.listen, watch.stop)
-        else:
-            if not a.dataset or not a.out:
-                raise InputError("train needs DATASET and --out RUN (or --resume RUN)")
-            folder = Path(a.out)
-            config = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
-            own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
-            config = with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
-            run = train(
-                a.dataset,
-                folder,
-                config,
-                "official" if a.split is None else a.split,
-                a.n_train,
-                watch.listen,
-                watch.stop,
-            )
-    return _show_metrics(run.metrics, folder, a.json)
-
-
-def _trace(a: Arguments) -> int:
-    from .report.traced import trace_run
-    from .trace.options import DEFAULTS, with_kinds
-
-    options = with_kinds(DEFAULTS, a.paths, max_depth=a.depth, max_reflections=a.reflections, rays=a.rays, seed=a.seed)
-    split = "official" if a.split is None else a.split
-    folder = trace_run(
-        a.scene,
-        a.dataset,
-        a.out,
-        options,
-        material=a.material,
-        split=split,
-        n_train=a.n_train,
-        seed=a.seed or 0,
-        calibration=a.calibrate,
-        progress=sys.stderr.isatty(),
-    )
-    return _show_metrics(json.loads((folder / "metrics.json").read_text()), folder, a.json)
-
-
 def _evaluate(a: Arguments) -> int:
     from .report.runs import evaluate_run
 
-    return _show_metrics(evaluate_run(a.run, a.split), None if a.split else Path(a.run), a.json)
-
-
-def _show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -> int:
-    if as_json:
-        _print_json(metrics)
-        return 0
-    from .report.metrics import TASKS
-
-    task = TASKS[metrics["task"]]
-    title = f"{task.label} on {metrics['n_test']} test rows"
-    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
-    named = (
-        (metrics["model"], metrics[task.block]),
-        (f"{task.reference_name} ({task.reference})", metrics["reference"][task.reference]),
-    )
-    for name, block in named:
-        print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
-    print(
-        f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
-        f"{metrics['ms_per_sample']:.1f} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
-    )
-    if folder is not None:
-        print(f"results: {folder}")
-    return 0
+    return show_metrics(evaluate_run(a.run, a.split), None if a.split else Path(a.run), a.json)
 
 
 def _predict(a: Arguments) -> int:
     from .report.runs import predict_to_file
-    from .report.tx_file import read_tx_positions
+    from .report.tx_file import read_transmitters
 
-    shapes = predict_to_file(a.run, read_tx_positions(a.tx, a.input), a.out)
+    positions, heading = read_transmitters(a.tx, a.input)
+    shapes = predict_to_file(a.run, positions, a.out, heading)
     if a.json:
-        _print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
+        print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
         print(f"{shapes['tx_pos'][0]} predictions: {a.out}")
     return 0
@@ -208,24 +120,18 @@ def _bench(a: Arguments) -> int:
 
     rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs))
     if a.json:
-        _print_json(rows)
+        print_json(rows)
     return 0
 
 
 def _demo(a: Arguments) -> int:
     from .report.demo import demo
 
-    with _watch() as watch:
+    with progress_bar() as watch:
         run, index = demo(Path(a.out) if a.out else None, watch.listen, watch.stop)
-    _show_metrics(run.metrics, run.folder, a.json)
+    show_metrics(run.metrics, run.folder, a.json)
     print(f"pictures: {index}", file=sys.stderr if a.json else sys.stdout)
     return 0
-
-
-def _watch() -> Any:
-    from .report.watch import Watch
-
-    return Watch()
 
 
 class _Parser(argparse.ArgumentParser):
@@ -271,12 +177,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
     sub.add_argument("--replace", action="store_true", help="take the place of an existing scene folder")
 
-    sub = command("train", _train, "fit a field to measured spectra and score it")
+    sub = command(
+        "train", train_command, "fit a field to measured spectra, or a hybrid to any measurements, and score it"
+    )
     sub.add_argument(
         "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
     )
-    sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+", "ray-tracing"), help="default: wrf-gs+")
-    sub.add_argument("--scene", metavar="SCENE", help="for ray-tracing, which is then the same as the command trace")
+    sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+", "hybrid", "ray-tracing"), help="default: wrf-gs+")
+    sub.add_argument("--scene", metavar="SCENE", help="for hybrid, or for ray-tracing, which is then the command trace")
     _add_tracing(sub)
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
     sub.add_argument(
@@ -290,7 +198,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     sub.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped")
 
-    sub = command("trace", _trace, "predict by ray tracing and score it like a learned field")
+    sub = command("trace", trace_command, "predict by ray tracing and score it like a learned field")
     sub.add_argument("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
     sub.add_argument("--out", metavar="RUN", required=True, help="run folder to make")
@@ -306,8 +214,8 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
     given = sub.add_mutually_exclusive_group(required=True)
-    given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres, with a header")
-    given.add_argument("--input", metavar="FILE.npz", help="array tx_pos [m, 3] in metres")
+    given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
+    given.add_argument("--input", metavar="FILE.npz", help="array tx_pos [m, 3] in metres (and heading_rad [m])")
     sub.add_argument("--out", required=True, metavar="FILE.npz")
 
     sub = command("compare", _compare, "table, SSIM distribution and pictures of several runs", json_output=False)

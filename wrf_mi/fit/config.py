@@ -7,7 +7,7 @@ import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import yaml
 
@@ -255,13 +255,17 @@ def _convert(value: Any, kind: type, name: str, source: str) -> Any:
     return value
 
 
-def with_settings(config: TrainConfig, settings: Iterable[str]) -> TrainConfig:
-    """The configuration with ``key=value`` settings applied in order; keys are dotted, values YAML.
+Settings = TypeVar("Settings")
+"""A frozen dataclass of plain values or of such dataclasses."""
+
+
+def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
+    """Settings (`TrainConfig`, or those of a hybrid) with ``key=value`` applied in order; keys dotted, values YAML.
 
     Raises:
         InputError: no ``=``, an unknown key, or a value of the wrong type.
     """
-    values = to_dict(config)
+    values: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
@@ -276,7 +280,7 @@ def with_settings(config: TrainConfig, settings: Iterable[str]) -> TrainConfig:
             node[last] = yaml.safe_load(text) if text.strip() else ""
         except (yaml.YAMLError, ValueError):  # the latter from dates that are none
             raise InputError(f"--set {setting}: {text!r} is no YAML value; quote text that is none") from None
-    return from_dict(values, "--set")
+    return cast(Settings, _build(type(config), values, "--set", ""))
 
 
 def dump(config: TrainConfig) -> str:
@@ -284,6 +288,7 @@ def dump(config: TrainConfig) -> str:
     return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
-def describe() -> str:
-    """One line a setting, with its default, for ``wrf-mi train --help-settings``."""
-    return "\n".join(f"{name}={value}" for name, value in _flat(to_dict(TrainConfig()), ""))
+def describe(settings: Any | None = None) -> str:
+    """One line a setting, with its default, for ``wrf-mi train --help-settings``; those of a fit if none are given."""
+    values = dataclasses.asdict(TrainConfig() if settings is None else settings)
+    return "\n".join(f"{name}={value}" for name, value in _flat(values, ""))

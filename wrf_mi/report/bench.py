@@ -89,6 +89,10 @@ CHECKS: Mapping[str, Check] = {
     "large-scan": Check("mesh from a scan", "bench_scene:large_scan"),
     "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan"),
     "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat"),
+    "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab"),
+    "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows"),
+    "hybrid-conference": Check("hybrid, newrf", "bench_hybrid_csi:conference"),
+    "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office"),
 }
 
 

@@ -40,6 +40,7 @@ COLUMNS = {
     "mean": "mean",
     "p10": "p10",
     "p90": "p90",
+    "inside_90": "inside 90 %",
     "ms_per_sample": "ms per sample",
     "train_seconds": "training (s)",
     "peak_memory_mb": "peak memory (MB)",

@@ -117,7 +117,8 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
     blocks, every = zip(*parts, strict=True)
     task = blocks[0]["task"]
     arrays = {key: np.concatenate([a[key] for a in every]) for key in ("row", "tx_pos")}
-    for key in ("prediction", "truth", reference_key(TASKS[task])):
+    known = ("prediction", "truth", "std", reference_key(TASKS[task]))
+    for key in (key for key in known if key in every[0]):
         arrays[key] = np.concatenate([a[key] for a in every], axis=1)
     arrays["receiver_name"] = every[0]["receiver_name"]
     metrics = score(arrays, task) | {
@@ -138,7 +139,8 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. ``prediction`` and, where they are
     known, ``truth`` and ``reference_<name>``: grey in 0..1 [m, H, W] or [n_rx, m, H, W] float32, power in dBm [m] or
-    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k] or [n_rx, m, k] complex64.
+    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k] or [n_rx, m, k] complex64. ``std``, where a
+    method states it, is the predicted standard deviation, of the same shape, real.
 
     Returns:
         The arrays as written.

@@ -15,6 +15,8 @@ from wrf_mi.core.angles import FloatArray
 
 EXACT = np.finfo(float).eps ** 2
 """Smallest relative squared error that float64 can show."""
+REAL_90, COMPLEX_90 = 1.6449, 1.5174
+"""Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
 
 
 def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
@@ -78,6 +80,20 @@ def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     # A prediction without any error would be infinitely accurate; float64 cannot tell more than this.
     ratio = np.maximum(np.divide(error, power, out=np.full(power.shape, np.nan), where=power > 0), EXACT)
     return -10 * np.log10(ratio)
+
+
+def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
+    """Share of the known values inside the predicted 90 % intervals.
+
+    Args:
+        prediction: any shape, real or complex.
+        std: predicted standard deviation, the same shape; errors are taken to be normal (complex: circular).
+        truth: the same shape; NaN where nothing was received.
+    """
+    error = np.abs(np.asarray(prediction) - np.asarray(truth))
+    bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
+    known = np.isfinite(error)
+    return float((error <= bound * np.asarray(std, float))[known].mean())
 
 
 def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:

@@ -114,6 +114,14 @@ def read_run(path: str | Path, name: str | None = None) -> Run:
     )
 
 
+def stated_model(folder: Path) -> Any:
+    """The model that a run folder's ``config.yaml`` names at its top; None where it names none or cannot be read."""
+    try:
+        return yaml.safe_load((folder / CONFIG).read_text()).get("model")
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
+        return None
+
+
 def read_runs(paths: Sequence[str | Path]) -> list[Run]:
     """Read several run folders under names that differ: folders of the same name get as many parents as needed.
 

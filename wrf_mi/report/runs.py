@@ -32,6 +32,7 @@ from ..fit.trainer import Progress, Trainer, peak_memory_mb
 from ..measure import make_splits
 from ..trace import load_record
 from .evaluate import Predict, evaluate, pool, stored_metrics, write_predictions, write_results
+from .hybrid_run import evaluate_hybrid, is_hybrid, predict_hybrid
 from .run_folder import CONFIG, METRICS
 from .traced import evaluate_traced, is_traced, predict_traced
 
@@ -210,6 +211,8 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
     path = Path(folder)
     if is_traced(path):
         return evaluate_traced(path, split)
+    if is_hybrid(path):
+        return evaluate_hybrid(path, split)
     run = read_config(path)
     record = load_record(run.dataset)
     if is_blocked(path):
@@ -246,23 +249,31 @@ def _finished(folder: Path, run: RunConfig) -> dict[str, Any]:
     return {"train_seconds": float(arrays["seconds"]), "gaussians": arrays["mean/position"].shape[1]}
 
 
-def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -> dict[str, tuple[int, ...]]:
+def predict_to_file(
+    folder: str | Path, tx_pos_m: np.ndarray, out: str | Path, tx_heading_rad: np.ndarray | None = None
+) -> dict[str, tuple[int, ...]]:
     """What a run's model predicts at new transmitter positions, as an ``.npz`` file.
 
     Args:
         folder: run folder with one field.
         tx_pos_m: positions [m, 3], metres.
         out: file to write; keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
-            [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``.
+            [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and of a hybrid
+            ``std``.
+        tx_heading_rad: how the transmitter is turned, [m]; only a hybrid for signal strengths uses it.
 
     Returns:
         Shape of each array in the file.
 
     Raises:
-        InputError: a run over several blocks, or positions that are not finite.
+        InputError: a run over several blocks, positions that are not finite, or headings for a model without.
     """
-    path = Path(folder)
-    if is_traced(path):
+    path, std = Path(folder), None
+    if tx_heading_rad is not None and not is_hybrid(path):
+        raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
+    if is_hybrid(path):
+        prediction, std, names = predict_hybrid(path, tx_pos_m, tx_heading_rad)
+    elif is_traced(path):
         prediction, names = predict_traced(path, tx_pos_m)
     else:
         predictor = Run(path).predictor()
@@ -274,6 +285,8 @@ def predict_to_file(folder: str | Path, tx_pos_m: np.ndarray, out: str | Path) -
         "tx_pos": np.asarray(tx_pos_m, float),
         "receiver_name": np.asarray(names),
     }
+    if std is not None:
+        arrays["std"] = std.astype(np.float32)
     return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
 
 

@@ -31,6 +31,7 @@ from ..trace.calibration import calibrated_rssi, load_calibration, save_calibrat
 from ..trace.offsets import fit_offsets
 from ..trace.tracer import Instrument, RayTracer, instrument_of
 from .evaluate import evaluate, milliseconds_per_sample, pool, stored_metrics, write_results
+from .run_folder import stated_model
 
 MODEL = "ray-tracing"
 PATHS, CALIBRATION = "paths.npz", "calibration.json"
@@ -67,10 +68,7 @@ class TraceConfig:
 
 def is_traced(folder: Path) -> bool:
     """Whether a folder is a run of the ray tracer."""
-    try:
-        return yaml.safe_load((folder / CONFIG).read_text()).get("model") == MODEL
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
-        return False
+    return stated_model(folder) == MODEL
 
 
 def read_trace_config(folder: Path) -> TraceConfig:

@@ -11,47 +11,63 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line, text_lines
 
+HEADING = "heading_rad"
+"""Column or array of headings."""
 
-def read_tx_positions(csv_file: str | Path | None, npz_file: str | Path | None) -> FloatArray:
-    """Positions [m, 3] in metres of a CSV file with columns x, y, z, or of an ``.npz`` file with ``tx_pos``.
+
+def read_transmitters(csv_file: str | Path | None, npz_file: str | Path | None) -> tuple[FloatArray, FloatArray | None]:
+    """Positions [m, 3] in metres and, where the file tells them, headings [m] in rad.
+
+    Args:
+        csv_file: with columns x, y, z and perhaps heading_rad; or
+        npz_file: with arrays ``tx_pos`` [m, 3] and perhaps ``heading_rad`` [m].
 
     Raises:
-        InputError: the file is missing, or a row is not three finite numbers.
+        InputError: the file is missing, or a row is not made of finite numbers.
     """
     path = Path(csv_file if csv_file is not None else npz_file or "")
     if not path.is_file():
         raise InputError(f"{path}: no such file; give positions x, y, z in metres")
-    positions = _from_csv(path) if csv_file is not None else _from_npz(path)
+    positions, heading = _from_csv(path) if csv_file is not None else _from_npz(path)
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
     if len(bad):
         raise InputError(f"{path}, row {bad[0] + 1}: not a finite number; give x, y, z in metres")
     if len(positions) == 0:
         raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
-    return positions
+    if heading is not None and (heading.shape != (len(positions),) or not np.isfinite(heading).all()):
+        raise InputError(f"{path}: {HEADING} must be one finite number (rad) for each position; correct it")
+    return positions, heading
 
 
-def _from_csv(path: Path) -> FloatArray:
-    rows = [row for row in csv.reader(text_lines(path)) if row]
+def _from_csv(path: Path) -> tuple[FloatArray, FloatArray | None]:
+    try:
+        rows = [row for row in csv.reader(text_lines(path)) if row]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({one_line(error)}); give x, y, z in metres") from None
     header = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "z"} <= set(header):
         raise InputError(f"{path}: header {','.join(header)[:40]!r} lacks x, y, z; make it the first line")
-    columns, positions = [header.index(name) for name in "xyz"], []
+    turned = HEADING in header
+    columns, values = [header.index(name) for name in ("x", "y", "z", *([HEADING] if turned else []))], []
     for number, row in enumerate(rows[1:], start=1):
         try:
-            positions.append([float(row[c]) for c in columns])
+            values.append([float(row[c]) for c in columns])
         except (ValueError, IndexError):
-            raise InputError(f"{path}, row {number}: {','.join(row)[:60]!r} is not three numbers; correct it") from None
-    return np.asarray(positions, float).reshape(-1, 3)
+            wanted = f"{len(columns)} numbers" if turned else "three numbers"
+            raise InputError(f"{path}, row {number}: {','.join(row)[:60]!r} is not {wanted}; correct it") from None
+    table = np.asarray(values, float).reshape(-1, len(columns))
+    return table[:, :3], table[:, 3] if turned else None
 
 
-def _from_npz(path: Path) -> FloatArray:
+def _from_npz(path: Path) -> tuple[FloatArray, FloatArray | None]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             positions = np.asarray(arrays["tx_pos"], float)
+            heading = np.asarray(arrays[HEADING], float) if HEADING in arrays else None
     except KeyError:
         raise InputError(f"{path}: no array tx_pos; store positions [m, 3] under that name") from None
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not readable as .npz ({one_line(error)}); write it with numpy.savez") from None
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise InputError(f"{path}: tx_pos has shape {list(positions.shape)}, expected [m, 3]; store x, y, z in metres")
-    return positions
+    return positions, heading

@@ -71,5 +71,39 @@ class Watch:
             print(f"{fold or 'training'} {p.step}/{steps}  {text}", file=sys.stderr, flush=True)
 
 
+class Stages:
+    """Shows the stages of a fit that is not made of steps, each with the share of it that is done."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), console=self._console)
+        self._what: str | None = None
+        self._task: Any = None
+
+    def __enter__(self) -> Stages:
+        """Start the bar."""
+        if self._console.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the bar."""
+        if self._console.is_terminal:
+            self._bar.stop()
+
+    def listen(self, what: str, share: float) -> None:
+        """Show that ``share`` (0..1) of a stage is done."""
+        if what != self._what:
+            self._what = what
+            if self._console.is_terminal:
+                self._task = self._bar.add_task(what, total=1.0)
+            else:
+                print(what, file=sys.stderr, flush=True)
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=share)
+
+
 def _clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

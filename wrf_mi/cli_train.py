@@ -1,0 +1,162 @@
+"""What ``wrf-mi train`` and ``wrf-mi trace`` do, and how the command shows figures."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from .core import InputError
+
+Arguments = argparse.Namespace
+
+
+def train_command(a: Arguments) -> int:
+    """``train``: a field, a hybrid, or a traced run."""
+    if a.help_settings:
+        print(_settings_text())
+        return 0
+    traced = (a.paths, a.depth, a.reflections, a.rays, a.calibrate)
+    if a.resume:
+        given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset, a.scene, a.material, *traced)
+        if any(value is not None for value in given) or a.set or a.deterministic:
+            raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
+        return _resume(a)
+    if a.model == "ray-tracing":
+        if not (a.scene and a.dataset and a.out) or a.set or a.preset or a.deterministic:
+            raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
+        return trace_command(a)
+    if a.model == "hybrid":
+        if any(value is not None for value in (*traced, a.preset)) or a.deterministic:
+            raise InputError("train --model hybrid takes --scene, --material, --split, --n-train, --seed and --set")
+    elif any(value is not None for value in (a.scene, a.material, *traced)):
+        raise InputError("--scene and what is traced in it belong to --model ray-tracing (--scene also to hybrid)")
+    if not a.dataset or not a.out:
+        raise InputError("train needs DATASET and --out RUN (or --resume RUN)")
+    return _train_hybrid(a) if a.model == "hybrid" else _train_field(a)
+
+
+def _resume(a: Arguments) -> int:
+    from .report.hybrid_run import is_hybrid, resume_hybrid
+    from .report.runs import resume
+    from .report.watch import Stages
+
+    folder = Path(a.resume)
+    if is_hybrid(folder):
+        with Stages() as stages:
+            resume_hybrid(folder, stages.listen)
+        return _show_stored(folder, a.json)
+    with progress_bar() as watch:
+        run = resume(folder, watch.listen, watch.stop)
+    return show_metrics(run.metrics, folder, a.json)
+
+
+def _train_field(a: Arguments) -> int:
+    from .fit.config import PRESETS, TrainConfig, with_settings
+    from .report.runs import train
+
+    with progress_bar() as watch:
+        config = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
+        own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
+        config = with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
+        run = train(a.dataset, a.out, config, _split(a), a.n_train, watch.listen, watch.stop)
+    return show_metrics(run.metrics, Path(a.out), a.json)
+
+
+def _train_hybrid(a: Arguments) -> int:
+    from .report.hybrid_run import train_hybrid
+    from .report.watch import Stages
+
+    with Stages() as stages:
+        folder = train_hybrid(
+            a.dataset,
+            a.out,
+            a.scene,
+            material=a.material,
+            split=_split(a),
+            n_train=a.n_train,
+            seed=a.seed or 0,
+            settings=tuple(a.set),
+            listen=stages.listen,
+        )
+    return _show_stored(folder, a.json)
+
+
+def _split(a: Arguments) -> str:
+    return "official" if a.split is None else a.split
+
+
+def _settings_text() -> str:
+    from .fit.config import describe
+    from .hybrid.models import settings_of_hybrids
+
+    parts = ["wrf-gs, wrf-gs+:", describe()]
+    for name, settings in settings_of_hybrids().items():
+        parts += [f"\nhybrid, {name}:", describe(settings)]
+    return "\n".join(parts)
+
+
+def trace_command(a: Arguments) -> int:
+    """``trace``: what ray tracing alone predicts."""
+    from .report.traced import trace_run
+    from .trace.options import DEFAULTS, with_kinds
+
+    options = with_kinds(DEFAULTS, a.paths, max_depth=a.depth, max_reflections=a.reflections, rays=a.rays, seed=a.seed)
+    folder = trace_run(
+        a.scene,
+        a.dataset,
+        a.out,
+        options,
+        material=a.material,
+        split=_split(a),
+        n_train=a.n_train,
+        seed=a.seed or 0,
+        calibration=a.calibrate,
+        progress=sys.stderr.isatty(),
+    )
+    return _show_stored(folder, a.json)
+
+
+def _show_stored(folder: Path, as_json: bool) -> int:
+    return show_metrics(json.loads((folder / "metrics.json").read_text()), folder, as_json)
+
+
+def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -> int:
+    """Print the content of ``metrics.json`` as a table or as JSON, and where the run lies."""
+    if as_json:
+        print_json(metrics)
+        return 0
+    from .report.metrics import TASKS
+
+    task = TASKS[metrics["task"]]
+    title = f"{task.label} on {metrics['n_test']} test rows"
+    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
+    named = (
+        (metrics["model"], metrics[task.block]),
+        (f"{task.reference_name} ({task.reference})", metrics["reference"][task.reference]),
+    )
+    for name, block in named:
+        print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    if "inside_90" in metrics:
+        print(f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals")
+    print(
+        f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
+        f"{metrics['ms_per_sample']:.1f} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
+    )
+    if folder is not None:
+        print(f"results: {folder}")
+    return 0
+
+
+def print_json(value: Any) -> None:
+    """Figures for programs."""
+    print(json.dumps(value, indent=1, default=str))
+
+
+def progress_bar() -> Any:
+    """A `wrf_mi.report.watch.Watch`, imported when it is needed."""
+    from .report.watch import Watch
+
+    return Watch()

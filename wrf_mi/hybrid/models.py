@@ -1,0 +1,103 @@
+"""Which hybrid serves which data: by what is measured, and by whether there is a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from numpy.typing import ArrayLike, NDArray
+
+from ..core import InputError, Receiver, Record
+from ..core.types import IntArray
+from .estimate import Estimate
+
+Listen = Callable[[str, float], None]
+
+
+class HybridModel(Protocol):
+    """A fitted hybrid."""
+
+    @property
+    def task(self) -> str:
+        """``"spectrum"``, ``"rssi"`` or ``"csi"``."""
+        ...
+
+    @property
+    def receivers(self) -> tuple[Receiver, ...]:
+        """Whose observations it predicts."""
+        ...
+
+    def predict(self, tx_pos_m: ArrayLike, receiver: int, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+        """What a receiver observes of transmitters at [q, 3], metres, turned by [q] rad, and how sure that is."""
+        ...
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that is needed to predict again."""
+        ...
+
+    def summary(self) -> dict[str, Any]:
+        """What was fitted, in plain numbers."""
+        ...
+
+
+@dataclass(frozen=True)
+class HybridKind:
+    """One of the hybrids.
+
+    Attributes:
+        settings: dataclass of its settings.
+        fit: ``fit(record, rows, scene, settings, seed, listen)``; ``scene`` as opened by Sionna RT, or None.
+        load: ``load(arrays, scene)``, from `HybridModel.arrays`.
+    """
+
+    settings: type
+    fit: Callable[[Record, IntArray, Any, Any, int, Listen], HybridModel]
+    load: Callable[[dict[str, NDArray[Any]], Any], HybridModel]
+
+
+def kind_of(record: Record, with_scene: bool) -> HybridKind:
+    """The hybrid for a record.
+
+    Args:
+        record: measurements.
+        with_scene: whether a mesh of the place is given.
+
+    Raises:
+        InputError: a task that none serves.
+    """
+    if record.task == "rssi":
+        from .rssi import RssiHybrid, RssiSettings, fit_rssi
+
+        return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
+    if record.task == "csi":
+        from .csi import CsiHybrid, CsiSettings, fit_csi
+
+        return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays)
+    if record.task != "spectrum":
+        raise InputError(f"{record.name}: holds {record.task}; no hybrid predicts that")
+    if with_scene:
+        from .spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
+
+        return HybridKind(SpectrumSettings, fit_spectrum, SpectrumHybrid.from_arrays)
+    from .measured_spectrum import MeasuredSpectrumHybrid, MeasuredSpectrumSettings, fit_measured_spectrum
+
+    def fit(record: Record, rows: IntArray, scene: Any, settings: Any, seed: int, listen: Listen) -> HybridModel:
+        return fit_measured_spectrum(record, rows, settings, seed, listen)
+
+    return HybridKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumHybrid.from_arrays)
+
+
+def settings_of_hybrids() -> dict[str, Any]:
+    """Default settings of each hybrid by what it serves."""
+    from .csi import CsiSettings
+    from .measured_spectrum import MeasuredSpectrumSettings
+    from .rssi import RssiSettings
+    from .spectrum import SpectrumSettings
+
+    return {
+        "spectra with --scene": SpectrumSettings(),
+        "spectra without": MeasuredSpectrumSettings(),
+        "signal strengths": RssiSettings(),
+        "channel coefficients": CsiSettings(),
+    }

@@ -1,0 +1,116 @@
+"""Polarised gains of specular paths in NumPy, float64, whole batches of transmitters at once.
+
+The same equations as `wrf_mi.hybrid.follow`, which computes them with derivatives in Dr.Jit for chains that are fixed.
+Here paths come and go with the transmitter, and derivatives by the few constants of the materials are differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import epsilon_0, speed_of_light
+
+from ..core.angles import FloatArray
+from .spectrum_rays import Met
+
+ComplexArray = NDArray[np.complex128]
+ALONG = 1e-12
+"""Squared sine below which a direction lies along an axis or a normal: any polarisation will do."""
+
+
+@dataclass(frozen=True)
+class Slabs:
+    """Constants of each object's material, arrays [b].
+
+    Attributes:
+        permittivity: relative.
+        conductivity: S/m.
+        thickness_m: metres.
+    """
+
+    permittivity: FloatArray
+    conductivity: FloatArray
+    thickness_m: FloatArray
+
+
+def coefficients(
+    cosine: FloatArray, permittivity: FloatArray, conductivity: FloatArray, thickness_m: FloatArray, frequency_hz: float
+) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
+    """Reflection (TE, TM) at and transmission (TE, TM) through a homogeneous slab in air, as `materials.slab`.
+
+    Source: ITU-R P.2040-3, equations 37, 43 and 44.
+    """
+    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * epsilon_0)
+    root = np.sqrt(eta - (1 - cosine**2))
+    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
+    once = np.exp(-2j * np.pi * frequency_hz / speed_of_light * thickness_m * root)
+    twice = once**2
+    through_te, through_tm = 1 / (1 - te**2 * twice), 1 / (1 - tm**2 * twice)
+    return (
+        te * (1 - twice) * through_te,
+        tm * (1 - twice) * through_tm,
+        (1 - te**2) * once * through_te,
+        (1 - tm**2) * once * through_tm,
+    )
+
+
+def gains(met: Met, slabs: Slabs, up: FloatArray, frequency_hz: float) -> ComplexArray:
+    """Lambda / (4 pi length) times interactions and polarisations of each path, without the phase of travelling.
+
+    Antennas are isotropic, linearly polarised: the transmitters' along the world's z axis, the receiver's along ``up``.
+
+    Args:
+        met: p paths.
+        slabs: the objects' materials.
+        up: unit vector [3], world frame.
+        frequency_hz: of the carrier.
+
+    Returns:
+        Shape [p].
+
+    Source: Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4 and 5.3.
+    """
+    length = np.linalg.norm(met.image_m, axis=1)
+    arrival = met.image_m / length[:, None]
+    depth = met.thing.shape[1]
+    directions = [-arrival]
+    for level in reversed(range(depth)):
+        back = np.where(met.plane[:, level] >= 0, (directions[0] * met.normal[:, level]).sum(axis=1), 0.0)
+        directions.insert(0, directions[0] - 2 * back[:, None] * met.normal[:, level])
+    field: ComplexArray = _theta_hat(directions[0], np.array([0.0, 0.0, 1.0])).astype(complex)
+    for level in range(depth):
+        row = np.flatnonzero(met.thing[:, level] >= 0)
+        if not len(row):
+            continue
+        before, after, normal = directions[level][row], directions[level + 1][row], met.normal[row, level]
+        which, mirror = met.thing[row, level], met.plane[row, level] >= 0
+        cosine = np.abs((before * normal).sum(axis=1))
+        r_te, r_tm, t_te, t_tm = coefficients(
+            cosine, slabs.permittivity[which], slabs.conductivity[which], slabs.thickness_m[which], frequency_hz
+        )
+        te, tm = np.where(mirror, r_te, t_te), np.where(mirror, r_tm, t_tm)
+        across = _unit_or(np.cross(before, normal), _any_across(before))
+        s, p = (field[row] * across).sum(axis=1), (field[row] * np.cross(across, before)).sum(axis=1)
+        field[row] = (te * s)[:, None] * across + (tm * p)[:, None] * np.cross(across, after)
+    taken = _theta_hat(arrival, up)
+    loss = speed_of_light / frequency_hz / (4 * np.pi) / length
+    gain: ComplexArray = (taken * field).sum(axis=1) * loss
+    return gain
+
+
+def _theta_hat(direction: FloatArray, axis: FloatArray) -> FloatArray:
+    """Unit vector of growing zenith angle from an antenna's axis."""
+    return _unit_or((direction @ axis)[:, None] * direction - axis, _any_across(direction))
+
+
+def _any_across(direction: FloatArray) -> FloatArray:
+    reference = np.where(np.abs(direction[:, :1]) >= 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    rest = reference - (direction * reference).sum(axis=1, keepdims=True) * direction
+    return np.asarray(rest / np.linalg.norm(rest, axis=1, keepdims=True))
+
+
+def _unit_or(vector: FloatArray, other: FloatArray) -> FloatArray:
+    square = (vector**2).sum(axis=1, keepdims=True)
+    return np.where(square > ALONG, vector / np.sqrt(np.where(square > ALONG, square, 1.0)), other)
