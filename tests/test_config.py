@@ -50,6 +50,9 @@ def good_values(name: str, default: Any) -> st.SearchStrategy[Any]:
     return st.floats(0.001, LARGEST.get(name, 1e6))
 
 
+SOURCES = ("points", "mesh", "paths")
+
+
 @st.composite
 def configurations(draw: st.DrawFn) -> TrainConfig:
     """Any valid configuration, most settings changed."""
@@ -63,6 +66,10 @@ def configurations(draw: st.DrawFn) -> TrainConfig:
                 values[field.name] = build(types[field.name], f"{name}.")
             else:
                 values[field.name] = draw(good_values(name, DEFAULTS[name]))
+        if prefix == "initial.":
+            # Gaussians start from one source.
+            source = draw(st.sampled_from(SOURCES))
+            values |= {other: "" for other in SOURCES if other != source}
         return kind(**values)
 
     return build(TrainConfig, "")

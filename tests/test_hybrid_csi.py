@@ -233,6 +233,31 @@ def test_without_a_scene_the_field_is_kriged() -> None:
     assert np.median(accuracy) > np.median(cea_db(direct[240:, None], dense.observation[0, 240:])) + 15
 
 
+def test_several_receivers_and_subcarriers(right: Any, wrong: Any, places: np.ndarray) -> None:
+    frequencies = FREQUENCY_HZ + np.array([-10e6, 0.0, 10e6])
+    other = replace(ACCESS_POINT, name="other", position_m=np.array([3.2, 4.1, 1.9]))
+    k = 2 * np.pi * frequencies / speed_of_light
+    observed = np.zeros((2, len(places), 3), complex)
+    for number, access_point in enumerate((ACCESS_POINT, other)):
+        paths = trace_paths(right, places, access_point, TraceOptions(max_depth=2, rays=1 << 16, upright=True)).paths
+        gain = np.exp(-1j * k * paths.length_m[:, None]) / (2 * k * paths.length_m[:, None])
+        np.add.at(observed[number], paths.tx, gain)
+    both = replace(
+        record(places, observed[0, :, 1]),
+        receivers=(ACCESS_POINT, other),
+        observation=observed.astype(np.complex64),
+        frequencies_hz=frequencies,
+    )
+    test = np.arange(140, 200)
+    model = fit_csi(both, np.arange(140), wrong, QUICK, seed=1)
+    for number in range(2):
+        estimate = model.predict(places[test], number)
+        assert estimate.mean.shape == estimate.std.shape == (60, 3)
+        assert np.median(cea_db(estimate.mean, observed[number, test])) > 40  # as with one of both
+    again = CsiHybrid.from_arrays(model.arrays(), None)
+    np.testing.assert_array_equal(again.predict(places[test], 1).mean, model.predict(places[test], 1).mean)
+
+
 def test_noise_is_not_kriged() -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(size=(200, 2)) @ np.array([[1], [1j]])

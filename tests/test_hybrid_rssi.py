@@ -181,6 +181,17 @@ def test_search_lowers_the_held_out_error() -> None:
     assert after["shadow_db"] < 12
 
 
+def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
+    record = made(240, noise_db=0.5)
+    assert record.tx_heading_rad is not None
+    ahead = Places(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
+    turn = record.tx_heading_rad[:, None]
+    np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
+    stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
+    model = fit_rssi(stated, np.arange(240), None, replace(FAST, search_rows=50, search_rounds=3, noise_db=1.0))
+    assert model.summary()["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
+
+
 def test_folds_leave_out_neighbours_in_time() -> None:
     count = 700
     measured = Measured(Places(np.zeros((count, 3)), None), np.zeros((1, count)), np.arange(count))

@@ -20,7 +20,7 @@ from traced_rooms import SHOEBOX as ROOM
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.report.compare import compare
-from wrf_mi.report.hybrid_run import evaluate_hybrid, load_hybrid, train_hybrid
+from wrf_mi.report.hybrid_run import evaluate_hybrid, load_hybrid, open_hybrid, train_hybrid
 from wrf_mi.report.metrics import inside_interval, ssim
 from wrf_mi.report.run_folder import read_run
 from wrf_mi.report.watch import Stages
@@ -424,3 +424,5 @@ def test_model_is_read_as_it_was_fitted(waves: Path, run: Path) -> None:
     assert seconds == json.loads((run / "metrics.json").read_text())["train_seconds"]
     arrays: Any = stored(run)
     np.testing.assert_allclose(model.predict(arrays["tx_pos"], 1).mean, arrays["prediction"][1], atol=ROUNDING)
+    opened = open_hybrid(run).predict(arrays["tx_pos"], 1)
+    np.testing.assert_allclose(opened.std, arrays["std"][1], atol=ROUNDING)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from traced_rooms import HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room
+from scipy.spatial.distance import cdist
+from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room, write_xml
 
-from wrf_mi.core import InputError, Paths
+from wrf_mi.core import InputError, Paths, Record
 from wrf_mi.field import WrfGsPlus
 from wrf_mi.field.initial_paths import gaussians_from_mesh, gaussians_from_paths
+from wrf_mi.fit.config import InitialConfig, TrainConfig, with_settings
+from wrf_mi.fit.start import initial_gaussians
 from wrf_mi.trace import TraceOptions, trace_paths
 
 
@@ -31,8 +35,6 @@ def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -
     assert (start.position_m < np.array([LENGTH, WIDTH, HEIGHT]) + 0.3).all()
     on_wall = np.abs(start.position_m[:, :, None] - np.array([[0, LENGTH], [0, WIDTH], [0, HEIGHT]])).min(axis=(1, 2))
     assert (on_wall < 0.1).mean() > 0.4
-    assert start.signals is not None
-    assert start.opacities is not None
     # What carries most power is a direct path, and starts as the strongest and least transparent.
     strongest = int(np.abs(start.signals).argmax())
     assert np.linalg.norm(tx - start.position_m[strongest], axis=1).min() < 1.0
@@ -40,22 +42,12 @@ def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -
     assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 
-def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndarray]) -> None:
-    paths, tx = traced
-    wall = paths.object_names.index("west")
-    own = paths.select(paths.objects[:, 0] == wall)
-    start = gaussians_from_paths(own, tx, (receiver([3.0, 2.0, 1.0]),), 1, np.random.default_rng(0))
-    assert start.image_map is not None
-    image = np.column_stack([tx, np.ones(len(tx))]) @ start.image_map[0].T
-    assert np.allclose(image, tx * [-1, 1, 1], atol=1e-4)  # float32 corners of the wall at x = 0
-
-
 def test_a_field_starts_with_them(traced: tuple[Paths, np.ndarray]) -> None:
     paths, tx = traced
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
-    weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0)) | start.static_signal()
+    weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
-    assert weights["signal"].shape == (2, 20)
+    assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
     assert np.isfinite(weights["opacity"]).all()
     assert np.ptp(weights["opacity"]) > 0
 
@@ -77,3 +69,32 @@ def test_a_mesh_is_covered_by_area(tmp_path: Path) -> None:
     assert abs(floor.mean() - share) < 4 * np.sqrt(share * (1 - share) / 2000)  # four deviations of a draw
     with pytest.raises(InputError, match="no surface"):
         gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
+
+
+def test_settings_name_surfaces_or_paths(tmp_path: Path) -> None:
+    scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
+    own = receiver([3.0, 2.0, 1.0])
+    record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))
+    rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
+
+    def start(config: InitialConfig, record: Record = record) -> np.ndarray:
+        return initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+
+    def from_a_wall(position: np.ndarray) -> np.ndarray:
+        return np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
+
+    assert from_a_wall(start(InitialConfig(40, mesh=scene))).max() < 1e-5  # float32 of some metres
+    # A mesh without materials has surfaces as well.
+    assert from_a_wall(start(InitialConfig(40, mesh=str(tmp_path / "floor.ply")))).max() < 1e-5
+    found = start(InitialConfig(200, paths=scene))
+    # Direct paths begin at transmitters: at those of the training rows, and at none of the others.
+    standing = found[from_a_wall(found) > 0.25]
+    assert len(standing) > 5
+    assert cdist(standing, tx[rows]).min(axis=1).max() < 0.5
+    assert standing[:, 0].max() < LENGTH / 2
+    with pytest.raises(InputError, match="room states no carrier frequency"):
+        start(InitialConfig(paths=scene), replace(record, frequencies_hz=None))
+    with pytest.raises(InputError, match="is a mesh without radio materials"):
+        start(InitialConfig(paths="room.ply"))
+    with pytest.raises(InputError, match="Gaussians start from one"):
+        with_settings(TrainConfig(), ["initial.mesh=a", "initial.paths=b"])

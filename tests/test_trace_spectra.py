@@ -158,13 +158,16 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
     np.testing.assert_allclose(signals, reference, atol=ANGLE_OF_ELEMENTS * np.abs(reference).max())
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_orientation_turns_a_device_as_the_quaternion_turns_the_array(seed: int):
+UP_AND_DOWN = ([0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
+"""Where angles are not unique."""
+
+
+@pytest.mark.parametrize("quaternion", [*np.random.default_rng(0).normal(size=(5, 4)), *UP_AND_DOWN])
+def test_orientation_turns_a_device_as_the_quaternion_turns_the_array(quaternion: np.ndarray):
     backend.init()
     import mitsuba as mi
     from sionna.rt.utils import rotation_matrix as sionna_rotation
 
-    quaternion = np.random.default_rng(seed).normal(size=4)
     device = sionna_rotation(mi.Point3f(sionna_orientation(quaternion))).numpy()[:, :, 0]
     array = rotation_matrix(quaternion)
     # Boresight, and the array's x and y: Sionna RT has them on its x, y and z.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .measure import fetch, make_splits
     from .report.compare import compare
     from .report.figures import spectrum_table
-    from .report.hybrid_run import train_hybrid
+    from .report.hybrid_run import open_hybrid, train_hybrid
     from .report.runs import Run, evaluate_run, resume, train
     from .report.traced import trace_run
     from .report.view import scene_view
@@ -42,6 +42,7 @@ _HOME = {
     "load": "trace:load_record",
     "make_scene": "scene.make",
     "make_splits": "measure",
+    "open_hybrid": "report.hybrid_run",
     "resume": "report.runs",
     "scene_view": "report.view",
     "spectrum_table": "report.figures",
@@ -67,6 +68,7 @@ __all__ = [
     "load",
     "make_scene",
     "make_splits",
+    "open_hybrid",
     "resume",
     "scene_view",
     "spectrum_table",

@@ -55,9 +55,11 @@ def _data_fetch(a: Arguments) -> int:
     from .measure.registry import known
     from .trace import load_record
 
-    made_here = known(a.name).base_url is None
-    where = load_record(a.name, progress=True).source if made_here else fetch(a.name)
+    dataset = known(a.name)
+    where = load_record(a.name, progress=True).source if dataset.base_url is None else fetch(a.name)
     print(f"{a.name}: {where}")
+    if dataset.note:
+        print(f"{a.name}: {dataset.note}", file=sys.stderr)
     return 0
 
 

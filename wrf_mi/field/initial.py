@@ -48,6 +48,10 @@ class InitialGaussians:
         """The parameter ``opacity``, shape [1, n], as a logit."""
         return np.full((1, self.count), np.log(self.opacity / (1 - self.opacity)), np.float32)
 
+    def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
+        """The parameter ``signal`` [2, n] of a field that keeps a static one: real and imaginary parts."""
+        return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
+
 
 def random_gaussians(
     receivers: Sequence[Receiver],

@@ -7,7 +7,7 @@ become Gaussians of that power. A mesh alone says where anything that scatters c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .initial import InitialGaussians, gaussians_from_points
-from .network import Weights
 
 LEAST_SCALE_M = 0.02
 """Smallest starting scale: a cluster of one point still has a size."""
@@ -32,24 +31,18 @@ class PathGaussians(InitialGaussians):
     Attributes:
         signals: complex, shape [n]: amplitude relative to the strongest times ``signal``, and phase of the path.
         opacities: alpha at the centre of each, shape [n].
-        image_map: affine map of the transmitter to the image that each Gaussian shows, [n, 3, 4]: image = A [x, 1].
     """
 
-    signals: NDArray[np.complex128] | None = None
-    opacities: FloatArray | None = None
-    image_map: FloatArray | None = None
+    signals: NDArray[np.complex128] = field(kw_only=True)
+    opacities: FloatArray = field(kw_only=True)
 
     def opacity_logit(self) -> NDArray[np.float32]:
         """The parameter ``opacity``, shape [1, n], as a logit."""
-        if self.opacities is None:
-            return super().opacity_logit()
         return np.log(self.opacities / (1 - self.opacities))[None].astype(np.float32)
 
-    def static_signal(self) -> Weights:
-        """The parameter ``signal`` [2, n] of a field that keeps a static one; empty where none is known."""
-        if self.signals is None:
-            return {}
-        return {"signal": np.stack([self.signals.real, self.signals.imag]).astype(np.float32)}
+    def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
+        """The parameter ``signal`` [2, n]: that of the paths; nothing is drawn."""
+        return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
 
 
 def gaussians_from_paths(
@@ -64,8 +57,7 @@ def gaussians_from_paths(
     """Gaussians on clusters of the last points of interaction of traced paths, the transmitter itself for direct ones.
 
     Points are clustered by direction and distance as their receiver sees them, weighted by power; a cluster's mean is
-    the centre, its spread the scale, its mean power the signal and (as a share of the strongest) the opacity. The
-    affine map from transmitter to image is that of the cluster's strongest chain of surfaces, by least squares.
+    the centre, its spread the scale, its mean power the signal and (as a share of the strongest) the opacity.
 
     Args:
         paths: of the training transmitters.
@@ -100,7 +92,6 @@ def gaussians_from_paths(
     chosen = np.concatenate([used, rng.choice(used, count - len(used))]) if len(used) < count else used
     position, scale = np.empty((count, 3)), np.empty(count)
     strength, phase = np.empty(count), np.empty(count)
-    affine = np.empty((count, 3, 4))
     for index, cluster in enumerate(chosen):
         own = np.flatnonzero(label == cluster)
         share = power[own] / power[own].sum() if power[own].sum() > 0 else np.full(len(own), 1 / len(own))
@@ -110,13 +101,14 @@ def gaussians_from_paths(
         # Power that arrives by the cluster from a transmitter, on average over all of them.
         strength[index] = power[own].sum() / paths.n_tx
         phase[index] = np.angle(paths.gain[own[np.argmax(power[own])]])
-        affine[index] = _image_map(paths, tx_pos_m, receivers, own)
     repeated = np.bincount(chosen, minlength=len(centres))[chosen]
     relative = np.maximum(strength / repeated / strength.max(), LEAST_SHARE)
     amplitude = signal * np.sqrt(relative)
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
-    return PathGaussians(position + jitter, scale, opacity, signal, amplitude * np.exp(1j * phase), opacities, affine)
+    return PathGaussians(
+        position + jitter, scale, opacity, signal, signals=amplitude * np.exp(1j * phase), opacities=opacities
+    )
 
 
 def gaussians_from_mesh(
@@ -152,17 +144,3 @@ def _nearest(features: FloatArray, centres: FloatArray) -> IntArray:
 
     label: IntArray = cKDTree(centres).query(features)[1].astype(np.int64)
     return label
-
-
-def _image_map(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], own: IntArray) -> FloatArray:
-    """Affine map [3, 4] from transmitter to image of the strongest chain among some paths."""
-    strongest = own[np.argmax(np.abs(paths.gain[own]))]
-    same = own[(paths.objects[own] == paths.objects[strongest]).all(axis=1) & (paths.rx[own] == paths.rx[strongest])]
-    rx = receivers[int(paths.rx[strongest])].position_m
-    image = rx + paths.arrival[same] * paths.length_m[same, None]
-    x = tx_pos_m[paths.tx[same]]
-    mean_x, mean_i = x.mean(axis=0), image.mean(axis=0)
-    # With few transmitters the map is a mirror's: orthogonal, as every chain of reflections is (Kabsch 1976).
-    u, s, vt = np.linalg.svd((image - mean_i).T @ (x - mean_x))
-    linear = np.eye(3) if len(same) < 4 or s[-1] < 1e-6 else u @ vt
-    return np.column_stack([linear, mean_i - linear @ mean_x])

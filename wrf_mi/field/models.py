@@ -131,7 +131,7 @@ class WrfGsPlus:
         """Parameters as NumPy arrays: static attributes from ``initial``, network drawn from ``rng``."""
         sizes, weights = self.encoding.sizes, initial.geometry()
         weights["opacity"] = initial.opacity_logit()
-        weights["signal"] = (rng.standard_normal((2, initial.count)) * initial.signal).astype(np.float32)
+        weights["signal"] = initial.static_signal(rng)
         for i in range(self.layers):
             inputs = ({"hidden": self.width} if i else {}) | (sizes if i in (0, self.skip) else {})
             weights |= init_layer(f"deform.{i}", inputs, self.width, rng)

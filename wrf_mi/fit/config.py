@@ -20,7 +20,10 @@ class InitialConfig:
 
     Attributes:
         gaussians: how many.
-        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres; empty: random.
+        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres: on its points.
+        mesh: scene that `wrf_mi.trace.open_scene` opens: on its surfaces.
+        paths: such a scene: where traced paths of the training transmitters come from. Of the three one at most;
+            with none of them Gaussians start at random.
         size_deg: standard deviation of a random Gaussian as its receiver sees it, degrees.
         nearest_m: smallest distance of a random Gaussian from its receiver, metres.
         farthest_m: largest distance, metres.
@@ -30,6 +33,8 @@ class InitialConfig:
 
     gaussians: int = 270
     points: str = ""
+    mesh: str = ""
+    paths: str = ""
     size_deg: float = 7.0
     nearest_m: float = 1.0
     farthest_m: float = 8.0
@@ -143,6 +148,9 @@ class TrainConfig:
             good, words = _RANGES.get(name, _NOT_NEGATIVE)
             if not math.isfinite(value) or not good(value):
                 raise InputError(f"setting {name}: {value} is out of range, choose {words}")
+        sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
+        if len(sources) > 1:
+            raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")
         nearest, farthest = values["initial.nearest_m"], values["initial.farthest_m"]
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")

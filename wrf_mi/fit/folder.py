@@ -182,12 +182,12 @@ def load_rows(folder: Path, record: Record) -> Split:
 def resume_run(folder: Path, record: Record) -> Trainer:
     """A run as its last checkpoint left it; from the start if it was stopped before the first."""
     run, split = read_config(folder), load_rows(folder, record)
-    trainer = Trainer(record, split, run.settings)
     if (folder / CHECKPOINT).exists():
         arrays = read_checkpoint(folder)
-        trainer.state = FitState.from_arrays(arrays)
-        trainer.record_functions()
+        trainer = Trainer(record, split, run.settings, state=FitState.from_arrays(arrays))
         trainer.seconds = float(arrays["seconds"])
+    else:
+        trainer = Trainer(record, split, run.settings)
     cut_log(folder, trainer.state.step)
     return trainer
 

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
-from ..field import FIELDS, Encoding, InitialGaussians, gaussians_from_points, random_gaussians
+from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
 from ..field.device import to_float, to_tensor
 from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
-from ..scene.points import read_points
 from ..splat.tiles import perception_plane
 from .config import TrainConfig
 from .predictor import Predictor
 from .schedule import plan
+from .start import initial_gaussians
 from .state import FitState
 from .step import Field, Loss, TrainingData, device_pose, make_step, watched
 
@@ -76,15 +76,6 @@ def _paper_loss(prediction: Any, truth: Any, batch: int, height: int, width: int
     return spectrum_loss(prediction, truth, batch, height, width, eta)[0]
 
 
-def _initial(config: TrainConfig, record: Record, rng: np.random.Generator) -> InitialGaussians:
-    i = config.initial
-    if i.points:
-        start = gaussians_from_points(read_points(i.points), i.gaussians, rng)
-        return InitialGaussians(start.position_m, start.scale_m, i.opacity, i.signal)
-    distance = (i.nearest_m, i.farthest_m)
-    return random_gaussians(record.receivers, i.gaussians, rng, distance, i.size_deg, i.opacity, i.signal)
-
-
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -112,6 +103,7 @@ class Trainer:
         config: settings.
         field: a model of your own in place of the one that ``config.model`` names.
         initial: starting values in place of those that ``config.initial`` describes.
+        state: of a fit that was stopped, to go on from.
         loss: in place of the paper's: ``loss(prediction, truth, batch, height, width)`` of flat Dr.Jit arrays.
 
     Raises:
@@ -126,6 +118,7 @@ class Trainer:
         *,
         field: Field | None = None,
         initial: InitialGaussians | None = None,
+        state: FitState | None = None,
         loss: Loss | None = None,
     ) -> None:
         if record.task != "spectrum":
@@ -140,8 +133,11 @@ class Trainer:
         if config.deterministic:
             # Parallel sums add in the order in which threads finish.
             dr.set_thread_count(1)
-        rng = np.random.default_rng([config.seed, 0])
-        self.state = FitState(self.field.init(initial or _initial(config, record, rng), rng))
+        if state is None:
+            rng = np.random.default_rng([config.seed, 0])
+            start = initial or initial_gaussians(config.initial, record, split.train, rng)
+            state = FitState(self.field.init(start, rng))
+        self.state = state
         self._poses = [device_pose(r) for r in record.receivers]
         self._plane = perception_plane(self.height, self.width, mi.Float)
         self._data = TrainingData(

@@ -122,6 +122,13 @@ KNOWN = (
         licence="MIT",
         origin="traced on this machine by Sionna RT in the scene of the same name (wrf_mi.trace.load_record)",
     ),
+    DataSet(
+        name="traced-room",
+        task="spectrum",
+        licence="MIT",
+        origin="traced on this machine by Sionna RT in the laboratory with furniture (wrf_mi.trace.load_record)",
+        note="room/ in it is the scene that a model may be given: bare walls, some centimetres off, of one material.",
+    ),
 )
 
 
@@ -199,7 +206,7 @@ def load(name_or_folder: str | Path) -> Record:
     if folder is None:
         how = f"run `wrf-mi data fetch {dataset.name}`, or set {DATA_VARIABLE} to a folder that holds {dataset.name}/"
         if dataset.manifest is None:
-            how = f"wrf_mi.trace.load_record({dataset.name!r}) traces it in under a minute"
+            how = f"wrf_mi.trace.load_record({dataset.name!r}) traces it"
         raise InputError(f"data set {dataset.name}: not on this machine; {how}")
     return _complete(dataset, _read(folder / (dataset.file or ""), dataset.name))
 

@@ -90,9 +90,12 @@ CHECKS: Mapping[str, Check] = {
     "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan"),
     "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat"),
     "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab"),
+    "hybrid-flat": Check("hybrid, flat-ble", "bench_hybrid_rssi:all_rows"),
     "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows"),
     "hybrid-conference": Check("hybrid, newrf", "bench_hybrid_csi:conference"),
     "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office"),
+    "hybrid-room": Check("hybrid, traced room", "bench_hybrid_room:main"),
+    "hybrid-starts": Check("WRF-GS+, traced room", "bench_starts:main"),
 }
 
 

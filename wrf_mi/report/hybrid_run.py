@@ -194,6 +194,20 @@ def evaluate_hybrid(folder: Path, split: str | None = None) -> dict[str, Any]:
     return _header(folder, config, seconds, model) | metrics | {"split": name}
 
 
+def open_hybrid(folder: str | Path) -> HybridModel:
+    """The fitted model of a run: ``open_hybrid(run).predict(tx_pos_m, receiver)`` gives mean and standard deviation.
+
+    Raises:
+        InputError: not a finished run, or one over several splits; a data set or scene that is not there any more.
+    """
+    path = Path(folder)
+    config = read_hybrid_config(path)
+    if not (path / SPLIT).exists():
+        raise InputError(f"{path}: one model for each block; choose one, e.g. {path / 'fold0'}")
+    record = load_record(config.dataset)
+    return load_hybrid(path, kind_of(record, config.scene is not None), _open(config, record))[0]
+
+
 def predict_hybrid(
     folder: Path, tx_pos_m: FloatArray, tx_heading_rad: FloatArray | None = None
 ) -> tuple[NDArray[Any], FloatArray, tuple[str, ...]]:
@@ -210,11 +224,7 @@ def predict_hybrid(
     Raises:
         InputError: not a finished run, or one over several splits.
     """
-    config = read_hybrid_config(folder)
-    if not (folder / SPLIT).exists():
-        raise InputError(f"{folder}: one model for each block; choose one, e.g. {folder / 'fold0'}")
-    record = load_record(config.dataset)
-    model, _ = load_hybrid(folder, kind_of(record, config.scene is not None), _open(config, record))
+    model = open_hybrid(folder)
     found = [model.predict(tx_pos_m, r, tx_heading_rad) for r in range(len(model.receivers))]
     names = tuple(receiver.name for receiver in model.receivers)
     return np.stack([e.mean for e in found]), np.stack([e.std for e in found]), names

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from ..core import Record
 from ..measure import load
+from .furnished import NAME as ROOM
+from .furnished import traced_room
 from .laboratory import NAME as LABORATORY
 from .laboratory import laboratory_record
 from .materials import set_frequency
@@ -27,11 +29,14 @@ __all__ = [
     "set_frequency",
     "trace_paths",
     "trace_spectra",
+    "traced_room",
 ]
 
 
 def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
-    """Read any data set as `wrf_mi.measure.load` does, and trace the embedded ``laboratory`` where it is asked for.
+    """Read any data set as `wrf_mi.measure.load` does, and trace what is made on this machine where it is asked for.
+
+    These are the embedded ``laboratory`` (some seconds) and ``traced-room`` (some minutes).
 
     Args:
         name_or_folder: a folder, or a known data set's name.
@@ -40,6 +45,9 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     Raises:
         InputError: as `wrf_mi.measure.load`.
     """
-    if name_or_folder == LABORATORY and not Path(name_or_folder).is_dir():
-        return laboratory_record(progress=progress)
+    if not Path(name_or_folder).is_dir():
+        if name_or_folder == LABORATORY:
+            return laboratory_record(progress=progress)
+        if name_or_folder == ROOM:
+            return traced_room(progress=progress)[0]
     return load(name_or_folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -36,7 +37,10 @@ def sionna_orientation(orientation_xyzw: ArrayLike) -> tuple[float, float, float
         orientation_xyzw: unit quaternion, array's frame to world.
     """
     device_to_world = rotation_matrix(orientation_xyzw) @ _DEVICE_TO_ARRAY
-    alpha, beta, gamma = Rotation.from_matrix(device_to_world).as_euler("ZYX")
+    with warnings.catch_warnings():
+        # Of an array that looks straight up or down many angles are right, and any of them will do.
+        warnings.filterwarnings("ignore", "Gimbal lock")
+        alpha, beta, gamma = Rotation.from_matrix(device_to_world).as_euler("ZYX")
     return float(alpha), float(beta), float(gamma)
 
 
