@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -310,3 +311,14 @@ def test_expected_spectrum_is_the_mean_of_many() -> None:
     assert np.sqrt(np.square(grey - drawn.mean(axis=0)).mean()) < 0.02
     # That the scale is a draw's own is not in the deviation stated.
     assert deviation.mean() == pytest.approx(drawn.std(axis=0).mean(), rel=0.1)
+
+
+def test_report_of_another_process_is_its_own() -> None:
+    h = signals(positions(2), TOWARDS)
+    first = certain(h, 0.1)
+    turned = np.linalg.qr(np.random.default_rng(1).normal(size=first.basis.shape))[0].astype(complex)
+    second = replace(first, basis=turned, variance=first.variance * np.arange(1, 10))
+    used = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)
+    for posterior in (first, second, first):
+        fresh = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
+        np.testing.assert_array_equal(used(posterior), fresh)
