@@ -19,7 +19,8 @@ from wrf_mi.hybrid.spectrum_fit import Constants, fit_constants, fit_maps, map_p
 from wrf_mi.hybrid.spectrum_loss import Grid
 from wrf_mi.hybrid.spectrum_model import Chaining, Fit, Spectrometer, SpectrumModel, begin
 from wrf_mi.hybrid.spectrum_rest import NOISE, Rest
-from wrf_mi.hybrid.spectrum_sheets import Known, Search
+from wrf_mi.hybrid.spectrum_search import Search
+from wrf_mi.hybrid.spectrum_sheets import Known
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6

@@ -1,7 +1,7 @@
 """The hybrid for spatial spectra: a traced room of which the rest is learned.
 
 Element signals are a coherent sum of specular paths: those of the given mesh, with displaced planes and fitted
-materials (`wrf_mi.hybrid.spectrum_fit`); those of surfaces that the mesh lacks (`wrf_mi.hybrid.spectrum_sheets`), which
+materials (`wrf_mi.hybrid.spectrum_fit`); those of surfaces that the mesh lacks (`wrf_mi.hybrid.spectrum_search`), which
 also hide what is behind them; each times a learned complex amplitude that varies slowly with the transmitter's image.
 All phases come from path lengths, so what is learned holds between and beyond the training rows. What is left of
 spectra near a transmitter is added as kriging would (`wrf_mi.hybrid.spectrum_rest`). Every step has to

@@ -21,7 +21,8 @@ from .spectrum_gains import Slabs
 from .spectrum_loss import Grid
 from .spectrum_rays import ChainTable, Met, Things, find_chains, opened
 from .spectrum_rest import LENGTHS, Rest
-from .spectrum_sheets import KINDS, Frame, Known, Search, Sheet, frames_of
+from .spectrum_search import Search
+from .spectrum_sheets import KINDS, Frame, Known, Sheet, frames_of
 
 ComplexArray = NDArray[np.complex128]
 Arrays = dict[str, NDArray[Any]]
