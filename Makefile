@@ -3,13 +3,14 @@
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo lint test test-slow bench clean
+.PHONY: help setup demo lint test test-slow bench bench-quick clean
 
 help:
 	@echo "make demo       train on real spectra, or on a traced room where there are none"
 	@echo "make test       lint, types, import order, tests, notebooks"
 	@echo "make test-slow  the tests that take minutes"
-	@echo "make bench      run time against error"
+	@echo "make bench      every stored figure, run time against error among them; hours"
+	@echo "make bench-quick  ratios of run times against the stored ones; a minute"
 	@echo "make setup      only the set-up that the others begin with"
 	@echo "make clean      remove .venv, caches and packages; runs stay"
 
@@ -37,6 +38,9 @@ test-slow: $(READY)
 
 bench: $(READY)
 	$(BIN)/wrf-mi bench
+
+bench-quick: $(READY)
+	$(BIN)/wrf-mi bench --quick
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -12,9 +12,20 @@ from wrf_mi.core import InputError
 from wrf_mi.report import bench_plan
 from wrf_mi.report.bench import CASES, CHECKS, bench, check_table, read_results, table
 from wrf_mi.report.check import main
+from wrf_mi.report.pareto import full_table
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 RESULTS = CHECKOUT / "benchmarks" / "results"
+NEEDS_NO_DATA = ("traced-and-splatted", "hybrid-room", "hybrid-starts", "pareto", "scaling", "operator", "stress")
+"""Checks on what is made here; the traced room takes minutes."""
+ON_PAGE = {
+    "pareto": "speed.md",
+    "scaling": "speed.md",
+    "operator": "speed.md",
+    "budgets": "speed.md",
+    "stress": "numerics.md",
+}
+"""Pages that show a check's table; those of hybrids have their own, and all others are in the README."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -57,8 +68,8 @@ def test_checks_say_what_data_they_lack(
     """The function is there; without data it is one line, exit status 2 and no file."""
     module, _, function = CHECKS[name].function.partition(":")
     assert callable(getattr(importlib.import_module(f"wrf_mi.report.{module}"), function))
-    if name == "traced-and-splatted":
-        return  # needs no data
+    if name in NEEDS_NO_DATA:
+        return
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert main(CHECKS[name].function, str(tmp_path / "out.json")) == 2
@@ -79,9 +90,15 @@ def test_readme_shows_the_stored_results() -> None:
     readme = (CHECKOUT / "README.md").read_text()
     trained, checked = read_results(RESULTS)
     hybrids = [one for one in checked if one["case"].startswith("hybrid-")]
-    others = [one for one in checked if one not in hybrids]
+    others = [one for one in checked if one not in hybrids and one["case"] not in ON_PAGE]
     page = (CHECKOUT / "docs" / "hybrid_models.md").read_text()
     assert f"<!-- hybrids -->\n{check_table(hybrids)}\n<!-- /hybrids -->" in page
+    for one in checked:
+        name = one["case"]
+        if name in ON_PAGE:
+            shown = full_table(one["figures"]["points"]) if name == "pareto" else check_table([one])
+            page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
+            assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
         assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
 

@@ -49,7 +49,8 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
 
 
 def test_the_subcommands() -> None:
-    expected = {"doctor", "data", "mesh", "train", "trace", "evaluate", "predict", "compare", "bench", "demo"}
+    expected = {"doctor", "data", "mesh", "train", "trace", "sweep", "evaluate", "predict", "compress", "compare"}
+    expected |= {"bench", "demo"}
     assert {name[0] for name in commands(_parser()) if name} == expected
 
 

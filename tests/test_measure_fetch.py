@@ -25,7 +25,7 @@ needs_data = pytest.mark.skipif(
     not DATA or not Path(DATA, "rfid-lab").is_dir(), reason="WRF_MI_DATA names no folder with rfid-lab/"
 )
 ROWS = 6
-NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory")
+NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room")
 PICKLES = Path(__file__).parent / "data"
 DATASET = DataSet("small", "spectrum", "MIT", "made up", base_url="http://unused")
 

@@ -106,7 +106,7 @@ def test_commands_parse(path: Path) -> None:
 
 def test_readme_shows_every_step_of_the_way() -> None:
     shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
-    assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace"}
+    assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace", "sweep"}
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__
-from .cli_train import print_json, progress_bar, show_metrics, trace_command, train_command
+from .cli_train import print_json, progress_bar, show_metrics, sweep_command, trace_command, train_command
 from .core import BackendError, InputError
 
 Arguments = argparse.Namespace
@@ -56,9 +57,10 @@ def _data_fetch(a: Arguments) -> int:
     from .trace import load_record
 
     dataset = known(a.name)
-    where = load_record(a.name, progress=True).source if dataset.base_url is None else fetch(a.name)
+    made_here = dataset.base_url is None
+    where = load_record(a.name, progress=True).source if made_here else fetch(a.name)
     print(f"{a.name}: {where}")
-    if dataset.note:
+    if made_here and dataset.note:
         print(f"{a.name}: {dataset.note}", file=sys.stderr)
     return 0
 
@@ -93,19 +95,36 @@ def _mesh(a: Arguments) -> int:
 def _evaluate(a: Arguments) -> int:
     from .report.runs import evaluate_run
 
-    return show_metrics(evaluate_run(a.run, a.split), None if a.split else Path(a.run), a.json)
+    return show_metrics(evaluate_run(a.run, a.split, not a.no_operator), None if a.split else Path(a.run), a.json)
 
 
 def _predict(a: Arguments) -> int:
+    from .parallel import open_scheduler
     from .report.runs import predict_to_file
     from .report.tx_file import read_transmitters
 
     positions, heading = read_transmitters(a.tx, a.input)
-    shapes = predict_to_file(a.run, positions, a.out, heading)
+    with open_scheduler(a.scheduler) as scheduler:
+        given = scheduler if a.scheduler else None
+        shapes = predict_to_file(a.run, positions, a.out, heading, given, not a.no_operator)
     if a.json:
         print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
         print(f"{shapes['tx_pos'][0]} predictions: {a.out}")
+    return 0
+
+
+def _compress(a: Arguments) -> int:
+    from .fit.compress import Compression
+    from .report.compressed import compress_run, render
+
+    how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
+    with progress_bar() as watch:
+        found = compress_run(a.run, a.out, how, listen=watch.listen)
+    if a.json:
+        print_json(found)
+    else:
+        print(render(found), f"results: {a.out}", sep="\n")
     return 0
 
 
@@ -118,9 +137,25 @@ def _compare(a: Arguments) -> int:
 
 
 def _bench(a: Arguments) -> int:
+    from .parallel import open_scheduler
     from .report.bench import CASES, CHECKS, bench
 
-    rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs))
+    if a.store and not a.quick:
+        raise InputError("--store: belongs to --quick; cases are stored in any case")
+    if a.quick and a.scheduler:
+        raise InputError("--quick: its pairs are interleaved in one process; leave --scheduler away")
+    if a.quick:
+        if a.names:
+            raise InputError(f"--quick: measures its own pairs; leave {a.names[0]} away")
+        from .report.bench_quick import quick
+
+        result = quick(Path(a.out), a.store)
+        if a.json:
+            print_json(result)
+        return 0
+    with open_scheduler(a.scheduler) as scheduler:
+        given = scheduler if a.scheduler else None
+        rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs), given)
     if a.json:
         print_json(rows)
     return 0
@@ -182,21 +217,8 @@ def _parser() -> argparse.ArgumentParser:
     sub = command(
         "train", train_command, "fit a field to measured spectra, or a hybrid to any measurements, and score it"
     )
-    sub.add_argument(
-        "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
-    )
-    sub.add_argument("--model", choices=("wrf-gs", "wrf-gs+", "hybrid", "ray-tracing"), help="default: wrf-gs+")
-    sub.add_argument("--scene", metavar="SCENE", help="for hybrid, or for ray-tracing, which is then the command trace")
-    _add_tracing(sub)
+    _add_training(sub)
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
-    sub.add_argument(
-        "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"
-    )
-    sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
-    sub.add_argument("--seed", type=int, metavar="N", help="default: 0")
-    sub.add_argument("--deterministic", action="store_true", help="bit-identical results, on one thread")
-    sub.add_argument("--preset", choices=("default", "paper", "quick"), help="a named set of settings")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
     sub.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     sub.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped")
 
@@ -205,13 +227,25 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
     sub.add_argument("--out", metavar="RUN", required=True, help="run folder to make")
     _add_tracing(sub)
+    target = "choose depth, rays, diffraction and scattering until received power is converged to so many dB"
+    sub.add_argument("--target-error", type=float, metavar="DB", help=target)
     sub.add_argument("--split", help="as for train; official by default")
     sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
     sub.add_argument("--seed", type=int, metavar="N", help="of split and rays; default: 0")
+    _add_scheduler(sub)
+
+    run_sweep = partial(sweep_command, parse=parser.parse_args)
+    sub = command("sweep", run_sweep, "train with every combination of settings, and put the scores in a table")
+    _add_training(sub)
+    vary = "setting or option of train and its values; repeatable, all combinations are run; e.g. seed=0,1,2"
+    sub.add_argument("--vary", action="append", default=[], metavar="KEY=A,B,...", help=vary)
+    sub.add_argument("--out", metavar="DIR", required=True, help="folder of all runs and their table")
+    _add_scheduler(sub)
 
     sub = command("evaluate", _evaluate, "score a run on its held-out rows")
     sub.add_argument("run", metavar="RUN")
     sub.add_argument("--split", help="score on another split's test rows that the run has not seen; writes nothing")
+    _add_operator(sub)
 
     sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
@@ -219,6 +253,21 @@ def _parser() -> argparse.ArgumentParser:
     given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
     given.add_argument("--input", metavar="FILE.npz", help="array tx_pos [m, 3] in metres (and heading_rad [m])")
     sub.add_argument("--out", required=True, metavar="FILE.npz")
+    _add_operator(sub)
+    _add_scheduler(sub)
+
+    sub = command("compress", _compress, "a smaller and faster run of a run, with what that costs")
+    sub.add_argument("run", metavar="RUN")
+    sub.add_argument("--out", required=True, metavar="RUN2", help="run folder to make")
+    sub.add_argument("--budget", type=int, default=0, metavar="N", help="Gaussians to keep (default: all)")
+    sub.add_argument("--width", type=int, default=0, metavar="N", help="neurons a layer of a smaller network")
+    sub.add_argument("--layers", type=int, default=0, metavar="N", help="hidden layers of a smaller network")
+    sub.add_argument("--terms", type=int, default=0, metavar="K", help="make it a factorised field of K terms")
+    sub.add_argument(
+        "--distil", type=int, default=6000, metavar="STEPS", help="a smaller network learns the old one's (6000)"
+    )
+    sub.add_argument("--fine-tune", type=int, default=0, metavar="STEPS", help="then on the training rows (0)")
+    sub.add_argument("--precision", default="half", help="of stored numbers: single, half (default) or 8bit")
 
     sub = command("compare", _compare, "table, SSIM distribution and pictures of several runs", json_output=False)
     sub.add_argument("runs", nargs="+", metavar="RUN")
@@ -228,10 +277,34 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("names", nargs="*", metavar="NAME", help="cases to measure (default: all)")
     sub.add_argument("--out", default="benchmarks/results", metavar="DIR", help="where results are written")
     sub.add_argument("--runs", default="runs/bench", metavar="DIR", help="where run folders are kept")
+    _add_scheduler(sub)
+    text = "ratios of interleaved pairs in about a minute; fails if one is clearly above twice the stored one"
+    sub.add_argument("--quick", action="store_true", help=text)
+    sub.add_argument("--store", action="store_true", help="with --quick: store the ratios instead")
 
     sub = command("demo", _demo, "the main job on real spectra, or on a traced room where there are none")
     sub.add_argument("--out", metavar="RUN", help="run folder (default: a new one in runs/)")
     return parser
+
+
+def _add_training(sub: Any) -> None:
+    """What is fitted, to what."""
+    sub.add_argument(
+        "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
+    )
+    sub.add_argument(
+        "--model", choices=("wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing"), help="default: wrf-gs+"
+    )
+    sub.add_argument("--scene", metavar="SCENE", help="for hybrid, or for ray-tracing, which is then the command trace")
+    _add_tracing(sub)
+    sub.add_argument(
+        "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"
+    )
+    sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
+    sub.add_argument("--seed", type=int, metavar="N", help="default: 0")
+    sub.add_argument("--deterministic", action="store_true", help="bit-identical results, on one thread")
+    sub.add_argument("--preset", choices=("default", "paper", "quick"), help="a named set of settings")
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
 
 
 def _add_tracing(sub: Any) -> None:
@@ -244,6 +317,18 @@ def _add_tracing(sub: Any) -> None:
     fit = "fit antenna patterns, or materials too, to the training rows (signal strengths)"
     sub.add_argument("--calibrate", choices=("patterns", "all"), help=fit)
     sub.add_argument("--rays", metavar="N", help="that search from each source, or auto: until no more paths are found")
+
+
+def _add_scheduler(sub: Any) -> None:
+    """Where parts are computed."""
+    text = "compute on several workers: local, local:N (on this machine) or a Dask scheduler's tcp://HOST:PORT"
+    sub.add_argument("--scheduler", metavar="WHERE", help=text)
+
+
+def _add_operator(sub: Any) -> None:
+    """How a learned field is evaluated."""
+    text = "splat each spectrum, where the field's geometry would allow one linear map for all (see docs/speed.md)"
+    sub.add_argument("--no-operator", action="store_true", help=text)
 
 
 def _number(text: str) -> int | float:

@@ -1,10 +1,13 @@
-"""What ``wrf-mi train`` and ``wrf-mi trace`` do, and how the command shows figures."""
+"""What ``wrf-mi train``, ``trace`` and ``sweep`` do, and how the command shows figures."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +21,34 @@ def train_command(a: Arguments) -> int:
     if a.help_settings:
         print(_settings_text())
         return 0
-    traced = (a.paths, a.depth, a.reflections, a.rays, a.calibrate)
     if a.resume:
-        given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset, a.scene, a.material, *traced)
+        given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset, a.scene, a.material, *_traced(a))
         if any(value is not None for value in given) or a.set or a.deterministic:
             raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
         return _resume(a)
+    _check_options(a)
+    if a.model == "ray-tracing":
+        return trace_command(a)
+    return _train_hybrid(a) if a.model == "hybrid" else _train_field(a)
+
+
+def _traced(a: Arguments) -> tuple[Any, ...]:
+    return a.paths, a.depth, a.reflections, a.rays, a.calibrate
+
+
+def _check_options(a: Arguments) -> None:
+    """Refuse options of ``train`` that do not belong together."""
     if a.model == "ray-tracing":
         if not (a.scene and a.dataset and a.out) or a.set or a.preset or a.deterministic:
             raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
-        return trace_command(a)
+        return
     if a.model == "hybrid":
-        if any(value is not None for value in (*traced, a.preset)) or a.deterministic:
+        if any(value is not None for value in (*_traced(a), a.preset)) or a.deterministic:
             raise InputError("train --model hybrid takes --scene, --material, --split, --n-train, --seed and --set")
-    elif any(value is not None for value in (a.scene, a.material, *traced)):
+    elif any(value is not None for value in (a.scene, a.material, *_traced(a))):
         raise InputError("--scene and what is traced in it belong to --model ray-tracing (--scene also to hybrid)")
     if not a.dataset or not a.out:
         raise InputError("train needs DATASET and --out RUN (or --resume RUN)")
-    return _train_hybrid(a) if a.model == "hybrid" else _train_field(a)
 
 
 def _resume(a: Arguments) -> int:
@@ -54,15 +67,19 @@ def _resume(a: Arguments) -> int:
 
 
 def _train_field(a: Arguments) -> int:
-    from .fit.config import PRESETS, TrainConfig, with_settings
     from .report.runs import train
 
     with progress_bar() as watch:
-        config = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
-        own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
-        config = with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
-        run = train(a.dataset, a.out, config, _split(a), a.n_train, watch.listen, watch.stop)
+        run = train(a.dataset, a.out, _field_config(a), _split(a), a.n_train, watch.listen, watch.stop)
     return show_metrics(run.metrics, Path(a.out), a.json)
+
+
+def _field_config(a: Arguments) -> Any:
+    from .fit.config import PRESETS, TrainConfig, with_settings
+
+    config: Any = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
+    own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
+    return with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
 
 
 def _train_hybrid(a: Arguments) -> int:
@@ -92,7 +109,7 @@ def _settings_text() -> str:
     from .fit.config import describe
     from .hybrid.models import settings_of_hybrids
 
-    parts = ["wrf-gs, wrf-gs+:", describe()]
+    parts = ["wrf-gs, wrf-gs+, factorised:", describe()]
     for name, settings in settings_of_hybrids().items():
         parts += [f"\nhybrid, {name}:", describe(settings)]
     return "\n".join(parts)
@@ -100,23 +117,59 @@ def _settings_text() -> str:
 
 def trace_command(a: Arguments) -> int:
     """``trace``: what ray tracing alone predicts."""
+    from .parallel import open_scheduler
     from .report.traced import trace_run
+    from .trace.target import CHOSEN_KINDS
+
+    options = _trace_options(a)
+    target = getattr(a, "target_error", None)  # train has none
+    for name, given in (("--depth", a.depth), ("--rays", a.rays)):
+        if target is not None and given is not None:
+            raise InputError(f"trace: --target-error chooses what {name} states; give one of them")
+    kinds = CHOSEN_KINDS if a.paths is None else [kind for kind in CHOSEN_KINDS if getattr(options, kind)]
+    if target is not None:
+        # What --paths names may be switched on; it is where it counts.
+        options = replace(options, **dict.fromkeys(CHOSEN_KINDS, False))
+    asked = {"material": a.material, "split": _split(a), "n_train": a.n_train, "seed": a.seed or 0}
+    call = partial(trace_run, a.scene, a.dataset, a.out, options, **asked, calibration=a.calibrate)
+    call = partial(call, target_error_db=target, kinds=kinds)
+    where = getattr(a, "scheduler", None)  # train has none
+    with open_scheduler(where) as scheduler:
+        folder = call(progress=sys.stderr.isatty(), scheduler=scheduler if where else None)
+    return _show_stored(folder, a.json)
+
+
+def _trace_options(a: Arguments) -> Any:
     from .trace.options import DEFAULTS, with_kinds
 
-    options = with_kinds(DEFAULTS, a.paths, max_depth=a.depth, max_reflections=a.reflections, rays=a.rays, seed=a.seed)
-    folder = trace_run(
-        a.scene,
-        a.dataset,
-        a.out,
-        options,
-        material=a.material,
-        split=_split(a),
-        n_train=a.n_train,
-        seed=a.seed or 0,
-        calibration=a.calibrate,
-        progress=sys.stderr.isatty(),
-    )
-    return _show_stored(folder, a.json)
+    numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": a.seed}
+    return with_kinds(DEFAULTS, a.paths, **numbers)
+
+
+def sweep_command(a: Arguments, parse: Callable[[list[str]], Arguments]) -> int:
+    """``sweep``: a run of ``train`` for each combination; ``parse`` reads the arguments of a call of the command."""
+    from .parallel import open_scheduler
+    from .report.sweep import OPTIONS, check_failures, check_fit, plan_sweep, run_sweep, sweep_table
+
+    given = {key: getattr(a, key.replace("-", "_")) for key in OPTIONS}
+    options = {key: str(value) for key, value in given.items() if value is not None}
+    sweep = plan_sweep(a.out, a.vary, options, a.set, ["--deterministic"] if a.deterministic else [])
+    for run in sweep.runs:
+        one = parse([*run.arguments, "--out", str(run.folder)])
+        _check_options(one)
+        traced, field = one.model == "ray-tracing", one.model not in ("ray-tracing", "hybrid")
+        settings: Any = _field_config(one) if field else _trace_options(one) if traced else tuple(one.set)
+        drawn = settings.seed if field else one.seed or 0
+        check_fit(one.dataset, settings, one.scene, one.material, (_split(one), drawn, one.n_train), one.calibrate)
+    with open_scheduler(a.scheduler) as scheduler:
+        rows = run_sweep(sweep, scheduler)
+    if a.json:
+        print_json(rows)
+    else:
+        print(sweep_table(rows, sweep.varied))
+        print(f"results: {a.out}")
+    check_failures(rows)
+    return 0
 
 
 def _show_stored(folder: Path, as_json: bool) -> int:

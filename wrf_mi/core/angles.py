@@ -61,6 +61,17 @@ def sphere_directions(height: int, width: int) -> FloatArray:
     return unit_vectors(azimuth_rad(width)[None, :], sphere_elevation_rad(height)[:, None])
 
 
+def solid_angles(height: int, width: int) -> FloatArray:
+    """Weight of each pixel in an integral over the upper hemisphere, [height * width], steradian.
+
+    cos(elevation) times the pixel's angles, by the trapezoidal rule: the horizon counts half, and half again in the
+    lower hemisphere.
+    """
+    rows = np.cos(elevation_rad(height)) * (np.pi / 2 / height) * (2 * np.pi / width)
+    rows[0] /= 2
+    return np.repeat(rows, width)
+
+
 def azimuth_elevation(vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Azimuth in [0, 2 pi) and elevation in [-pi/2, pi/2], in radians, of vectors [..., 3]."""
     v = np.asarray(vectors, float)

@@ -5,16 +5,18 @@ from ..backend import init
 # Dr.Jit loads an LLVM of its own choice when it is imported: ours must be chosen before.
 init()
 
+from .factorised import Factorised
 from .gaussians import Gaussians, rows
 from .initial import InitialGaussians, gaussians_from_points, random_gaussians
 from .models import Encoding, WrfGs, WrfGsPlus
 
-FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus}
+FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus, "factorised": Factorised}
 """Field classes by the name that `wrf-mi train --model` takes."""
 
 __all__ = [
     "FIELDS",
     "Encoding",
+    "Factorised",
     "Gaussians",
     "InitialGaussians",
     "WrfGs",

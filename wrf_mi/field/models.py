@@ -18,7 +18,11 @@ from .initial import InitialGaussians
 from .network import Params, Weights, init_layer, linear, linear_of_pairs, relu
 
 GEOMETRY = ("position", "log_scale", "rotation")
-"""Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n]."""
+"""Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
+
+A field whose geometry and attenuation are the same for all transmitters says so by ``still``, and by
+``signal_parameters`` which of its parameters, by the start of their names, reach its signals alone.
+"""
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,8 @@ class WrfGs:
 
     blending = "product"
     per_gaussian = GEOMETRY
+    still = True
+    signal_parameters = ("signal.",)
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
         """Parameters as NumPy arrays: geometry from ``initial``, networks drawn from ``rng``."""
@@ -113,6 +119,8 @@ class WrfGsPlus:
 
     The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
     three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
+    With ``still`` the first head is the only one: Gaussians then stand as they are for every transmitter, and the
+    map from their signals to the receiver is the same for all.
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
     rotation's to the quaternion before it is normalised; the heads start small, so that the static
     field is what training sees first.
@@ -122,10 +130,17 @@ class WrfGsPlus:
     layers: int = 8
     width: int = 256
     skip: int = 4
+    still: bool = False
 
     blending = "alpha"
     per_gaussian = (*GEOMETRY, "opacity", "signal")
-    heads = (("signal", 2, 0.5), ("rotation", 4, 0.05), ("scale", 3, 0.05))
+    signal_parameters = ("signal", "deform.")
+
+    @property
+    def heads(self) -> tuple[tuple[str, int, float], ...]:
+        """Name, size and starting gain of each head."""
+        moving = () if self.still else (("rotation", 4, 0.05), ("scale", 3, 0.05))
+        return (("signal", 2, 0.5), *moving)
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
         """Parameters as NumPy arrays: static attributes from ``initial``, network drawn from ``rng``."""
@@ -153,7 +168,8 @@ class WrfGsPlus:
         offset = {head: rows(linear(params, f"deform.{head}", hidden)) for head, _, _ in self.heads}
 
         def deformed(name: str, head: str) -> list[dr.ArrayBase]:
-            return [dr.tile(a, batch) + d for a, d in zip(rows(params[name]), offset[head], strict=True)]
+            static = [dr.tile(a, batch) for a in rows(params[name])]
+            return [a + d for a, d in zip(static, offset[head], strict=True)] if head in offset else static
 
         opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
         return Gaussians(

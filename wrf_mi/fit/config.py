@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 import yaml
 
 from ..core import InputError
+from ..splat.skip import Skip
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,25 @@ class EncodingConfig:
     position_scale_m: float = 4.0
     tx_octaves: int = 4
     tx_scale_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size of the networks, which are most of a field's size and time.
+
+    Attributes:
+        width: neurons of a layer; 0: the paper's (256 for WRF-GS+, 128 for WRF-GS), 128 for a factorised field.
+        layers: hidden layers; 0: the paper's eight, three for a factorised field. WRF-GS+ joins its input again
+            half-way.
+        terms: of a factorised field; 0: 32.
+        still: WRF-GS+ moves signals alone with the transmitter, not rotation and scale: the map from signals to
+            the receiver is then the same for all transmitters.
+    """
+
+    width: int = 0
+    layers: int = 0
+    terms: int = 0
+    still: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,7 +131,7 @@ class TrainConfig:
     """All settings of a fit.
 
     Attributes:
-        model: ``"wrf-gs"`` or ``"wrf-gs+"``.
+        model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         steps: optimiser steps.
         batch: transmitters in a step.
         seed: of starting values and of the order of rows.
@@ -122,6 +142,7 @@ class TrainConfig:
         checkpoint_every: steps between two checkpoints.
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
+        skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
     """
 
     model: str = "wrf-gs+"
@@ -136,8 +157,10 @@ class TrainConfig:
     validate_every: int = 1000
     initial: InitialConfig = field(default_factory=InitialConfig)
     encoding: EncodingConfig = field(default_factory=EncodingConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    skip: Skip = field(default_factory=Skip)
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""

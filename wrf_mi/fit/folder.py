@@ -3,7 +3,10 @@
     config.yaml     data set, split, seed, versions and all settings, resolved
     split.npz       rows that trained, chose and score
     log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_ssim, held_out, gaussians
-    checkpoint.npz  format version, parameters, optimiser state, receivers; arrays only
+    checkpoint.npz  format version, parameters, optimiser state, receivers; arrays only. Of a compressed run:
+                    parameters in few bits (`wrf_mi.fit.packed`), no optimiser state
+    operator0.npz   where Gaussians stand still: their weights in each pixel at receiver 0 (`wrf_mi.fit.still`),
+                    made by the first prediction, safe to delete
 
 Every file appears whole or not at all.
 """
@@ -29,12 +32,15 @@ from ..core import InputError, Receiver, Record, Split
 from ..core.files import one_line, write_arrays, write_atomically
 from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
+from .packed import pack_params, unpack_params
 from .predictor import Predictor
 from .state import FitState
 from .trainer import Progress, Trainer, check_rows, final_params, make_field
 
 FORMAT = 1
 """Version of ``checkpoint.npz``."""
+PACKED_FORMAT = 2
+"""Version of ``checkpoint.npz`` of a compressed run."""
 
 CONFIG, SPLIT, LOG, CHECKPOINT = "config.yaml", "split.npz", "log.jsonl", "checkpoint.npz"
 
@@ -113,6 +119,26 @@ def write_checkpoint(folder: Path, trainer: Trainer) -> None:
     write_arrays(folder / CHECKPOINT, arrays)
 
 
+def write_packed(
+    folder: Path, source: Mapping[str, NDArray[Any]], params: Mapping[str, NDArray[np.float32]], precision: str
+) -> int:
+    """Write ``checkpoint.npz`` of a compressed run: enough to predict, and no more.
+
+    Args:
+        folder: of the compressed run.
+        source: arrays of the checkpoint that it was made from, for what stays.
+        params: its parameters.
+        precision: of their numbers, see `wrf_mi.fit.packed`.
+
+    Returns:
+        Its size, bytes.
+    """
+    kept = ("step", "seconds", "image_size", "receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
+    arrays = {"format": np.asarray(PACKED_FORMAT)} | {key: source[key] for key in kept}
+    arrays |= pack_params(params, precision)
+    return write_arrays(folder / CHECKPOINT, arrays, compressed=True).stat().st_size
+
+
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
     """Arrays of ``checkpoint.npz``.
 
@@ -124,12 +150,15 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         version = int(arrays["format"])
+        if version == PACKED_FORMAT:
+            arrays |= {f"mean/{name}": values for name, values in unpack_params(arrays).items()}
     except FileNotFoundError:
         raise InputError(f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume") from None
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not readable ({one_line(error)}); restore it or train anew") from None
-    if version != FORMAT:
-        raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    if version not in (FORMAT, PACKED_FORMAT):
+        known = f"{FORMAT} and {PACKED_FORMAT}"
+        raise InputError(f"{path}: format {version}, this version reads {known}; use the version that wrote it")
     return arrays
 
 
@@ -184,6 +213,8 @@ def resume_run(folder: Path, record: Record) -> Trainer:
     run, split = read_config(folder), load_rows(folder, record)
     if (folder / CHECKPOINT).exists():
         arrays = read_checkpoint(folder)
+        if int(arrays["format"]) == PACKED_FORMAT:
+            raise InputError(f"{folder}: compressed, so without what training needs; go on with the run it is made of")
         trainer = Trainer(record, split, run.settings, state=FitState.from_arrays(arrays))
         trainer.seconds = float(arrays["seconds"])
     else:
@@ -192,16 +223,29 @@ def resume_run(folder: Path, record: Record) -> Trainer:
     return trainer
 
 
-def load_predictor(folder: str | Path) -> Predictor:
+def load_predictor(folder: str | Path, operator: bool = True) -> Predictor:
     """The trained field of a run folder, ready to predict.
+
+    Args:
+        folder: of the run.
+        operator: predict by operator where the field allows it; operators are stored in the folder.
 
     Raises:
         InputError: not a run folder, or a damaged one.
     """
     path = Path(folder)
     config, arrays = read_config(path), read_checkpoint(path)
+    height, width = map(int, arrays["image_size"])
+    settings = config.settings
     return Predictor(
-        make_field(config.settings), final_params(arrays), stored_receivers(arrays), *map(int, arrays["image_size"])
+        make_field(settings),
+        final_params(arrays),
+        stored_receivers(arrays),
+        height,
+        width,
+        settings.skip,
+        operator,
+        path,
     )
 
 

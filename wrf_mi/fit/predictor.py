@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -12,8 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import InputError, Receiver
 from ..field.device import to_tensor
 from ..field.gaussians import Gaussians
+from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
 from .step import Field, Params, device_pose, make_prediction
+from .still import StillField, stands_still
 
 
 class Predictor:
@@ -25,6 +29,11 @@ class Predictor:
         receivers: poses, by which spectra are asked for.
         height: rows of a spectrum.
         width: columns.
+        skip: what is not evaluated.
+        operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear
+            map from signals to pixels (`wrf_mi.splat.operator`), built at the first prediction. It leaves nothing out,
+            whatever ``skip`` says.
+        store: folder in which operators are kept from process to process; None: in memory alone.
     """
 
     def __init__(
@@ -34,25 +43,38 @@ class Predictor:
         receivers: Sequence[Receiver],
         height: int,
         width: int,
+        skip: Skip = NOTHING,
+        operator: bool = False,
+        store: Path | None = None,
     ) -> None:
         self.receivers = tuple(receivers)
         self._poses = [device_pose(r) for r in receivers]
         self._plane = perception_plane(height, width, mi.Float)
-        self._field, self._count = field, -1
+        self._field, self._skip, self._count = field, skip, -1
+        self._by_operator, self._store = operator and stands_still(field), store
+        self._still: StillField | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
         """Use other parameters (Dr.Jit tensors) from now on."""
         if params["position"].shape[1] != self._count:
             # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
-            self._predict, self._count = make_prediction(self._field), params["position"].shape[1]
-        self._params = params
+            self._predict, self._count = make_prediction(self._field, self._skip), params["position"].shape[1]
+        self._params, self._still = params, None
         dr.eval(self._params)
 
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
         return self._field.gaussians(self._params, to_tensor(columns))
+
+    def still(self) -> StillField:
+        """The field as operators; forgotten when parameters change."""
+        if self._still is None:
+            params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
+            size = self._plane.height, self._plane.width
+            self._still = StillField(self._field, params, self.receivers, *size, self._store)
+        return self._still
 
     def __call__(self, tx_pos_m: ArrayLike, receiver: int = 0) -> NDArray[np.float32]:
         """Spectra of transmitters at one receiver.
@@ -73,6 +95,12 @@ class Predictor:
         bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
         if len(bad):
             raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
+        if self._by_operator:
+            try:
+                return self.still()(positions, receiver)
+            except MemoryError as error:
+                warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
+                self._by_operator = False
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
         for image, position in zip(out, positions, strict=True):

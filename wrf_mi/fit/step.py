@@ -6,8 +6,10 @@ recorded kernels; a captured array or a changing Python number would be traced a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import operator
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -15,13 +17,14 @@ import mitsuba as mi
 from drjit.opt import Adam
 
 from ..core import Receiver
-from ..field.models import WrfGs, WrfGsPlus
+from ..field import Factorised, WrfGs, WrfGsPlus
 from ..project.footprint import Pose
 from ..splat.render import splat
+from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
 from .recorded import Recorded
 
-Field = WrfGs | WrfGsPlus
+Field = WrfGs | WrfGsPlus | Factorised
 Loss = Callable[[Any, Any, int, int, int], Any]
 """``loss(prediction, truth, batch, height, width)`` of flat arrays, a Dr.Jit float of one value."""
 Params = dict[str, Any]
@@ -39,7 +42,7 @@ def device_pose(receiver: Receiver) -> Pose:
     return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
 
 
-def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane, skip: Skip = NOTHING) -> Any:
     """The pixel receiver's spectrum |R| per direction, [batch * height * width], row-major.
 
     Args:
@@ -48,8 +51,9 @@ def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane
         tx_pos: transmitter positions [3, batch], metres.
         pose: of the receiver.
         plane: its perception plane.
+        skip: what is not evaluated.
     """
-    re, im = splat(field.gaussians(params, tx_pos), pose, plane)
+    re, im = splat(field.gaussians(params, tx_pos), pose, plane, skip)
     return dr.sqrt(re * re + im * im + DARK)
 
 
@@ -81,13 +85,36 @@ class StepReport:
 
     Attributes:
         loss: of the batch before the step.
-        broken: 1 if the loss or a gradient was not finite (the step was then not taken), else 0.
         urge: length of the gradient by each Gaussian's direction from the receiver.
     """
 
     loss: Any
-    broken: Any
     urge: Any
+
+
+@dataclass
+class Trouble:
+    """The first step whose loss or gradient was not finite; from then on no step is taken.
+
+    Attributes:
+        step: its number from 1; 0: none so far.
+        groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
+    """
+
+    step: Any
+    groups: Any
+
+
+def watched_groups(names: Iterable[str]) -> list[str]:
+    """The parameters that `Trouble` watches, in its order, after the loss."""
+    return [name for name in names if watched(name)]
+
+
+def no_trouble(names: Iterable[str]) -> Trouble:
+    """None so far, for parameters of these names."""
+    none = Trouble(mi.UInt32(0), dr.zeros(mi.Float, 1 + len(watched_groups(names))))
+    dr.make_opaque(none)  # a constant would be recorded as one
+    return none
 
 
 def watched(name: str) -> bool:
@@ -108,9 +135,11 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         loss_of: loss of a batch.
 
     Returns:
-        ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay) -> (mean, StepReport)``. It takes
-        one step of ``adam`` in place and returns the new running mean of the parameters.
+        ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
+        StepReport)``. It takes one step of ``adam`` in place, that of this number from 1, and returns the new running
+        mean of the parameters. After trouble nothing changes any more.
     """
+    groups = watched_groups(rates)
 
     @Recorded
     def step(
@@ -123,7 +152,9 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         plane: Plane,
         factor: Any,
         decay: Any,
-    ) -> tuple[Params, StepReport]:
+        number: Any,
+        trouble: Trouble,
+    ) -> tuple[Params, Trouble, StepReport]:
         # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
         adam.set_learning_rate({name: factor * rates[name] for name in rates})
         params = {name: adam[name] for name in rates}
@@ -132,30 +163,35 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         prediction = grey(field, params, tx_pos, pose, plane)
         loss = loss_of(prediction, truth, batch, plane.height, plane.width)
         dr.backward(loss)
-        health = dr.detach(loss)
-        for name in params:
-            if watched(name):
-                health = health + dr.sum(dr.abs(dr.grad(params[name]).array))
-        finite = dr.isfinite(health)
+        sums = [dr.detach(loss), *(dr.sum(dr.abs(dr.grad(params[name]).array)) for name in groups)]
+        fine = [dr.isfinite(s) for s in sums]
+        good = reduce(operator.and_, fine)
+        untroubled = trouble.step == 0
+        finite = good & untroubled
         offset = [dr.detach(params["position"])[k].array - pose.position[k] for k in range(3)]
         pull = [dr.grad(params["position"])[k].array for k in range(3)]
         distance = dr.sqrt(sum(c * c for c in offset))
         urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
         adam.step(eval=False, active=finite)
-        mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], decay) for name in mean}
-        report = StepReport(dr.detach(loss), dr.select(finite, mi.Float(0), mi.Float(1)), urge)
-        dr.eval(adam, mean, report)
-        return mean, report
+        share = dr.select(finite, decay, 1)
+        mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
+        now = dr.concat([dr.select(f, mi.Float(0), mi.Float(1)) for f in fine])
+        trouble = Trouble(
+            dr.select(untroubled & ~good, number, trouble.step), dr.select(untroubled, now, trouble.groups)
+        )
+        report = StepReport(dr.detach(loss), urge)
+        dr.eval(adam, mean, trouble, report)
+        return mean, trouble, report
 
     return step
 
 
-def make_prediction(field: Field) -> Callable[..., Any]:
+def make_prediction(field: Field, skip: Skip = NOTHING) -> Callable[..., Any]:
     """A recorded prediction: ``predict(params, tx_pos, pose, plane) -> greys``, without gradients."""
 
     @Recorded
     def predict(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
         with dr.suspend_grad():
-            return grey(field, params, tx_pos, pose, plane)
+            return grey(field, params, tx_pos, pose, plane, skip)
 
     return predict

@@ -27,7 +27,7 @@ from .predictor import Predictor
 from .schedule import plan
 from .start import initial_gaussians
 from .state import FitState
-from .step import Field, Loss, TrainingData, device_pose, make_step, watched
+from .step import Field, Loss, TrainingData, Trouble, device_pose, make_step, no_trouble, watched_groups
 
 
 class NumericsError(RuntimeError):
@@ -69,7 +69,26 @@ def make_field(config: TrainConfig) -> Field:
         raise InputError(f"model {config.model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
     e = config.encoding
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m)
-    return FIELDS[config.model](encoding=encoding)
+    n = config.network
+    sizes: dict[str, Any] = {}
+    if n.width:
+        sizes["width"] = n.width
+    if n.layers:
+        sizes["layers"] = n.layers
+    if n.still and config.model != "wrf-gs+":
+        raise InputError(f"setting network.still: {config.model} moves signals alone anyway; leave it away")
+    if config.model == "wrf-gs":
+        if n.width:
+            sizes["signal_widths"] = (n.width, max(1, n.width // 2))
+    elif config.model == "wrf-gs+":
+        if n.layers:
+            sizes["skip"] = n.layers // 2
+        sizes["still"] = n.still
+    if n.terms:
+        if config.model != "factorised":
+            raise InputError(f"setting network.terms: {config.model} has none; leave it away")
+        sizes["terms"] = n.terms
+    return FIELDS[config.model](encoding=encoding, **sizes)
 
 
 def _paper_loss(prediction: Any, truth: Any, batch: int, height: int, width: int, eta: float) -> Any:
@@ -167,7 +186,12 @@ class Trainer:
         """Predictions with the running mean of the parameters as it is now."""
         if self._predictor is None:
             self._predictor = Predictor(
-                self.field, self.state.mean_params(), self.record.receivers, self.height, self.width
+                self.field,
+                self.state.mean_params(),
+                self.record.receivers,
+                self.height,
+                self.width,
+                self.config.skip,
             )
         else:
             self._predictor.update(self.state.mean)
@@ -206,12 +230,12 @@ class Trainer:
         """
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
-        first, losses, broken = state.step, dr.zeros(mi.Float), dr.zeros(mi.Float)
+        first, losses, trouble = state.step, dr.zeros(mi.Float), no_trouble(state.adam)
         since = 0
         while state.step < config.steps and not (state.step > first and stop()):
             t = state.step
             receiver = int(schedule.receiver[t])
-            state.mean, report = self._step(
+            state.mean, trouble, report = self._step(
                 state.adam,
                 state.mean,
                 self._data,
@@ -221,10 +245,12 @@ class Trainer:
                 self._plane,
                 dr.opaque(mi.Float, float(schedule.factor[t])),
                 dr.opaque(mi.Float, float(schedule.decay[t])),
+                dr.opaque(mi.UInt32, t + 1),
+                trouble,
             )
-            losses, broken = losses + report.loss, dr.maximum(broken, report.broken)
+            losses += report.loss
             state.urge += report.urge
-            dr.eval(losses, broken, state.urge)
+            dr.eval(losses, state.urge)
             state.step, state.urge_steps, since = t + 1, state.urge_steps + 1, since + 1
             self.seconds = before + time.perf_counter() - start
             last = state.step == config.steps
@@ -232,8 +258,7 @@ class Trainer:
                 self._adapt()
             scored = state.step % config.validate_every == 0 or last
             if state.step % config.log_every == 0 or scored:
-                if broken[0] > 0:
-                    raise NumericsError(self._diagnose())
+                self._require_finite(trouble)
                 score = self.validate() if scored else None
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / (state.step - first) * (config.steps - state.step)
@@ -241,11 +266,11 @@ class Trainer:
                 listen(Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left))
                 losses, since = dr.zeros(mi.Float), 0
             if state.step % config.checkpoint_every == 0 and not last:
+                self._require_finite(trouble)
                 save()
         dr.sync_thread()
         self.seconds = before + time.perf_counter() - start
-        if broken[0] > 0:  # stopped between two lines of the log
-            raise NumericsError(self._diagnose())
+        self._require_finite(trouble)
         save()
         return state.step == config.steps
 
@@ -273,16 +298,20 @@ class Trainer:
         if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
 
-    def _diagnose(self) -> str:
-        """Say which parameters are not finite or, as a broken step is not taken, which groups were watched."""
-        bad = [name for name, values in self.state.params().items() if not np.isfinite(values).all()]
+    def _require_finite(self, trouble: Trouble) -> None:
+        """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
+        step = int(trouble.step[0])
+        # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
+        groups = (self.state.params(), *self.state.moments()[:2])
+        bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
         if bad:
-            return f"step {self.state.step}: parameters not finite: {', '.join(bad)}"
-        groups = ", ".join(name for name in self.state.adam if watched(name))
-        return (
-            f"within the {self.config.log_every} steps before step {self.state.step}: loss or gradient not finite "
-            f"(watched: {groups}); the parameters were left as before; lower the learning rates"
-        )
+            where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
+            raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
+        if step:
+            names = ["loss", *watched_groups(self.state.adam)]
+            found = ", ".join(n for n, broken in zip(names, trouble.groups.numpy(), strict=True) if broken)
+            where = f"step {step}: not finite: {found}"
+            raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")
 
 
 def final_params(arrays: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:

@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
 
-from ..core.angles import FloatArray, azimuth_rad, elevation_rad, pixel_directions
+from ..core.angles import FloatArray, pixel_directions, solid_angles
 from ..field.device import on_device
 from .follow import Complex
 from .traced import Float64, TracedPaths
@@ -43,17 +43,6 @@ LEAST_POWER = 1e-20
 
 def _wavenumber(frequency_hz: Any) -> Any:
     return 2 * np.pi * frequency_hz / speed_of_light
-
-
-def solid_angles(height: int, width: int) -> FloatArray:
-    """Weight of each pixel in an integral over the upper hemisphere, [height * width], steradian.
-
-    cos(elevation) times the pixel's angles, by the trapezoidal rule: the horizon counts half, and half again in the
-    lower hemisphere.
-    """
-    rows = np.cos(elevation_rad(height)) * (np.pi / 2 / height) * (2 * np.pi / width)
-    rows[0] /= 2
-    return np.repeat(rows, len(azimuth_rad(width)))
 
 
 @lru_cache(maxsize=16)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.resources import files
 from pathlib import Path
@@ -51,7 +52,7 @@ def fetch(
         home: folder to put ``<name>/`` in; by default that of ``WRF_MI_DATA``, or else the user's cache.
         base_url: a mirror of the public original.
         retries: how often a file is tried again.
-        progress: show a progress bar on standard error.
+        progress: show a progress bar, and what a user has to know of the data, on standard error.
 
     Returns:
         The data set's folder.
@@ -64,7 +65,10 @@ def fetch(
         raise InputError(f"data set {name}: is not downloaded but {dataset.origin}")
     place = Path(home) if home else data_home()
     target = locate(name, place) or place / name
-    return download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    if progress and dataset.note:
+        print(f"{name}: {dataset.note}", file=sys.stderr)
+    return folder
 
 
 def download(

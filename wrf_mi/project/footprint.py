@@ -42,7 +42,8 @@ class Footprints:
         whitened: two vectors a, b with v^T C^-1 v = ((a . u)^2 + (b . u)^2) / (n . u)^2.
         radius: angular radius that holds the whole footprint, radians; detached.
         visible: far enough from the receiver to have a footprint; detached.
-        depth: distance from the receiver, metres, [n] (the same for all transmitters); detached.
+        depth: distance from the receiver, metres, [n] (the same for all transmitters); detached, float64: it decides
+            the order, and depths that differ by less than a float32's last digit must not change places by chance.
     """
 
     direction: list[dr.ArrayBase]
@@ -86,8 +87,9 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     batch = gaussians.batch
     offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
     local = pose.to_local(offset)
+    exact = centre_distance(gaussians.position, pose.position)
+    visible = exact >= NEAR_M
     depth = dr.sqrt(dot(local, local))
-    visible = dr.detach(depth) >= NEAR_M
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
     n[2] = dr.select(visible, n[2], 1)
@@ -123,8 +125,15 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
         whitened=(a, b),
         radius=dr.atan(CUTOFF * dr.sqrt(largest)),
         visible=dr.tile(visible, batch),
-        depth=dr.detach(depth),
+        depth=exact,
     )
+
+
+def centre_distance(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Distance of points in float64, detached."""
+    double: Any = dr.float64_array_t(type(a[0]))
+    x, y, z = (double(dr.detach(p)) - double(dr.detach(q)) for p, q in zip(a, b, strict=True))
+    return dr.sqrt(x * x + y * y + z * z)
 
 
 def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBase:

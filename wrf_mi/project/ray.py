@@ -25,7 +25,7 @@ from typing import Any
 import drjit as dr
 
 from ..field.gaussians import Gaussians
-from .footprint import Pose, dot, own_axes, tangent_basis
+from .footprint import Pose, centre_distance, dot, own_axes, tangent_basis
 from .footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 LOG2_E = 1.4426950408889634
@@ -43,7 +43,7 @@ class RayFootprints:
         whitened: vectors a and b.
         lean: k1 and k2.
         depth_extent: 1 / L^2.
-        depth: distance D of the centre, metres; detached.
+        depth: distance D of the centre, metres; detached, float64 as in `wrf_mi.project.footprint.Footprints`.
         visible: not nearer than ``NEAR_M``; detached.
     """
 
@@ -91,9 +91,10 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     """
     offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
     local = pose.to_local(offset)
-    # By the same arithmetic as `project`: what is a tie there is one here.
     depth = dr.sqrt(dot(local, local))
-    visible = dr.detach(depth) >= NEAR_M
+    # As in `project`: what is a tie there is one here.
+    exact = centre_distance(gaussians.position, pose.position)
+    visible = exact >= NEAR_M
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
     # Any unit vector serves where nothing is seen; its direction is set to zero at the end.
@@ -121,7 +122,7 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
         whitened=(a, b),
         lean=(dot(g3, to_first) / determinant, dot(g3, to_second) / determinant),
         depth_extent=dr.rcp(mahalanobis * mahalanobis),
-        depth=dr.detach(depth),
+        depth=exact,
         visible=visible,
     )
 

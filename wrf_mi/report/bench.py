@@ -9,11 +9,11 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import yaml
 from ..core import InputError
 from ..core.files import write_atomically
 from ..fit.folder import versions
+from ..parallel import Scheduler, SerialScheduler, run_module, worker_threads
 from .run_folder import CONFIG, METRICS
 
 
@@ -89,6 +90,7 @@ CHECKS: Mapping[str, Check] = {
     "large-scan": Check("mesh from a scan", "bench_scene:large_scan"),
     "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan"),
     "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat"),
+    "stress": Check("numbers under stress", "bench_stress:main"),
     "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab"),
     "hybrid-flat": Check("hybrid, flat-ble", "bench_hybrid_rssi:all_rows"),
     "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows"),
@@ -96,10 +98,20 @@ CHECKS: Mapping[str, Check] = {
     "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office"),
     "hybrid-room": Check("hybrid, traced room", "bench_hybrid_room:main"),
     "hybrid-starts": Check("WRF-GS+, traced room", "bench_starts:main"),
+    "pareto": Check("traced room", "bench_pareto:main"),
+    "scaling": Check("cost against work", "bench_scaling:main"),
+    "operator": Check("prediction by operator", "bench_operator:main"),
+    "budgets": Check("fields at budgets", "bench_budget:main"),
 }
 
 
-def bench(names: Sequence[str], out: Path, runs: Path) -> list[dict[str, Any]]:
+SHARED_NOTE = (
+    "bench: cases that share a machine slow each other down: for times that can be compared start one worker on each "
+    "machine, with OMP_NUM_THREADS at its number of cores (docs/cluster.md)"
+)
+
+
+def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
     """Measure cases one after the other, each as a process of its own, and write the table.
 
     A case whose run folder is finished is only written down again; one that was stopped goes on.
@@ -108,6 +120,8 @@ def bench(names: Sequence[str], out: Path, runs: Path) -> list[dict[str, Any]]:
         names: keys of `CASES` and `CHECKS`.
         out: folder for ``<case>.json`` and the tables, ``README.md``.
         runs: folder for run folders.
+        scheduler: whose workers measure a case each at a time, with their number of threads, and must see ``runs`` and
+            the data under the same names; None: this process.
 
     Returns:
         One dictionary a case, as in its JSON file.
@@ -120,16 +134,23 @@ def bench(names: Sequence[str], out: Path, runs: Path) -> list[dict[str, Any]]:
         if name not in CASES and name not in CHECKS:
             raise InputError(f"bench {name}: unknown; choose from {', '.join([*CASES, *CHECKS])}")
     out.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for name in names:
-        result = _check(name, runs / name) if name in CHECKS else _measure(name, runs / name)
+
+    def each(index: int, result: dict[str, Any]) -> None:
+        name = names[index]
         write_atomically(out / f"{name}.json", json.dumps(result, indent=1) + "\n")
-        rows.append(result)
         print(f"{name}: {out / name}.json", file=sys.stderr)
+
+    if scheduler is not None:
+        print(SHARED_NOTE, file=sys.stderr)
+    rows = (scheduler or SerialScheduler()).map(partial(_case, runs), names, what="measuring", each=each)
     trained, checked = read_results(out)
     parts = ["# Figures", f"Written by `wrf-mi bench`. {NOTE}", table(trained), CHECK_NOTE, check_table(checked)]
     write_atomically(out / "README.md", "\n\n".join(parts) + "\n")
     return rows
+
+
+def _case(runs: Path, name: str) -> dict[str, Any]:
+    return _check(name, runs / name) if name in CHECKS else _measure(name, runs / name)
 
 
 def _measure(name: str, folder: Path) -> dict[str, Any]:
@@ -139,13 +160,13 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
         resumed = (folder / CONFIG).exists()
         call = ["train", "--resume", str(folder)] if resumed else arguments
         start = time.perf_counter()
-        status = subprocess.run([sys.executable, "-m", "wrf_mi.cli", *call], stdout=subprocess.DEVNULL).returncode
+        status, said = run_module("wrf_mi.cli", call)
         if status != 0:
-            raise BenchFailed(f"bench {name}: `wrf-mi {' '.join(call)}` ended with status {status}")
+            raise BenchFailed(f"bench {name}: `wrf-mi {' '.join(call)}` ended with status {status} {said}".rstrip())
         # The time of the whole process means something only where it ran in one go.
         wall = None if resumed else time.perf_counter() - start
         # Written when it is measured: the table may be made again elsewhere.
-        measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine()}
+        measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine(), **_threads()}
         write_atomically(folder / "bench.json", json.dumps(measured))
     config = yaml.safe_load((folder / CONFIG).read_text())
     return {
@@ -163,17 +184,22 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
     stored = folder / "check.json"
     if not stored.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        call = [sys.executable, "-m", "wrf_mi.report.check", CHECKS[name].function, str(stored)]
         start = time.perf_counter()
-        status = subprocess.run(call).returncode
+        status, said = run_module("wrf_mi.report.check", [CHECKS[name].function, str(stored)])
         if status != 0:
-            raise BenchFailed(f"bench {name}: ended with status {status}")
+            raise BenchFailed(f"bench {name}: ended with status {status} {said}".rstrip())
         measured = json.loads(stored.read_text())
-        where = {"date": time.strftime("%Y-%m-%d"), "machine": machine(), "versions": versions()}
+        where = {"date": time.strftime("%Y-%m-%d"), "machine": machine(), "versions": versions(), **_threads()}
         measured = {"wall_seconds": time.perf_counter() - start, **where, "figures": measured}
         write_atomically(stored, json.dumps(measured, indent=1))
     known = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
     return known | json.loads(stored.read_text())
+
+
+def _threads() -> dict[str, int]:
+    """What must be known of a measurement in a worker beside its machine."""
+    threads = worker_threads()
+    return {} if threads is None else {"worker_threads": threads}
 
 
 def machine() -> dict[str, Any]:

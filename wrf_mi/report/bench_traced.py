@@ -6,25 +6,25 @@ python -m wrf_mi.report.bench_traced
 from __future__ import annotations
 
 import json
-import time
 from typing import Any
 
 from ..backend import init
 
 init()
 
-import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 import wrf_mi_plugins  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from skimage.metrics import structural_similarity  # noqa: E402
 
-from ..core import Receiver, pixel_directions, unit_vectors  # noqa: E402
+from ..core import Receiver, unit_vectors  # noqa: E402
 from ..field.gaussians import Gaussians  # noqa: E402
 from ..project.footprint import Pose  # noqa: E402
 from ..splat.render import splat  # noqa: E402
 from ..splat.tiles import perception_plane  # noqa: E402
+from .stock import StockRenderer, rgb_variant  # noqa: E402
+from .timing import Within, seconds  # noqa: E402
 
 HEIGHT, WIDTH = 90, 360
 BLENDINGS = ("alpha", "product")
@@ -157,7 +157,6 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
     which finds all hits anew, ``again_ms`` one after the signals changed. The update of the scene, in which Mitsuba
     builds its own BVH, is left out on both sides.
     """
-    own_variant: Any = mi.variant()
     gaussians, receiver = random_field(0, "alpha", count, size_deg, opacity=0.1)
     opacity: Any = gaussians.opacity
     scene = scene_of(gaussians, receiver)
@@ -165,19 +164,15 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
     # Copies: what `numpy` gives on the CPU is the array's own memory, which an update of the scene frees.
     data, signal = (params[f"gaussians.{name}"].numpy().copy() for name in ("data", "signal"))
     times: dict[str, list[float]] = {"traced_ms": [], "again_ms": [], "stock_ms": []}
-    try:
-        mi.set_variant(own_variant.replace("mono_polarized", "rgb"))
-        stock, stock_integrator = _stock(data, opacity.numpy(), receiver)
-        for _ in range(repeats + 1):
-            mi.set_variant(own_variant)
-            for name, key, values in (("traced_ms", "data", data), ("again_ms", "signal", signal)):
-                params[f"gaussians.{key}"] = mi.Float(values)
-                params.update()
-                times[name].append(_ms(lambda: mi.render(scene)))
-            mi.set_variant(own_variant.replace("mono_polarized", "rgb"))
-            times["stock_ms"].append(_ms(lambda: mi.render(stock, integrator=stock_integrator, spp=1)))
-    finally:
-        mi.set_variant(own_variant)
+    stock = StockRenderer(receiver, HEIGHT, WIDTH)
+    colour = np.random.default_rng(0).standard_normal((count, 3)).astype(np.float32)
+    stock.load(data.reshape(count, -1), opacity.numpy(), colour)
+    for _ in range(repeats + 1):
+        for name, key, values in (("traced_ms", "data", data), ("again_ms", "signal", signal)):
+            params[f"gaussians.{key}"] = mi.Float(values)
+            params.update()
+            times[name].append(1e3 * seconds(lambda: mi.render(scene)))
+        times["stock_ms"].append(1e3 * seconds(Within(stock.render, rgb_variant)))
     # The first of each compiles.
     median = {name: float(np.median(values[1:])) for name, values in times.items()}
     return {
@@ -187,52 +182,6 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
         "stock_over_traced": float(np.median(np.divide(times["stock_ms"], times["traced_ms"])[1:])),
         "stock_over_again": float(np.median(np.divide(times["stock_ms"], times["again_ms"])[1:])),
     }
-
-
-def _ms(render: Any) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(render())
-    dr.sync_thread()
-    return 1e3 * (time.perf_counter() - start)
-
-
-def _stock(data: Any, opacity: Any, receiver: Receiver) -> tuple[Any, Any]:
-    """The same Gaussians for ``volprim_rf_basic``, with one constant colour each, and the same rays."""
-    table = pixel_directions(HEIGHT, WIDTH).reshape(-1, 3) @ receiver.to_world.T
-    direction = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in table.T))
-    origin = mi.Point3f(*receiver.position_m.tolist())
-
-    class Rays(mi.Sensor):
-        """Sensors are classes of one variant, so this one needs its own."""
-
-        def sample_ray_differential(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
-        ) -> Any:
-            row, column = mi.UInt32(sample2.y * HEIGHT), mi.UInt32(sample2.x * WIDTH)
-            ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, direction, row * WIDTH + column, active))
-            return mi.RayDifferential3f(ray), mi.Spectrum(1)
-
-    mi.register_sensor("wrf_bench_rays", Rays)
-    count = len(opacity)
-    colour = np.random.default_rng(0).standard_normal((count, 3)).astype(np.float32)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {
-                "type": "wrf_bench_rays",
-                "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": 1},
-            },
-            "gaussians": {
-                "type": "ellipsoids",
-                "data": mi.TensorXf(data, (count, 10)),
-                "opacities": mi.TensorXf(opacity, (count, 1)),
-                "sh_coeffs": mi.TensorXf(colour),
-            },
-        }
-    )
-    return scene, mi.load_dict({"type": "volprim_rf_basic"})
 
 
 def main() -> dict[str, Any]:

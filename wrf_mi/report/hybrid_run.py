@@ -224,7 +224,13 @@ def predict_hybrid(
     Raises:
         InputError: not a finished run, or one over several splits.
     """
-    model = open_hybrid(folder)
+    return predict_with(open_hybrid(folder), tx_pos_m, tx_heading_rad)
+
+
+def predict_with(
+    model: HybridModel, tx_pos_m: FloatArray, tx_heading_rad: FloatArray | None
+) -> tuple[NDArray[Any], FloatArray, tuple[str, ...]]:
+    """The same with a run's model from `open_hybrid`."""
     found = [model.predict(tx_pos_m, r, tx_heading_rad) for r in range(len(model.receivers))]
     names = tuple(receiver.name for receiver in model.receivers)
     return np.stack([e.mean for e in found]), np.stack([e.std for e in found]), names

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +30,22 @@ from ..fit.folder import (
 from ..fit.predictor import Predictor
 from ..fit.trainer import Progress, Trainer, peak_memory_mb
 from ..measure import make_splits
+from ..parallel import Scheduler, row_parts
 from ..trace import load_record
 from .evaluate import Predict, evaluate, pool, stored_metrics, write_predictions, write_results
-from .hybrid_run import evaluate_hybrid, is_hybrid, predict_hybrid
+from .hybrid_run import evaluate_hybrid, is_hybrid, open_hybrid, predict_with
 from .run_folder import CONFIG, METRICS
-from .traced import evaluate_traced, is_traced, predict_traced
+from .traced import TracedRun, evaluate_traced, is_traced
 
 Listen = Callable[[str, int, Progress], None]
 """Hears of progress: name of the fold ("" where there is one split), steps in all, and the progress."""
 
+Estimates = tuple[NDArray[Any], NDArray[Any] | None, tuple[str, ...]]
+"""Observations [n_rx, m, ...], their standard deviations where the model states them, and the receivers' names."""
+
 FOLDS = "fold*"
+PREDICTED_AT_ONCE = 256
+"""Positions of one part at most, for a scheduler: 33 MB of spectra of 90 x 360 for each receiver."""
 
 
 class Interrupted(Exception):
@@ -63,15 +69,18 @@ class Run:
         """Content of ``metrics.json``."""
         return json.loads((self.folder / METRICS).read_text())
 
-    def predictor(self) -> Predictor:
+    def predictor(self, operator: bool = True) -> Predictor:
         """The trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
+
+        Args:
+            operator: predict by operator where the field allows it.
 
         Raises:
             InputError: a run over all blocks has one field a fold, in its subfolders.
         """
         if is_blocked(self.folder):
             raise InputError(f"{self.folder}: one field for each block; choose one, e.g. {self.folder / 'fold0'}")
-        return load_predictor(self.folder)
+        return load_predictor(self.folder, operator)
 
 
 def is_blocked(folder: Path) -> bool:
@@ -167,7 +176,8 @@ def _fit(
         raise Interrupted(
             f"stopped after step {trainer.state.step} of {run.settings.steps}; go on with: wrf-mi train --resume {top}"
         )
-    metrics, arrays = evaluate(trainer.record, trainer.split, of_rows(trainer.record, trainer.predictor()))
+    # As the run will be opened: where there is an operator it is built and stored here.
+    metrics, arrays = evaluate(trainer.record, trainer.split, of_rows(trainer.record, load_predictor(folder)))
     metrics = _header(run, trainer.seconds) | {"gaussians": trainer.state.gaussians} | metrics
     write_results(folder, metrics, arrays)
     return metrics, arrays
@@ -194,13 +204,14 @@ def _header(run: RunConfig, seconds: float) -> dict[str, Any]:
     }
 
 
-def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]:
+def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = True) -> dict[str, Any]:
     """Score a run again.
 
     Args:
         folder: run folder; without ``split`` its ``metrics.json`` and ``predictions.npz`` are written anew.
         split: score on the test rows of another split instead, without those the run was trained on;
             nothing is written.
+        operator: a learned field alone predicts by operator where it can.
 
     Returns:
         The metrics.
@@ -222,7 +233,7 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
         for k in range(len(make_splits(record, run.split, run.settings.seed, run.n_train))):
             part = path / f"fold{k}"
             done["train_seconds"] += _finished(part, run)["train_seconds"]
-            parts.append(evaluate(record, load_rows(part, record), of_rows(record, load_predictor(part))))
+            parts.append(evaluate(record, load_rows(part, record), of_rows(record, load_predictor(part, operator))))
         metrics, arrays = pool(parts)
     else:
         done = _finished(path, run)
@@ -233,7 +244,7 @@ def evaluate_run(folder: str | Path, split: str | None = None) -> dict[str, Any]
             if len(unseen) == 0:
                 raise InputError(f"{path}: trained on all test rows of split {split}; nothing is left to score")
             rows, run = replace(rows, test=unseen), replace(run, split=f"{split} (rows unseen by {run.split})")
-        metrics, arrays = evaluate(record, rows, of_rows(record, load_predictor(path)))
+        metrics, arrays = evaluate(record, rows, of_rows(record, load_predictor(path, operator)))
     merged = _header(run, 0.0) | stored_metrics(path) | done | metrics | {"split": run.split}
     if split is None:
         write_results(path, merged, arrays)
@@ -250,7 +261,12 @@ def _finished(folder: Path, run: RunConfig) -> dict[str, Any]:
 
 
 def predict_to_file(
-    folder: str | Path, tx_pos_m: np.ndarray, out: str | Path, tx_heading_rad: np.ndarray | None = None
+    folder: str | Path,
+    tx_pos_m: np.ndarray,
+    out: str | Path,
+    tx_heading_rad: np.ndarray | None = None,
+    scheduler: Scheduler | None = None,
+    operator: bool = True,
 ) -> dict[str, tuple[int, ...]]:
     """What a run's model predicts at new transmitter positions, as an ``.npz`` file.
 
@@ -261,6 +277,9 @@ def predict_to_file(
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and of a hybrid
             ``std``.
         tx_heading_rad: how the transmitter is turned, [m]; only a hybrid for signal strengths uses it.
+        scheduler: what computes parts of the positions; None: this process. Its workers must see the run folder, and
+            the data set and scene of a traced or hybrid run, under the same names.
+        operator: a learned field alone predicts by operator where it can.
 
     Returns:
         Shape of each array in the file.
@@ -268,26 +287,52 @@ def predict_to_file(
     Raises:
         InputError: a run over several blocks, positions that are not finite, or headings for a model without.
     """
-    path, std = Path(folder), None
+    path = Path(folder)
     if tx_heading_rad is not None and not is_hybrid(path):
         raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
-    if is_hybrid(path):
-        prediction, std, names = predict_hybrid(path, tx_pos_m, tx_heading_rad)
-    elif is_traced(path):
-        prediction, names = predict_traced(path, tx_pos_m)
+    parts: list[Estimates]
+    if scheduler is None or not len(tx_pos_m):
+        parts = [open_run(path, operator)(tx_pos_m, tx_heading_rad, 0)]
     else:
-        predictor = Run(path).predictor()
-        prediction = np.stack([predictor(tx_pos_m, r) for r in range(len(predictor.receivers))])
-        names = tuple(r.name for r in predictor.receivers)
+        rows = row_parts(len(tx_pos_m), scheduler.workers, most=PREDICTED_AT_ONCE)
+        given = [(tx_pos_m[r], None if tx_heading_rad is None else tx_heading_rad[r], r.start) for r in rows]
+        sizes = [len(one[0]) for one in given]
+        parts = scheduler.map(_predict_part, given, partial(open_run, path, operator), what="predicting", sizes=sizes)
+    means, stds, names = zip(*parts, strict=True)
     arrays: dict[str, Any] = {
         "row": np.arange(len(tx_pos_m)),
-        "prediction": prediction,
+        "prediction": np.concatenate(means, axis=1),
         "tx_pos": np.asarray(tx_pos_m, float),
-        "receiver_name": np.asarray(names),
+        "receiver_name": np.asarray(names[0]),
     }
-    if std is not None:
-        arrays["std"] = std.astype(np.float32)
+    if stds[0] is not None:
+        arrays["std"] = np.concatenate(stds, axis=1).astype(np.float32)
     return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
+
+
+def open_run(folder: Path, operator: bool = True) -> Callable[[np.ndarray, np.ndarray | None, int], Estimates]:
+    """The model of a run: a function of positions [m, 3], headings [m] or None, and the row that the first one is.
+
+    Raises:
+        InputError: not a finished run, or one over several blocks.
+    """
+    if is_hybrid(folder):
+        model = open_hybrid(folder)
+        return lambda tx_pos_m, heading, first: predict_with(model, tx_pos_m, heading)
+    if is_traced(folder):
+        traced = TracedRun(folder)
+        return lambda tx_pos_m, heading, first: (traced.predict(tx_pos_m, first), None, traced.names)
+    predictor = Run(folder).predictor(operator)
+    names = tuple(receiver.name for receiver in predictor.receivers)
+    return lambda tx_pos_m, heading, first: (
+        np.stack([predictor(tx_pos_m, r) for r in range(len(names))]),
+        None,
+        names,
+    )
+
+
+def _predict_part(model: Callable[..., Estimates], part: tuple[np.ndarray, np.ndarray | None, int]) -> Estimates:
+    return model(*part)
 
 
 __all__ = ["CONFIG", "Interrupted", "Run", "evaluate_run", "predict_to_file", "resume", "train"]

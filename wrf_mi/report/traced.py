@@ -4,11 +4,14 @@ config.yaml      data set, split, seed, versions, scene and what is traced
 split.npz        rows that fitted and rows that score (in ``fold0``, ... for several splits)
 paths.npz        every path, to be used again for other materials (`wrf_mi.trace.load_trace`, ``recompute``)
 metrics.json, predictions.npz
+convergence.json where settings were chosen by convergence: target and estimated error, dB, and all that was tried
 """
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,18 +28,24 @@ from ..core.types import IntArray
 from ..fit.folder import CONFIG, SPLIT, load_rows, versions
 from ..fit.trainer import peak_memory_mb
 from ..measure import make_splits, save_split
+from ..parallel import Scheduler, row_parts
 from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_trace
 from ..trace.calibrate import CalibrationOptions, calibrate
-from ..trace.calibration import calibrated_rssi, load_calibration, save_calibration
+from ..trace.calibration import Calibration, calibrated_rssi, load_calibration, save_calibration
 from ..trace.offsets import fit_offsets
+from ..trace.result import join_traces
+from ..trace.solve import TARGETS_AT_ONCE
+from ..trace.target import CHOSEN_KINDS, choose_options
 from ..trace.tracer import Instrument, RayTracer, instrument_of
 from .evaluate import evaluate, milliseconds_per_sample, pool, stored_metrics, write_results
 from .run_folder import stated_model
 
 MODEL = "ray-tracing"
-PATHS, CALIBRATION = "paths.npz", "calibration.json"
+PATHS, CALIBRATION, CONVERGENCE = "paths.npz", "calibration.json", "convergence.json"
 TIMED = 3
 """Single samples that are timed: in a furnished scene with transmission one may take seconds."""
+TRACED_AT_LEAST = 16
+"""Positions of one part at least, for a scheduler: candidates of fewer are made no faster."""
 CALIBRATIONS = {"patterns": CalibrationOptions(materials=False), "all": CalibrationOptions()}
 """What can be fitted beside offsets."""
 
@@ -99,7 +108,10 @@ def trace_run(
     n_train: int | float | None = None,
     seed: int = 0,
     calibration: str | None = None,
+    target_error_db: float | None = None,
+    kinds: Sequence[str] = CHOSEN_KINDS,
     progress: bool = False,
+    scheduler: Scheduler | None = None,
 ) -> Path:
     """Trace a scene for every row of a data set and score it as a learned model is scored.
 
@@ -117,7 +129,13 @@ def trace_run(
         seed: of the split. The rays have theirs in ``options``.
         calibration: what to fit to the training rows by gradients, beside offsets: ``"patterns"`` of the antennas,
             or ``"all"``, materials too (a step takes fifty times as long). Signal strengths alone.
+        target_error_db: error of received power, dB, for which depth, rays and further kinds of path are chosen by
+            convergence on a sample of the transmitters (`wrf_mi.trace.target`); None: ``options`` as they are.
+            ``convergence.json`` states what was tried.
+        kinds: that may then be switched on.
         progress: show a progress bar on standard error.
+        scheduler: what traces parts of the rows; None: this process. Its workers must see the scene under the same
+            name. What comes of it is the same.
 
     Returns:
         The run folder.
@@ -137,13 +155,24 @@ def trace_run(
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     config = TraceConfig(source, str(scene), material, split, n_train, seed, options or TraceOptions(), calibration)
     tracer = RayTracer(scene, instrument_of(record), config.options, material)
+    choice = None
+    if target_error_db is not None:
+        here = record.tx_pos_m, record.receivers
+        choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds)
+        # The instrument's own needs are the tracer's business: only what was chosen is taken over.
+        chosen = {name: getattr(choice.options, name) for name in ("max_depth", "rays", *CHOSEN_KINDS)}
+        config = replace(config, options=replace(config.options, **chosen))
+        choice = replace(choice, options=config.options)
+        tracer = RayTracer(scene, instrument_of(record), config.options, material)
 
     start = time.perf_counter()
-    traced = tracer.trace(record.tx_pos_m, progress)
+    traced = _trace(tracer, record.tx_pos_m, config, progress, scheduler)
     seconds = time.perf_counter() - start
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / CONFIG, _config_text(config))
     save_trace(folder / PATHS, traced)
+    if choice is not None:
+        write_atomically(folder / CONVERGENCE, json.dumps(choice.plain(), indent=1) + "\n")
     start = time.perf_counter()
     for part, rows in _parts(folder, splits):
         part.mkdir(exist_ok=True)
@@ -156,6 +185,25 @@ def trace_run(
     metrics, arrays = _score(folder, record, splits, tracer, traced)
     write_results(folder, _header(config, traced) | spent | metrics, arrays)
     return folder
+
+
+def _trace(
+    tracer: RayTracer, tx_pos_m: FloatArray, config: TraceConfig, progress: bool, scheduler: Scheduler | None
+) -> TraceResult:
+    """Paths of all positions; each part with the number of rays that all of them settle on."""
+    if scheduler is None:
+        return tracer.trace(tx_pos_m, progress)
+    rays = tracer.rays(tx_pos_m)
+    parts = row_parts(len(tx_pos_m), scheduler.workers, TRACED_AT_LEAST, TARGETS_AT_ONCE)
+    opener = partial(RayTracer, config.scene, tracer.instrument, replace(tracer.options, rays=rays), config.material)
+    given = [(tx_pos_m[part], part.start) for part in parts]
+    sizes = [len(positions) for positions, _ in given]
+    found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
+    return replace(join_traces(found), options=tracer.options)
+
+
+def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int]) -> TraceResult:
+    return tracer.trace(part[0], first_row=part[1])
 
 
 def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
@@ -192,37 +240,56 @@ def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
     return merged
 
 
-def predict_traced(folder: Path, tx_pos_m: FloatArray) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """What the receivers of a traced run report of new transmitter positions.
+class TracedRun:
+    """A traced run, ready to predict.
 
-    Args:
-        folder: the run, with one split.
-        tx_pos_m: positions [m, 3], metres.
-
-    Returns:
-        Observations [n_rx, m, ...], and the receivers' names.
-
-    Raises:
-        InputError: not a traced run, or one over several splits whose offsets differ.
+    Attributes:
+        names: of the receivers.
     """
-    config = read_trace_config(folder)
-    record = load_record(config.dataset)
-    instrument = instrument_of(record)
-    traced = load_trace(folder / PATHS)
-    tracer = _tracer_of(config, traced, instrument)
-    new = tracer.trace(tx_pos_m)
-    names = tuple(receiver.name for receiver in instrument.receivers)
-    if record.task != "rssi":
-        return instrument.observe(new.paths), names
-    if not (folder / SPLIT).exists():
-        raise InputError(f"{folder}: offsets for each block; trace with --split official to predict")
-    rows = load_rows(folder, record)
-    if config.calibration is not None:
-        calibration = load_calibration(folder / CALIBRATION)
-        return _with_floor(calibrated_rssi(calibration, new, tracer.scene), record, rows), names
-    old = instrument.observe(traced.paths)
-    known = rows.all_train
-    return fit_offsets(old[:, known], record.observation[:, known])(instrument.observe(new.paths)), names
+
+    def __init__(self, folder: Path) -> None:
+        """Open a run with one split.
+
+        Raises:
+            InputError: not a traced run, or one over several splits whose offsets differ.
+        """
+        config = read_trace_config(folder)
+        self._record = record = load_record(config.dataset)
+        self._instrument = instrument = instrument_of(record)
+        traced = load_trace(folder / PATHS)
+        self._tracer = _tracer_of(config, traced, instrument)
+        self.names = tuple(receiver.name for receiver in instrument.receivers)
+        self._calibration: Calibration | None = None
+        self._offsets: Callable[[FloatArray], FloatArray] | None = None
+        if record.task != "rssi":
+            return
+        if not (folder / SPLIT).exists():
+            raise InputError(f"{folder}: offsets for each block; trace with --split official to predict")
+        self._rows = load_rows(folder, record)
+        if config.calibration is not None:
+            self._calibration = load_calibration(folder / CALIBRATION)
+            return
+        known = self._rows.all_train
+        self._offsets = fit_offsets(instrument.observe(traced.paths)[:, known], record.observation[:, known])
+
+    def predict(self, tx_pos_m: FloatArray, first_row: int = 0) -> NDArray[Any]:
+        """What the receivers report of new transmitter positions.
+
+        Args:
+            tx_pos_m: positions [m, 3], metres.
+            first_row: what errors call the first of them.
+
+        Returns:
+            Observations [n_rx, m, ...].
+
+        Raises:
+            InputError: a position inside a solid object.
+        """
+        new = self._tracer.trace(tx_pos_m, first_row=first_row)
+        if self._calibration is not None:
+            return _with_floor(calibrated_rssi(self._calibration, new, self._tracer.scene), self._record, self._rows)
+        observed = self._instrument.observe(new.paths)
+        return observed if self._offsets is None else self._offsets(observed)
 
 
 def _tracer_of(config: TraceConfig, traced: TraceResult, instrument: Instrument) -> RayTracer:

@@ -16,6 +16,7 @@ does not grow with the number of layers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -133,15 +134,28 @@ def _add(record: list[Any], weights: list[Any], so_far: _Sum, product: bool) -> 
     )
 
 
+def _brightest(so_far: _Sum, product: bool) -> Any:
+    """Largest |T|^2 of a lane's pixels."""
+    squares = [x * x + y * y if product else x * x for x, y in zip(so_far.t_re, so_far.t_im, strict=True)]
+    return reduce(dr.maximum, squares)
+
+
 @dr.syntax
-def _forward(table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int) -> tuple[Any, Any]:
+def _forward(
+    table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, early: bool = False
+) -> tuple[Any, Any]:
     float_type, index_type = type(table), type(lists.index)
     lanes = _lanes(plane, lists, n, batch)
     fields = 13 if product else 12
     state = _start(float_type)
-    j = index_type(0)
-    while j < lanes.end:
-        record = read(table, dr.gather(index_type, lists.index, lanes.start + j), fields)
+    j, end = index_type(0), index_type(lanes.end)
+    while j < end:
+        i = dr.gather(index_type, lists.index, lanes.start + j)
+        if dr.hint(early, mode="scalar"):
+            # This Gaussian is the lane's last once it and all behind it can send no more than what is allowed.
+            reach = dr.gather(float_type, table, i * RECORD + fields)
+            end = dr.select(_brightest(state, product) * reach * reach <= 1, j, end)
+        record = read(table, i, fields)
         along = _along_azimuth(record, lanes.azimuth)
         state = _add(record, [_footprint(along, e)[0] for e in lanes.elevation], state, product)
         j += 1
@@ -274,12 +288,21 @@ def _backward(
 class _Blend(dr.CustomOp):
     """Blending as one differentiable operation over per-Gaussian columns."""
 
-    def eval(self, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, columns: list[Any]) -> Any:
+    def eval(
+        self,
+        lists: TileLists,
+        plane: Plane,
+        n: int,
+        product: bool,
+        batch: int,
+        columns: list[Any],
+        reach: Any | None,
+    ) -> Any:
         self.parts = (lists, plane, n, product, batch)
         self.count = len(columns)
-        self.table = pack(columns)
+        self.table = pack(columns if reach is None else [*columns, reach])
         dr.eval(self.table)
-        self.total = _forward(self.table, *self.parts)
+        self.total = _forward(self.table, *self.parts, reach is not None)
         dr.eval(self.total)
         return self.total
 
@@ -303,6 +326,7 @@ def blend(
     batch: int,
     opacity: Any | None = None,
     attenuation: list[Any] | None = None,
+    reach: Any | None = None,
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel.
 
@@ -314,13 +338,20 @@ def blend(
         batch: number of transmitters.
         opacity: array [batch * n] in [0, 1); alpha blending.
         attenuation: complex factor delta (re, im), |delta| < 1; product blending.
+        reach: bound of what a Gaussian and all behind it send (`wrf_mi.splat.skip.behind`) in units of the error
+            that is allowed, [batch * n]; a pixel's walk then ends once T times it is below 1. None: walk to the end.
 
     Returns:
         Real and imaginary part of R, arrays [batch * height * width], row-major. Differentiable in
         footprints, signal, and opacity or attenuation.
+
+    Raises:
+        ValueError: gradients of walks that end early, which are not bounded.
     """
     product = attenuation is not None
     n = dr.width(signal[0]) // batch
     own = attenuation if attenuation is not None else [opacity]
     columns = [*footprints.direction, *footprints.whitened[0], *footprints.whitened[1], *signal, *own]
-    return dr.custom(_Blend, lists, plane, n, product, batch, columns)
+    if reach is not None and dr.grad_enabled(columns):
+        raise ValueError("blend: walks that end early give no gradients; leave skip.rest at 0 in training")
+    return dr.custom(_Blend, lists, plane, n, product, batch, columns, reach)

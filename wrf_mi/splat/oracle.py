@@ -81,7 +81,8 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
     mean = np.asarray(mean_m, float)
     to_world = receiver.to_world
     centre = (mean - receiver.position_m) @ to_world  # each row R^T (mu - x_rx)
-    depth = np.linalg.norm(centre, axis=-1)
+    # Of the offset as it is: turned into the receiver's frame, equal depths differ in the last digit.
+    depth = np.linalg.norm(mean - receiver.position_m, axis=-1)
     near = depth < NEAR_M
     direction = np.where(near[:, None], [1.0, 0.0, 0.0], centre / np.where(near, 1.0, depth)[:, None])
     basis = tangent_basis(direction)

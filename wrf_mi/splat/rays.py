@@ -277,6 +277,6 @@ def blend_rays(
     factor = [] if walls is None else [walls.factor_re, walls.factor_im]
 
     def setting(table: Any, own_factor: list[Any]) -> _Setting:
-        return _Setting(table, own_factor, lists, bundles, product, footprints.depth, walls)
+        return _Setting(table, own_factor, lists, bundles, product, type(table)(footprints.depth), walls)
 
     return dr.custom(_BlendRays, setting, columns, factor)

@@ -4,24 +4,41 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+
 from ..field.gaussians import Gaussians
 from ..project.footprint import Pose, depth_order, project
 from .blend import blend
+from .skip import NOTHING, Skip, behind, negligible
 from .tiles import Plane, build_lists
 
 
-def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
+def splat(gaussians: Gaussians, pose: Pose, plane: Plane, skip: Skip = NOTHING) -> tuple[Any, Any]:
     """Received complex signal per direction for each transmitter of the batch.
 
     Args:
         gaussians: of one field for ``batch`` transmitters.
         pose: of the receiver.
         plane: the receiver's perception plane, see `wrf_mi.splat.perception_plane`.
+        skip: what is not evaluated, with bounds on the error.
 
     Returns:
         Real and imaginary part, arrays [batch * height * width], row-major.
     """
+    if not gaussians.count:
+        dark = type(gaussians.position[0])
+        return dr.zeros(dark, gaussians.batch * plane.pixels), dr.zeros(dark, gaussians.batch * plane.pixels)
     footprints = project(gaussians, pose)
     order = depth_order(footprints.depth, gaussians.position)
-    lists = build_lists(footprints, order, plane, gaussians.batch)
-    return blend(footprints, gaussians.signal, lists, plane, gaussians.batch, gaussians.opacity, gaussians.attenuation)
+    parts = (gaussians.opacity, gaussians.attenuation)
+    reach = None
+    if skip.error:
+        seen, product = footprints.visible, gaussians.attenuation is not None
+        sent, beyond = behind(gaussians.signal, seen, order, gaussians.batch, product)
+        if skip.contribution:
+            small = negligible(gaussians.signal, beyond, gaussians.batch, skip.contribution, *parts)
+            footprints.visible = seen & ~small
+        if skip.rest:
+            reach = sent * (1 / skip.rest)
+    lists = build_lists(footprints, order, plane, gaussians.batch, skip.boxes)
+    return blend(footprints, gaussians.signal, lists, plane, gaussians.batch, *parts, reach)

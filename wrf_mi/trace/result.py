@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.paths import read_paths_file, save_paths
-from .buffer import Legs
+from .buffer import Legs, join
 from .fields import UPRIGHT, path_gains, scattering_materials, sionna_orientation
 from .options import TraceOptions
 from .surfaces import Surfaces, scene_surfaces
@@ -109,6 +110,41 @@ def recompute(traced: TraceResult, scene: Any, pattern: str = "iso") -> TraceRes
     with scattering_materials(scene, traced.options):
         gain = path_gains(scene, surfaces, traced.legs(surfaces), *traced.ends(), traced.rays, pattern)
     return replace(traced, paths=replace(traced.paths, gain=gain), frequency_hz=float(scene.frequency[0]))
+
+
+def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
+    """The trace of all transmitters from traces of consecutive ones, with the same receivers, scene and options."""
+    first = parts[0]
+    starts = np.cumsum([0, *(part.paths.n_tx for part in parts)])
+    tx = np.concatenate([part.paths.tx + start for part, start in zip(parts, starts[:-1], strict=True)])
+    # Stable: the paths of a pair of devices all come from one part and keep their order.
+    order = np.lexsort((tx, np.concatenate([part.paths.rx for part in parts])))
+    legs = [
+        Legs(
+            p.paths.tx,
+            p.paths.rx,
+            p.paths.interactions,
+            p.primitives.astype(np.int64),
+            p.paths.vertices_m,
+            p.probability,
+            p.wedge,
+        )
+        for p in parts
+    ]
+    joined = join(legs, first.primitives.shape[1]).select(order)
+    names = ("rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part.paths, name) for part in parts])[order] for name in names
+    }
+    paths = replace(first.paths, tx=tx[order], n_tx=int(starts[-1]), **arrays)
+    return replace(
+        first,
+        paths=paths,
+        tx_pos_m=np.concatenate([part.tx_pos_m for part in parts]),
+        primitives=joined.face.astype(np.int32),
+        probability=joined.probability,
+        wedge=joined.wedge,
+    )
 
 
 def save_trace(file: str | Path, traced: TraceResult) -> Path:

@@ -72,6 +72,7 @@ def trace_paths(
     options: TraceOptions = DEFAULTS,
     progress: bool = False,
     prepared: Prepared | None = None,
+    first_row: int = 0,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
@@ -92,6 +93,7 @@ def trace_paths(
         progress: show a progress bar on standard error.
         prepared: of the scene, where one traces again and again to the same receivers: rays then always go out from
             these, and only the first time.
+        first_row: what errors call the first transmitter, where one traces in parts.
 
     Returns:
         The paths, the same for the same seed whatever the parts. Lengths and directions are float64: a float32 length
@@ -109,13 +111,12 @@ def trace_paths(
         raise InputError(f"trace_paths: {len(positions)} transmitters and {len(everyone)} receivers; give one at least")
     kept = prepared or Prepared(scene)
     surfaces = kept.surfaces
-    check_devices(surfaces, positions, [f"transmitter {row + 1}" for row in range(len(positions))])
+    check_devices(surfaces, positions, [f"transmitter {first_row + row + 1}" for row in range(len(positions))])
     check_devices(
         surfaces, np.stack([one.position_m for one in everyone]), [f"receiver {one.name}" for one in everyone]
     )
     ends, angles = device_ends(positions, everyone, options.upright)
-    # Sionna RT's diffraction at lossy wedges is a heuristic that is not reciprocal: its direction is kept.
-    swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not (options.diffraction and options.sampled)
+    swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not keeps_direction(options)
     if swap:
         ends, angles = (ends[1], ends[0]), (angles[1], angles[0])
     rays = kept.rays(*ends, options)
@@ -123,6 +124,14 @@ def trace_paths(
         legs = _search(scene, kept, ends, options, rays, progress)
         gain = path_gains(scene, surfaces, legs, ends, angles, rays)
     return _result(legs, gain, surfaces, positions, everyone, options, rays, swap, float(scene.frequency[0]))
+
+
+def keeps_direction(options: TraceOptions) -> bool:
+    """Whether transmitters search, though receivers are fewer.
+
+    Sionna RT's diffraction at lossy wedges is a heuristic that is not reciprocal.
+    """
+    return options.diffraction and options.sampled
 
 
 def _search(

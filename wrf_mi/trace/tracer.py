@@ -13,9 +13,9 @@ from ..core import InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
 from ..receive import bartlett_spectrum, csi, element_signals, minmax_scale, rssi_dbm
 from .options import DEFAULTS, TraceOptions
-from .result import TraceResult
+from .result import TraceResult, device_ends
 from .scenes import open_scene
-from .solve import Prepared, trace_paths
+from .solve import Prepared, keeps_direction, trace_paths
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,15 @@ class RayTracer:
         self.scene = open_scene(scene, instrument.carrier_hz, material=material)
         self._prepared = Prepared(self.scene)
 
-    def trace(self, tx_pos_m: ArrayLike, progress: bool = False) -> TraceResult:
-        """Paths from transmitter positions [n, 3] (metres) to all receivers."""
-        return trace_paths(self.scene, tx_pos_m, self.instrument.receivers, self.options, progress, self._prepared)
+    def trace(self, tx_pos_m: ArrayLike, progress: bool = False, first_row: int = 0) -> TraceResult:
+        """Paths from transmitter positions [n, 3] (metres), ``first_row`` and following, to all receivers."""
+        receivers = self.instrument.receivers
+        return trace_paths(self.scene, tx_pos_m, receivers, self.options, progress, self._prepared, first_row)
+
+    def rays(self, tx_pos_m: ArrayLike) -> int:
+        """How many rays search if these positions [n, 3] (metres) are the first: ``"auto"`` is settled on them."""
+        ends = device_ends(np.asarray(tx_pos_m, float), self.instrument.receivers, self.options.upright)[0]
+        return self._prepared.rays(*(ends if keeps_direction(self.options) else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
         """What every receiver reports for transmitter positions [n, 3] (metres), [n_rx, n, ...]."""

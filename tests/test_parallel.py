@@ -1,0 +1,171 @@
+"""Parts on workers: order, what is opened once, lost workers, errors, what is refused."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+import worker_tasks
+from calling import refused
+from worker_tasks import Lossy
+
+from wrf_mi.backend import init
+from wrf_mi.core import InputError
+from wrf_mi.parallel import Scheduler, SchedulerFailed, open_scheduler, row_parts, run_module, scheduler, worker
+from wrf_mi.parallel.progress import Parts
+from wrf_mi.parallel.worker import this_place
+
+SECONDS = 60
+"""For a process of ours to start on a busy machine."""
+
+
+@pytest.fixture(scope="module")
+def two() -> Iterator[Scheduler]:
+    """Two workers on this machine."""
+    with open_scheduler("local:2") as workers:
+        yield workers
+
+
+@pytest.mark.parametrize(("count", "workers", "least", "most"), [(1, 3, 1, 9), (100, 2, 1, 1000), (100, 2, 30, 60)])
+def test_parts_cover_all_rows_once(count: int, workers: int, least: int, most: int) -> None:
+    parts = row_parts(count, workers, least, most)
+    assert [row for part in parts for row in range(count)[part]] == list(range(count))
+    sizes = [part.stop - part.start for part in parts]
+    assert all(least <= size <= most for size in sizes[:-1])
+
+
+def test_large_parts_are_cut_and_small_ones_shared() -> None:
+    assert len(row_parts(100_000, 1, 1, 1000)) == 100
+    assert len(row_parts(80, 2)) == 16
+
+
+def test_results_come_in_order_and_once(two: Scheduler, capsys: pytest.CaptureFixture[str]) -> None:
+    heard: list[tuple[int, int]] = []
+    assert two.map(worker_tasks.double, range(20), what="doubling") == list(range(0, 40, 2))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 10
+    assert lines[-1] == "doubling: 20 of 20, 2 workers"
+    assert two.map(worker_tasks.double, range(5), each=lambda *one: heard.append(one)) == [0, 2, 4, 6, 8]
+    assert sorted(heard) == [(k, 2 * k) for k in range(5)]
+    assert two.map(worker_tasks.double, []) == []
+
+
+def test_serial_is_the_same_in_this_process() -> None:
+    heard: list[tuple[int, int]] = []
+    with open_scheduler(None) as serial:
+        assert serial.map(worker_tasks.double, [3, 1], each=lambda *one: heard.append(one)) == [6, 2]
+        assert serial.map(pow, [2, 3], lambda: 2) == [4, 8]
+    assert heard == [(0, 6), (1, 2)]
+
+
+def test_workers_stand_where_the_client_does_and_open_once(
+    two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WRF_MI_DATA", "elsewhere")
+    found = two.map(worker_tasks.place_of, range(12), partial(worker_tasks.opened, tmp_path))
+    processes = {process for process, *_ in found}
+    assert os.getpid() not in processes
+    assert len(processes) <= two.workers
+    assert {tuple(rest) for _, *rest in found} == {(str(tmp_path), "elsewhere", init().variant)}
+    assert len(list(tmp_path.glob("opened-*"))) == len(processes)
+
+
+def test_lost_worker_loses_nothing(two: Scheduler, tmp_path: Path) -> None:
+    lossy = Lossy(two, tmp_path)
+    assert lossy.map(worker_tasks.double, range(9)) == list(range(0, 18, 2))
+    lossy.assert_one_was_lost()
+
+
+def test_part_that_kills_every_worker_is_given_up(two: Scheduler) -> None:
+    with pytest.raises(SchedulerFailed, match="computing: 4 workers in a row ended in one part"):
+        two.map(worker_tasks.die, [0])
+    assert two.map(worker_tasks.double, [1]) == [2]
+
+
+def test_errors_of_parts_are_raised_as_they_are(two: Scheduler) -> None:
+    with pytest.raises(InputError, match=r"^part -1: negative; give another$"):
+        two.map(worker_tasks.refuse_negative, [1, 2, -1, 3])
+    with pytest.raises(ZeroDivisionError, match="no such number"):
+        two.map(worker_tasks.fail, [1])
+    assert two.map(worker_tasks.refuse_negative, [4]) == [4]
+
+
+def test_other_versions_and_folders_are_refused(
+    two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = this_place()
+    monkeypatch.chdir(tmp_path)  # is put back after the worker's own change of folder
+    other = worker.Place(place.folder, (), place.backend, (("drjit", "0.1"),))
+    with pytest.raises(InputError, match=r"drjit 1\.5\.0, but 0\.1 where the command runs; install the same"):
+        worker.run_part(other, "", None, worker_tasks.double, 1)
+    gone = worker.Place(str(tmp_path / "gone"), (), place.backend, place.versions)
+    with pytest.raises(InputError, match=r"cannot enter .*gone .*run the command in a folder that workers see"):
+        worker.run_part(gone, "", None, worker_tasks.double, 1)
+
+
+def test_where_it_cannot_compute_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduler, "CONNECT_S", 0.2)
+    positions = tmp_path / "tx.csv"
+    positions.write_text("x,y,z\n1,1,1\n")
+    call = ["predict", tmp_path, "--tx", positions, "--out", tmp_path / "p.npz", "--scheduler"]
+    for wrong, message in (
+        ("locals", "expected local, local:N or the address"),
+        ("local:0", "give the number of workers, 1 or more"),
+        ("tcp://127.0.0.1:1", "no Dask scheduler answers there"),
+        ("nonsense://127.0.0.1:1", "no Dask scheduler answers there"),
+    ):
+        refused([*call, wrong], message, capsys)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    refused([*call, "local:2"], r"pip install 'wrf-mi\[cluster\]'", capsys)
+    assert not (tmp_path / "p.npz").exists()
+
+
+def test_waiting_for_a_worker_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with Parts("tracing", 2, lines=True) as bar:
+        bar.waiting()
+        bar.waiting()
+        bar.advance(1, 1)
+    assert capsys.readouterr().err.splitlines() == [
+        "tracing: waiting for a worker to connect to the scheduler",
+        "tracing: 1 of 2, 1 worker",
+    ]
+
+
+def test_child_ends_with_its_parent(tmp_path: Path) -> None:
+    """Even a parent that is killed."""
+    (tmp_path / "sleeper.py").write_text(
+        "import os, pathlib, time\npathlib.Path('pid').write_text(str(os.getpid()))\ntime.sleep(600)\n"
+    )
+    code = "from wrf_mi.parallel import run_module; run_module('sleeper', [])"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment)
+    until = time.monotonic() + SECONDS
+    pid = tmp_path / "pid"
+    while not (pid.exists() and pid.read_text()) and time.monotonic() < until:
+        time.sleep(0.05)
+    child = int(pid.read_text())
+    os.kill(child, 0)
+    parent.kill()
+    parent.wait()
+    while time.monotonic() < until:
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail("the child lives on")
+
+
+def test_child_reports_status_and_last_line() -> None:
+    status, said = run_module("wrf_mi.cli", ["predict", "--no-such-option"], quiet=True)
+    assert status == 2
+    assert said.startswith("wrf-mi predict: ")

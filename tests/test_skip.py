@@ -1,0 +1,192 @@
+"""What predictions leave out: each bound on the error holds, and each switch saves something."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
+from wrf_mi.core import Receiver  # noqa: E402
+from wrf_mi.core.angles import pixel_directions  # noqa: E402
+from wrf_mi.field.gaussians import Gaussians  # noqa: E402
+from wrf_mi.project.footprint import Pose, depth_order, project  # noqa: E402
+from wrf_mi.project.footprint_constants import CUTOFF  # noqa: E402
+from wrf_mi.splat import oracle  # noqa: E402
+from wrf_mi.splat.render import splat  # noqa: E402
+from wrf_mi.splat.skip import Skip, behind, negligible  # noqa: E402
+from wrf_mi.splat.tiles import build_lists, perception_plane  # noqa: E402
+
+Float64 = dr.float64_array_t(mi.Float)
+RECEIVER = Receiver("r", np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.3, 0.2, 0.9]))
+POSE = Pose(
+    [Float64(float(x)) for x in RECEIVER.position_m],
+    [[Float64(float(x)) for x in row] for row in RECEIVER.to_world],
+)
+SIZE = (23, 61)
+COUNT, BATCH = 40, 2
+ROUNDING = 1e-12
+"""Float64 sums of some tens of numbers near one."""
+
+
+def fields(seed: int, product: bool, low: float = 0.05, high: float = 0.999, count: int = COUNT) -> Gaussians:
+    """Gaussians all around the receiver, below its horizon too, signals of two decades, some nearly opaque."""
+    rng = np.random.default_rng(seed)
+    where = rng.normal(0, 1.5, (3, count)) + RECEIVER.position_m[:, None]
+    where[:, 0] = RECEIVER.position_m + 0.01  # contains the receiver
+    strength = 10 ** rng.uniform(-2, 0, BATCH * count) * np.exp(2j * np.pi * rng.random(BATCH * count))
+    alpha = rng.uniform(low, high, BATCH * count)
+    delta = (1 - alpha) * np.exp(2j * np.pi * rng.random(BATCH * count))
+    return Gaussians(
+        position=[Float64(x) for x in where],
+        scale=[Float64(np.exp(rng.normal(-1, 0.7, BATCH * count))) for _ in range(3)],
+        rotation=[Float64(x) for x in rng.standard_normal((4, BATCH * count))],
+        signal=[Float64(strength.real.copy()), Float64(strength.imag.copy())],
+        opacity=None if product else Float64(alpha),
+        attenuation=[Float64(delta.real.copy()), Float64(delta.imag.copy())] if product else None,
+        batch=BATCH,
+    )
+
+
+def image(gaussians: Gaussians, skip: Skip) -> np.ndarray:
+    re, im = splat(gaussians, POSE, perception_plane(*SIZE, Float64), skip)
+    return re.numpy() + 1j * im.numpy()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32), st.booleans())
+def test_boxes_change_nothing(seed: int, product: bool) -> None:
+    """Below the horizon, behind the receiver, across the seam: what is in no list reaches no pixel of its tile."""
+    gaussians = fields(seed, product)
+    np.testing.assert_allclose(image(gaussians, Skip()), image(gaussians, Skip(boxes=False)), atol=ROUNDING)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 2**32),
+    st.booleans(),
+    st.sampled_from([0.0, 1e-3, 0.03, 0.3]),
+    st.sampled_from([0.0, 1e-3, 0.03, 0.3]),
+)
+def test_skips_stay_within_their_bounds(seed: int, product: bool, contribution: float, rest: float) -> None:
+    gaussians = fields(seed, product)
+    skip = Skip(contribution=contribution, rest=rest)
+    error = np.abs(image(gaussians, skip) - image(gaussians, Skip()))
+    assert error.max() <= skip.error + ROUNDING
+
+
+@pytest.mark.parametrize("product", [False, True])
+def test_early_end_ends_early(product: bool) -> None:
+    """Behind an opaque wall of Gaussians nothing is walked: what it hides may be anything that is not a number."""
+    gaussians = fields(3, product, 0.99, 0.999)
+    depth = project(gaussians, POSE).depth
+    n, far = gaussians.count, np.argsort(depth.numpy())[COUNT // 2 :]
+    front = np.ones(BATCH * n, bool)
+    for b in range(BATCH):
+        front[b * n + far] = False
+    # The front half covers the whole sphere, several times over.
+    gaussians.scale = [dr.select(dr.mask_t(Float64)(front), 40.0, s) for s in gaussians.scale]
+    if product:
+        assert gaussians.attenuation is not None
+        gaussians.attenuation = [0.02 * d for d in gaussians.attenuation]
+    exact, early = image(gaussians, Skip()), image(gaussians, Skip(rest=1e-3))
+    assert 0 < np.abs(exact - early).max() <= 1e-3
+
+
+def test_early_end_gives_no_gradients() -> None:
+    gaussians = fields(0, False)
+    dr.enable_grad(gaussians.signal)
+    with pytest.raises(ValueError, match="give no gradients"):
+        image(gaussians, Skip(rest=1e-3))
+
+
+@pytest.mark.parametrize("product", [False, True])
+def test_negligible_ones_are_found(product: bool) -> None:
+    """Gaussians that neither send nor hide are left out, however many; the others stay."""
+    gaussians = fields(5, product)
+    idle = np.arange(BATCH * COUNT) % 4 == 1
+    mask = dr.mask_t(Float64)(idle)
+    gaussians.signal = [dr.select(mask, 1e-6, s) for s in gaussians.signal]
+    if product:
+        assert gaussians.attenuation is not None
+        gaussians.attenuation = [
+            dr.select(mask, v, d) for v, d in zip((1 - 1e-6, 0), gaussians.attenuation, strict=True)
+        ]
+    else:
+        gaussians.opacity = dr.select(mask, 1e-6, gaussians.opacity)
+    footprints = project(gaussians, POSE)
+    order = depth_order(footprints.depth, gaussians.position)
+    _, beyond = behind(gaussians.signal, footprints.visible, order, BATCH, product)
+    found = negligible(gaussians.signal, beyond, BATCH, 1e-3, gaussians.opacity, gaussians.attenuation).numpy()
+    assert found[idle].all()
+    assert found[~idle].mean() < 0.2
+
+
+def test_what_is_behind_is_bound() -> None:
+    """M against its definition in NumPy."""
+    gaussians = fields(6, False)
+    footprints = project(gaussians, POSE)
+    order = depth_order(footprints.depth, gaussians.position)
+    strength = np.hypot(*(s.numpy() for s in gaussians.signal)) * footprints.visible.numpy()
+    for product, reduce in ((False, np.max), (True, np.sum)):
+        own, beyond = (a.numpy() for a in behind(gaussians.signal, footprints.visible, order, BATCH, product))
+        for b in range(BATCH):
+            there = b * COUNT + order.numpy()
+            for k, i in enumerate(there):
+                np.testing.assert_allclose(own[i], reduce(strength[there[k:]]), rtol=1e-9)
+                np.testing.assert_allclose(beyond[i], reduce(np.append(strength[there[k + 1 :]], 0)), rtol=1e-9)
+
+
+def test_boxes_shorten_lists() -> None:
+    gaussians = fields(1, False)
+    footprints = project(gaussians, POSE)
+    order = depth_order(footprints.depth, gaussians.position)
+    plane = perception_plane(*SIZE, Float64)
+    lengths = [build_lists(footprints, order, plane, BATCH, by_box).length.numpy().mean() for by_box in (True, False)]
+    assert lengths[0] < 0.7 * lengths[1]
+    assert lengths[1] == COUNT - 1  # all but the one that contains the receiver
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32))
+def test_cut_off_stays_within_its_bound(seed: int) -> None:
+    """Footprints end at three standard deviations, where their weight is at most exp(-4.5) of the opacity.
+
+    Taking a weight away from a pixel changes it by less than weight * (|S| + M), `wrf_mi.splat.skip`.
+    """
+    gaussians, n = fields(seed, False), COUNT
+    with pytest.MonkeyPatch.context() as patch:
+        images = []
+        for cutoff in (CUTOFF, 9.0):
+            patch.setattr(oracle, "CUTOFF", cutoff)
+            images.append(_oracle(gaussians))
+    strength = np.hypot(*(s.numpy()[:n] for s in gaussians.signal))
+    bound = np.exp(-0.5 * CUTOFF**2) * (gaussians.opacity.numpy()[:n] * (strength + strength.max())).sum()
+    error = np.abs(images[0] - images[1]).max()
+    assert 0 < error <= bound
+
+
+def _oracle(gaussians: Any) -> np.ndarray:
+    own = slice(0, COUNT)
+
+    def stack(parts: list[Any]) -> np.ndarray:
+        return np.stack([p.numpy()[own] for p in parts], axis=1)
+
+    return oracle.render(
+        stack(gaussians.position),
+        stack(gaussians.scale),
+        stack(gaussians.rotation),
+        stack(gaussians.signal) @ np.array([1, 1j]),
+        RECEIVER,
+        pixel_directions(*SIZE),
+        opacity=gaussians.opacity.numpy()[own],
+    )

@@ -1,0 +1,110 @@
+"""Depth, rays and kinds of path by convergence: the error stays within the target."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room, write_xml
+
+from wrf_mi.cli import main
+from wrf_mi.core import InputError, Record
+from wrf_mi.receive import rssi_dbm
+from wrf_mi.report.traced import CONVERGENCE, trace_run
+from wrf_mi.trace import TraceOptions, trace_paths
+from wrf_mi.trace.target import choose_options, remainder
+
+RX = receiver([3.1, 2.2, 1.5])
+PLAIN = TraceOptions(upright=True)
+FINE = replace(PLAIN, max_depth=6, rays=1 << 16)
+"""Three interactions more than a target of 1.5 dB takes here; each adds a third of what the last did."""
+
+
+@pytest.fixture(scope="module")
+def shoebox(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return room(tmp_path_factory.mktemp("shoebox"))
+
+
+@pytest.fixture(scope="module")
+def fine(shoebox: Any) -> np.ndarray:
+    """Received power of ten positions, much finer."""
+    return rssi_dbm(trace_paths(shoebox, inside(10), RX, FINE).paths)
+
+
+@pytest.mark.parametrize("target_db", [4.0, 1.5])
+def test_error_is_within_the_target(target_db: float, shoebox: Any, fine: np.ndarray) -> None:
+    """Against a much finer trace, at positions that were not in the sample too."""
+    choice = choose_options(shoebox, inside(10)[:5], RX, target_db, PLAIN, kinds=())
+    assert choice.reached
+    assert choice.options.max_depth < FINE.max_depth
+    coarse = rssi_dbm(trace_paths(shoebox, inside(10), RX, choice.options).paths)
+    assert np.abs(coarse - fine).max() <= target_db
+
+
+def test_a_smaller_error_takes_more(shoebox: Any) -> None:
+    rough, good = (choose_options(shoebox, inside(1), RX, db, PLAIN, kinds=()) for db in (8.0, 0.1))
+    assert rough.options.max_depth < good.options.max_depth
+    assert good.error_db < rough.error_db
+
+
+def test_diffraction_is_switched_on_where_it_counts(shoebox: Any, tmp_path: Path) -> None:
+    """Not in a box without edges into the open; the report says what was tried."""
+    choice = choose_options(shoebox, inside(2), RX, 4.0, PLAIN, kinds=("diffraction",))
+    assert not choice.options.diffraction
+    parts = [trial.part for trial in choice.trials]
+    assert parts[0] == "depth"
+    assert parts[-1] == "diffraction"
+    assert "scattering" not in parts
+    # Behind a partition that reaches the ceiling, seen round its edge alone.
+    alone = room(tmp_path, PARTITION)
+    shadow = choose_options(alone, np.array([[1.0, 2.0, 1.0]]), receiver([5.0, 2.0, 1.0]), 1.0, PLAIN)
+    assert shadow.options.diffraction
+
+
+def test_what_is_still_to_come() -> None:
+    """Of 1 + 1/2 + 1/4 + ... as much again as the last; nothing where it has ended; no guess where it grows."""
+    assert remainder([1.0, 0.5]) == pytest.approx(0.5)
+    assert remainder([1.0, 0.0]) == 0
+    assert remainder([0.5, 1.0]) == np.inf
+    assert remainder([1.0]) == np.inf
+
+
+def test_no_error_cannot_be_asked_for(shoebox: Any) -> None:
+    with pytest.raises(InputError, match="above 0"):
+        choose_options(shoebox, inside(2), RX, 0.0, PLAIN)
+
+
+def test_command_reports_what_was_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And nothing can be both chosen and given."""
+    call = ["trace", "laboratory", "rfid-lab", "--out", str(tmp_path / "run"), "--target-error", "2"]
+    for more, named in ((["--depth", "2"], "--depth"), (["--rays", "auto"], "--rays")):
+        assert main([*call, *more]) == 2
+        assert named in capsys.readouterr().err
+    assert main([*call[:-1], "0"]) == 2
+    assert not (tmp_path / "run").exists()
+
+
+def test_run_states_its_convergence(tmp_path: Path) -> None:
+    scene = write_xml(tmp_path / "scene", SHOEBOX)
+    rows = np.arange(6)
+    record = Record(
+        name="made-here",
+        task="rssi",
+        tx_pos_m=inside(6),
+        receivers=(RX,),
+        observation=np.full((1, 6), -50, np.float32) + rows.astype(np.float32),
+        official=(rows[:4], rows[4:]),
+        frequencies_hz=np.array([FREQUENCY_HZ]),
+    )
+    options = TraceOptions(scattering=False)
+    folder = trace_run(scene, record, tmp_path / "run", options, target_error_db=4.0, kinds=())
+    stated = json.loads((folder / CONVERGENCE).read_text())
+    assert stated["target_db"] == 4.0
+    assert stated["error_db"] <= 4.0
+    assert stated["options"] == yaml.safe_load((folder / "config.yaml").read_text())["options"]
+    assert [t["value"] for t in stated["trials"] if t["part"] == "depth"][:2] == [1, 2]

@@ -1,0 +1,35 @@
+"""A module run by `wrf_mi.parallel.run_module`: ``python -m wrf_mi.parallel.child THREADS MODULE ARGUMENTS``.
+
+Not imported by the package, as Python runs it as the main module.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import signal
+import sys
+import threading
+
+
+def _end_with_parent() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def main(threads: str, module: str, *arguments: str) -> None:
+    """What the child does: watch the pipe, choose threads (0: all cores), and be that module."""
+    # A worker ignores Ctrl-C, and that is inherited.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if int(threads):
+        from ..backend import init
+
+        init(threads=int(threads))
+    sys.argv = [module, *arguments]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

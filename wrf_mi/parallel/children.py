@@ -1,0 +1,75 @@
+"""Modules run as child processes that end with their parent, however that ends.
+
+A worker that is killed cannot stop its children, and its part starts again on another worker: a child that lived on
+would write to the same run folder. So a child holds a pipe from its parent and ends at once when that closes, see
+`wrf_mi.parallel.child`.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+
+from .worker import given_up, worker_threads
+
+POLL_S = 0.5
+GRACE_S = 30.0
+"""For a child that was asked to stop: it finishes its step and writes a checkpoint."""
+
+
+def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None) -> tuple[int, str]:
+    """Run ``python -m module arguments`` and wait for it.
+
+    In a worker the child computes with the worker's number of threads and says nothing; it is stopped, as by Ctrl-C,
+    when the client gives the part up. Elsewhere it writes to this process's standard error.
+
+    Args:
+        module: its name.
+        arguments: of the command line.
+        quiet: keep what it says on standard error instead of showing it; None: in a worker only.
+
+    Returns:
+        The exit status, and the last line on standard error where that was kept.
+
+    Raises:
+        KeyboardInterrupt: in this process; the child has ended then.
+    """
+    threads = worker_threads()
+    kept = threads is not None if quiet is None else quiet
+    call = [sys.executable, "-m", "wrf_mi.parallel.child", str(threads or 0), module, *arguments]
+    with tempfile.TemporaryFile("w+", errors="replace") as said:
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said if kept else None}
+        # In a group of its own: Ctrl-C on a terminal reaches this process, which passes it on once.
+        child = subprocess.Popen(call, process_group=0, **streams)  # type: ignore[call-overload]
+        try:
+            status = _wait(child)
+        except BaseException:
+            _stop(child)
+            raise
+        finally:
+            child.stdin.close()
+        said.seek(0)
+        lines = [line.strip() for line in said if line.strip()]
+    return status, lines[-1] if lines else ""
+
+
+def _wait(child: subprocess.Popen[bytes]) -> int:
+    while True:
+        try:
+            return child.wait(POLL_S)
+        except subprocess.TimeoutExpired:
+            if given_up():
+                return _stop(child)
+
+
+def _stop(child: subprocess.Popen[bytes]) -> int:
+    if child.poll() is None:
+        child.send_signal(signal.SIGINT)
+    try:
+        return child.wait(GRACE_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        return child.wait()

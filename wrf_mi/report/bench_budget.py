@@ -1,0 +1,123 @@
+"""Fields at several budgets: size with networks, time of a spectrum and SSIM, against the best field there is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core import Record
+from ..fit.compress import Compression
+from ..fit.config import TrainConfig, with_settings
+from ..fit.folder import load_predictor, load_rows
+from ..trace import load_record
+from .compressed import compress_run, plain_size, spectrum_times
+from .run_folder import METRICS, read_run
+from .runs import train
+
+BEST = "WRF-GS+"
+"""The best field: the paper's network, all defaults. The others are compared with it."""
+REPEATS = 100
+MOST_LOSS, LEAST_FASTER, LEAST_SMALLER = 0.01, 5.0, 10.0
+"""What a small field is held to: median SSIM that it may lose, and how much faster and smaller it must be."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A field at a budget.
+
+    Attributes:
+        settings: of its fit, beside the defaults.
+        how: what is done to it afterwards; None: nothing.
+        of: the budget by whose fit it starts; "": one of its own.
+    """
+
+    settings: tuple[str, ...]
+    how: Compression | None
+    of: str = ""
+
+
+def _factorised(gaussians: int, terms: int, width: int) -> tuple[str, ...]:
+    sizes = {"initial.gaussians": min(gaussians, 270), "density.most": gaussians}
+    sizes |= {"network.terms": terms, "network.width": width}
+    return ("model=factorised", *(f"{name}={value}" for name, value in sizes.items()))
+
+
+LARGE, HALF, SMALL = "320 Gaussians, 32 terms", "160 of these", "80 Gaussians, 16 terms"
+BUDGETS: Mapping[str, Budget] = {
+    BEST: Budget((), None),
+    LARGE: Budget(_factorised(320, 32, 128), Compression(precision="8bit")),
+    HALF: Budget((), Compression(budget=160, fine_tune=4000, precision="8bit"), of=LARGE),
+    SMALL: Budget(_factorised(80, 16, 64), Compression(precision="8bit")),
+}
+
+
+def _folder_name(name: str) -> str:
+    return name.replace(" ", "-").replace(",", "")
+
+
+def budgets(
+    record: Record, work: Path, schedule: Sequence[str] = (), seed: int = 0, given: Mapping[str, Budget] = BUDGETS
+) -> dict[str, Any]:
+    """Fit a field at each budget on the official split and measure them beside each other.
+
+    Args:
+        record: of spectra, with an official split.
+        work: folder for the runs; one that is finished there is used again.
+        schedule: settings of every fit.
+        seed: of every fit.
+        given: by name; the first is what the others are compared with. What another starts by stands before it.
+
+    Returns:
+        By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
+        `wrf_mi.report.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
+    """
+    folders = {}
+    for name, budget in given.items():
+        fitted = work / _folder_name(budget.of or name)
+        if not budget.of and not (fitted / METRICS).exists():
+            config = with_settings(TrainConfig(seed=seed), [*schedule, *budget.settings])
+            train(record, fitted, config)
+        folders[name] = fitted
+        if budget.how is not None:
+            folders[name] = work / f"{_folder_name(name)}-{budget.how.precision}"
+            if not (folders[name] / METRICS).exists():
+                compress_run(fitted, folders[name], budget.how, record)
+    first = folders[next(iter(folders))]
+    predictors = {name: load_predictor(folder) for name, folder in folders.items()}
+    times = spectrum_times(predictors, record.tx_pos_m[load_rows(first, record).all_train], REPEATS)
+    found, whole = {}, read_run(first).metrics["ssim"]["median"]
+    for name, folder in folders.items():
+        metrics, size = read_run(folder).metrics, plain_size(folder)
+        found[name] = {
+            **{key: metrics[key] for key in ("gaussians", "ssim", "train_seconds")},
+            **times[name],
+            "bytes": size,
+            "times_smaller": plain_size(first) / size,
+            "ssim_loss": whole - metrics["ssim"]["median"],
+        }
+    return found
+
+
+def rows_of(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Rows of the benchmark's table from what `budgets` returns."""
+    asked = f">= {LEAST_FASTER:.0f} times faster, >= {LEAST_SMALLER:.0f} times smaller, SSIM loss <= {MOST_LOSS}"
+    rows = []
+    for index, (name, one) in enumerate(found.items()):
+        value = f"{one['ssim']['median']:.3f} SSIM, {one['bytes'] / 1e3:.0f} kB, {one['ms']:.2f} ms"
+        if index:
+            ratio, low, high = one["times_faster"]
+            value += f": {ratio:.1f} times faster ({low:.1f} to {high:.1f}), {one['times_smaller']:.0f} times smaller"
+        what = f"{name}, 8 bits a weight" if index else f"{name}, {one['gaussians']} Gaussians"
+        rows.append({"what": what, "value": value, "asked": asked if index else ""})
+    return rows
+
+
+def main() -> dict[str, Any]:
+    """Budgets on rfid-lab's official split, with rows for the table."""
+    record = load_record("rfid-lab")
+    with tempfile.TemporaryDirectory() as work:
+        found = budgets(record, Path(work))
+    return {"rows": rows_of(found), "budgets": found}

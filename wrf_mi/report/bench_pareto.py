@@ -1,0 +1,32 @@
+"""Run time against error for every method on the traced room, which needs no data: table, JSON and picture."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from ..trace.furnished import traced_room
+from .figures import save
+from .methods import METHODS, Place
+from .pareto import front, measure_methods, pareto_figure, table
+from .timing import one_blas_thread
+
+ROWS = 400
+"""Of training: as many as somebody measures in a day, and as the hybrid's aim there is stated for."""
+REFERENCE = "volprim_rf_basic, WRF-GS+, 270"
+PICTURE = Path("docs/images/pareto.png")
+"""Written where the command is called in a checkout of the project, and only there."""
+FITS = Path("runs/bench/pareto/fits")
+"""Fitted models below the working directory; what is there already is used again."""
+
+
+def main() -> dict[str, Any]:
+    """Measure `METHODS`, some twenty minutes on two cores, and draw them."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    record, scene = traced_room()
+    with one_blas_thread():
+        points = measure_methods(Place(record, scene, FITS, ROWS), METHODS, REFERENCE)
+    if PICTURE.parent.is_dir():
+        save(pareto_figure(points, f"traced room, {ROWS} training rows, 90 x 360 directions"), PICTURE, dpi=130)
+    return {"rows": table(points), "reference": REFERENCE, "front": front(points), "points": points}

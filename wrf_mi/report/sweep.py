@@ -1,0 +1,341 @@
+"""A sweep: one run for each combination of settings, and a table of their scores.
+
+    OUT/sweep.json                              what all runs share
+    OUT/seed=0,initial.gaussians=150/           a run folder for each combination, named after what varies
+    OUT/scores.csv, scores.md, scores.json      the table
+
+Each run is ``wrf-mi train`` in a process of its own, one after the other or several on the workers of a scheduler. A
+finished one is not run again, one that was stopped goes on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import re
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import InputError, Split
+from ..core.files import one_line, write_atomically
+from ..fit.config import TrainConfig, with_settings
+from ..fit.schedule import plan
+from ..fit.start import initial_gaussians
+from ..hybrid.models import kind_of
+from ..measure import make_splits
+from ..parallel import Scheduler, SerialScheduler, run_module
+from ..trace import TraceOptions, load_record, open_scene
+from ..trace.tracer import instrument_of
+from .evaluate import stored_metrics
+from .metrics import TASKS
+from .run_folder import CONFIG, METRICS
+from .traced import is_traced
+
+OPTIONS = (
+    "dataset",
+    "model",
+    "scene",
+    "material",
+    "split",
+    "n-train",
+    "seed",
+    "preset",
+    "paths",
+    "depth",
+    "reflections",
+    "rays",
+    "calibrate",
+)
+"""What may vary beside settings: DATASET and the options of ``wrf-mi train``."""
+SHARED = "sweep.json"
+SCORES = ("median", "mean", "p10", "p90")
+HEADINGS = {
+    "score": "score",
+    **{key: key for key in SCORES},
+    "reference_median": "blend median",
+    "n_train": "training rows",
+    "n_test": "test rows",
+    "train_seconds": "training, s",
+    "ms_per_sample": "ms per sample",
+    "peak_memory_mb": "peak memory, MB",
+    "status": "status",
+}
+"""Columns of the table behind those that vary."""
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One combination.
+
+    Attributes:
+        folder: of its run.
+        varied: what was chosen for it, by setting or option.
+        arguments: of ``wrf-mi``, without ``--out``.
+    """
+
+    folder: Path
+    varied: Mapping[str, str]
+    arguments: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What `run_sweep` runs.
+
+    Attributes:
+        folder: of the sweep.
+        shared: what all runs have in common, as kept in ``sweep.json``.
+        runs: one for each combination.
+    """
+
+    folder: Path
+    shared: Mapping[str, Any]
+    runs: tuple[SweepRun, ...]
+
+    @property
+    def varied(self) -> list[str]:
+        """Settings and options that vary."""
+        return list(self.runs[0].varied)
+
+
+class SweepFailed(RuntimeError):
+    """Runs of a sweep did not finish; the others are in the table."""
+
+    exit_status = 1
+
+
+def plan_sweep(
+    out: str | Path,
+    vary: Sequence[str],
+    options: Mapping[str, str],
+    settings: Sequence[str] = (),
+    flags: Sequence[str] = (),
+) -> Sweep:
+    """All combinations, the last of ``vary`` changing fastest. Nothing is written.
+
+    Args:
+        out: folder of the sweep.
+        vary: ``KEY=VALUE,VALUE,...`` each, where a key is one of `OPTIONS` or a setting as ``--set`` takes it. Where a
+            value has commas, semicolons separate the values.
+        options: of all runs, keys from `OPTIONS`.
+        settings: ``KEY=VALUE`` of all runs.
+        flags: further arguments of all runs, such as ``--deterministic``.
+
+    Raises:
+        InputError: nothing varies, something does twice, or two runs would have one name.
+    """
+    choices: dict[str, list[str]] = {}
+    fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
+    for text in vary:
+        key, equals, listed = (part.strip() for part in text.partition("="))
+        values = [value.strip() for value in listed.split(";" if ";" in listed else ",")]
+        if not key or not equals or not all(values):
+            raise InputError(f"--vary {text}: expected KEY=VALUE,VALUE,..., such as seed=0,1,2")
+        if key in choices or key in fixed:
+            raise InputError(f"--vary {text}: {key} is given already; give it once")
+        if len(set(values)) < len(values):
+            raise InputError(f"--vary {text}: a value is given twice; leave it out")
+        choices[key] = values
+    if not choices:
+        raise InputError("sweep: nothing varies; give --vary KEY=VALUE,VALUE,... once or more")
+    runs, named = [], set()
+    for chosen in itertools.product(*choices.values()):
+        varied = dict(zip(choices, chosen, strict=True))
+        name = ",".join(f"{key}={_in_name(value)}" for key, value in varied.items())
+        if name in named:
+            raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
+        named.add(name)
+        runs.append(SweepRun(Path(out) / name, varied, _arguments(options, settings, flags, varied)))
+    shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
+    return Sweep(Path(out), shared, tuple(runs))
+
+
+def _arguments(
+    options: Mapping[str, str], settings: Sequence[str], flags: Sequence[str], varied: Mapping[str, str]
+) -> tuple[str, ...]:
+    chosen = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
+    own = [f"{key}={value}" for key, value in varied.items() if key not in OPTIONS]
+    dataset = [chosen.pop("dataset")] if "dataset" in chosen else []
+    given = [part for key, value in chosen.items() for part in (f"--{key}", value)]
+    return "train", *dataset, *given, *flags, *(part for one in (*settings, *own) for part in ("--set", one))
+
+
+def _in_name(value: str) -> str:
+    return re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-"
+
+
+def check_fit(
+    dataset: str,
+    settings: TrainConfig | TraceOptions | tuple[str, ...],
+    scene: str | None,
+    material: str | None,
+    split: tuple[str, int, float | None],
+    calibration: str | None,
+) -> None:
+    """Refuse a run that ``wrf-mi train`` would refuse, before anything is written.
+
+    Args:
+        dataset: name or folder.
+        settings: of a field, of a traced run, or changed ones (``key=value``) of the hybrid.
+        scene: name, folder or file, or None.
+        material: of a bare mesh, or None.
+        split: name, seed, and number or fraction of training rows.
+        calibration: of a traced run, or None.
+
+    Raises:
+        InputError: data, scene, split or settings that cannot be used.
+    """
+    record = _record(dataset)
+    rows = _splits(dataset, split[0], split[1], None if split[2] == 0 and isinstance(settings, tuple) else split[2])
+    if isinstance(settings, TrainConfig):
+        if record.task != "spectrum":
+            raise InputError(f"{record.name}: task {record.task!r}; learned fields are fitted to spectra")
+        for one in rows:
+            plan(settings, one, len(record.receivers))
+            initial_gaussians(settings.initial, record, one.train, np.random.default_rng([settings.seed, 0]))
+        return
+    if isinstance(settings, tuple):
+        with_settings(kind_of(record, scene is not None).settings(), settings)
+        if split[2] == 0 and scene is None:
+            raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
+    elif calibration is not None and record.task != "rssi":
+        raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
+    if scene is not None:
+        _open_scene(scene, instrument_of(record).carrier_hz, material)
+    elif material is not None:
+        raise InputError("--material belongs to a bare mesh; give it with --scene")
+
+
+# Runs of a sweep share most of these.
+_record = lru_cache(maxsize=4)(load_record)
+_open_scene = lru_cache(maxsize=4)(lambda scene, carrier_hz, material: open_scene(scene, carrier_hz, material=material))
+
+
+@lru_cache(maxsize=16)
+def _splits(dataset: str, name: str, seed: int, n_train: float | None) -> list[Split]:
+    return make_splits(_record(dataset), name, seed, n_train)
+
+
+def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
+    """Run what is not finished yet, and write the table.
+
+    Args:
+        sweep: from `plan_sweep`; its folder is made if need be.
+        scheduler: what computes the runs; None: this process, one after the other. Its workers must see its
+            folder, data sets and scenes under the same names.
+
+    Returns:
+        A dictionary for each run: what varies, the keys of `HEADINGS`, ``metrics`` (content of ``metrics.json``) and
+        ``run``, its folder. ``status`` is ``done``, ``kept`` where the run was finished before, else what went wrong.
+
+    Raises:
+        InputError: the folder is that of another sweep, or of something else.
+    """
+    _claim(sweep)
+    heard: dict[int, dict[str, Any]] = {}
+
+    def each(index: int, row: dict[str, Any]) -> None:
+        heard[index] = row
+        # Written after each run: the table of a sweep that takes a day can be looked at any time.
+        _write_table(sweep, [heard[k] for k in sorted(heard)])
+        name, count = sweep.runs[index].folder.name, f"{len(heard)} of {len(sweep.runs)}"
+        print(f"{name}: {_headline(row)} ({count})", file=sys.stderr, flush=True)
+
+    return (scheduler or SerialScheduler()).map(_run, sweep.runs, what="sweeping", each=each)
+
+
+def _claim(sweep: Sweep) -> None:
+    """Make the folder, or see that it belongs to the same sweep, perhaps with other values."""
+    folder, path = sweep.folder, sweep.folder / SHARED
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; choose another --out")
+    if path.exists():
+        try:
+            before = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: not readable ({one_line(error)}); choose another --out") from None
+        if before != sweep.shared:
+            raise InputError(f"{folder}: holds a sweep with other settings than this one; choose another --out")
+    elif folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: exists, is not empty and holds no sweep; choose another --out")
+    else:
+        write_atomically(path, json.dumps(sweep.shared, indent=1) + "\n")
+
+
+def _run(run: SweepRun) -> dict[str, Any]:
+    """One run, in this process's children; its row of the table."""
+    folder = run.folder
+    if (folder / METRICS).exists():
+        return _row(run, "kept")
+    resumable = (folder / CONFIG).exists() and not is_traced(folder)
+    if folder.exists() and not resumable:
+        shutil.rmtree(folder)  # a trace, or a run stopped before its configuration was there: nothing to go on from
+    arguments = ("train", "--resume", str(folder)) if resumable else (*run.arguments, "--out", str(folder))
+    status, said = run_module("wrf_mi.cli", arguments)
+    if status == 0 and (folder / METRICS).exists():
+        return _row(run, "done")
+    return _row(run, said.removeprefix("wrf-mi: ") or f"ended with status {status}")
+
+
+def _row(run: SweepRun, status: str) -> dict[str, Any]:
+    metrics = stored_metrics(run.folder)
+    row: dict[str, Any] = {"run": str(run.folder), **run.varied, **dict.fromkeys(HEADINGS), "status": status}
+    if not metrics:
+        return row | {"metrics": {}}
+    task = TASKS[metrics["task"]]
+    row |= {"score": task.label, "reference_median": metrics["reference"][task.reference]["median"]}
+    row |= {key: metrics[task.block][key] for key in SCORES}
+    row |= {key: metrics[key] for key in HEADINGS if key in metrics}
+    return row | {"metrics": metrics}
+
+
+def _headline(row: Mapping[str, Any]) -> str:
+    return row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
+
+
+def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Say which runs have no scores.
+
+    Raises:
+        SweepFailed: there are such.
+    """
+    failed = [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]
+    if failed:
+        raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {'; '.join(failed)}")
+
+
+def sweep_table(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:
+    """Markdown table of the rows of `sweep`."""
+    columns = [*varied, *HEADINGS.values()]
+    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
+    for row in rows:
+        cells = [_cell(key, row[key]) for key in (*varied, *HEADINGS)]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(key: str, value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3f}" if key in (*SCORES, "reference_median") else f"{value:.1f}"
+    return str(value).replace("|", "\\|")
+
+
+def _write_table(sweep: Sweep, rows: Sequence[Mapping[str, Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, ["run", *sweep.varied, *HEADINGS], extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(sweep.folder / "scores.csv", text.getvalue())
+    write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
+    write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")
