@@ -196,7 +196,7 @@ def test_sizes_of_networks_are_settings() -> None:
     assert (first.width, first.signal_widths, first.layers) == (16, (16, 8), 8)
     terms = field("model=factorised", "network.terms=5", "network.width=16")
     assert (terms.terms, terms.width, terms.layers) == (5, 16, 3)
-    for bad in (("model=wrf-gs", "network.still=true"), ("network.terms=4",)):
+    for bad in (("model=wrf-gs", "network.still=true"), ("model=wrf-gs", "network.phase_hz=1e9"), ("network.terms=4",)):
         with pytest.raises(InputError, match="leave it away"):
             field(*bad)
 

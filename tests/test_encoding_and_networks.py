@@ -160,7 +160,7 @@ def test_wrf_gs_plus_is_the_papers() -> None:
     inputs = {f"{i}.{part}": (256, 60) for i in (0, 4) for part in ("position", "transmitter")}
     heads = {"signal.hidden": (2, 256), "rotation.hidden": (4, 256), "scale.hidden": (3, 256)}
     assert shapes(weights, "deform.") == layers | inputs | heads
-    assert set(WrfGsPlus.per_gaussian) == {name for name in weights if "." not in name}
+    assert set(WrfGsPlus().per_gaussian) == {name for name in weights if "." not in name}
 
 
 @pytest.mark.parametrize("model", FIELDS)

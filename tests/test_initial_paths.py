@@ -4,18 +4,27 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room, write_xml
 
-from wrf_mi.core import InputError, Paths, Record
-from wrf_mi.field import WrfGsPlus
-from wrf_mi.field.initial_paths import gaussians_from_mesh, gaussians_from_paths
-from wrf_mi.fit.config import InitialConfig, TrainConfig, with_settings
-from wrf_mi.fit.start import initial_gaussians
-from wrf_mi.trace import TraceOptions, trace_paths
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
+from wrf_mi.core import InputError, Paths, Record  # noqa: E402
+from wrf_mi.field import WrfGsPlus  # noqa: E402
+from wrf_mi.field.initial_paths import gaussians_from_mesh, gaussians_from_paths  # noqa: E402
+from wrf_mi.fit.config import InitialConfig, TrainConfig, with_settings  # noqa: E402
+from wrf_mi.fit.start import initial_gaussians  # noqa: E402
+from wrf_mi.trace import TraceOptions, trace_paths  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +49,38 @@ def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -
     assert np.linalg.norm(tx - start.position_m[strongest], axis=1).min() < 1.0
     assert start.opacities.argmax() == strongest
     assert np.isclose(np.abs(start.signals).max(), 0.3)
+
+
+def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndarray]) -> None:
+    paths, tx = traced
+    wall = paths.object_names.index("west")
+    own = paths.select(paths.objects[:, 0] == wall)
+    start = gaussians_from_paths(own, tx, (receiver([3.0, 2.0, 1.0]),), 1, np.random.default_rng(0))
+    image = np.column_stack([tx, np.ones(len(tx))]) @ start.image_map[0].T
+    assert np.allclose(image, tx * [-1, 1, 1], atol=1e-4)  # float32 corners of the wall at x = 0
+
+
+@pytest.mark.parametrize("kind", [mi.TensorXf, dr.tensor_t(dr.float64_array_t(mi.Float))])
+def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarray], kind: Any) -> None:
+    paths, tx = traced
+    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
+    plain = WrfGsPlus(layers=2, width=8, skip=1)
+    turning = replace(plain, phase_hz=FREQUENCY_HZ)
+    weights = turning.init(start, np.random.default_rng(0))
+    params = {name: kind(np.asarray(value, float)) for name, value in weights.items()}
+    there = kind(np.ascontiguousarray(tx[:3].T.astype(np.float32).astype(float)))
+    signals = []
+    for field in (plain, turning):
+        re, im = field.gaussians(params, there).signal
+        signals.append((re.numpy() + 1j * im.numpy()).reshape(3, 20))
+    x, place = tx[:3].astype(np.float32).astype(float), weights["position"].T.astype(float)
+    affine = weights["image"].T.reshape(20, 3, 4).astype(float)
+    image = np.einsum("nij,bj->bni", affine, np.column_stack([x, np.ones(3)]))
+    phase = -2 * np.pi * FREQUENCY_HZ / speed_of_light * np.linalg.norm(image - place, axis=2)
+    single = kind is mi.TensorXf
+    # Distances of 10 m in float32: 1e-6 m, 5e-5 rad at this wavelength, in some operations.
+    np.testing.assert_allclose(signals[1], signals[0] * np.exp(1j * phase), atol=3e-4 if single else 1e-9)
+    assert np.abs(signals[1] - signals[0]).max() > 0.1
 
 
 def test_a_field_starts_with_them(traced: tuple[Paths, np.ndarray]) -> None:

@@ -52,6 +52,13 @@ class InitialGaussians:
         """The parameter ``signal`` [2, n] of a field that keeps a static one: real and imaginary parts."""
         return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
 
+    def image(self) -> NDArray[np.float32]:
+        """The parameter ``image``: the affine map A, b of the transmitter to its image, rows [A b], shape [12, n].
+
+        Where nothing is known each Gaussian sees the transmitter itself.
+        """
+        return np.tile(np.eye(3, 4).reshape(12, 1), self.count).astype(np.float32)
+
 
 def random_gaussians(
     receivers: Sequence[Receiver],

@@ -31,10 +31,12 @@ class PathGaussians(InitialGaussians):
     Attributes:
         signals: complex, shape [n]: amplitude relative to the strongest times ``signal``, and phase of the path.
         opacities: alpha at the centre of each, shape [n].
+        image_map: affine map of the transmitter to the image that each Gaussian shows, [n, 3, 4]: image = A [x, 1].
     """
 
     signals: NDArray[np.complex128] = field(kw_only=True)
     opacities: FloatArray = field(kw_only=True)
+    image_map: FloatArray = field(kw_only=True)
 
     def opacity_logit(self) -> NDArray[np.float32]:
         """The parameter ``opacity``, shape [1, n], as a logit."""
@@ -43,6 +45,10 @@ class PathGaussians(InitialGaussians):
     def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
         """The parameter ``signal`` [2, n]: that of the paths; nothing is drawn."""
         return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
+
+    def image(self) -> NDArray[np.float32]:
+        """The parameter ``image``, shape [12, n], of the chains of surfaces that paths have come by."""
+        return np.ascontiguousarray(self.image_map.reshape(-1, 12).T, np.float32)
 
 
 def gaussians_from_paths(
@@ -57,7 +63,8 @@ def gaussians_from_paths(
     """Gaussians on clusters of the last points of interaction of traced paths, the transmitter itself for direct ones.
 
     Points are clustered by direction and distance as their receiver sees them, weighted by power; a cluster's mean is
-    the centre, its spread the scale, its mean power the signal and (as a share of the strongest) the opacity.
+    the centre, its spread the scale, its mean power the signal and (as a share of the strongest) the opacity. The
+    affine map from transmitter to image is that of the cluster's strongest chain of surfaces, by least squares.
 
     Args:
         paths: of the training transmitters.
@@ -92,6 +99,7 @@ def gaussians_from_paths(
     chosen = np.concatenate([used, rng.choice(used, count - len(used))]) if len(used) < count else used
     position, scale = np.empty((count, 3)), np.empty(count)
     strength, phase = np.empty(count), np.empty(count)
+    affine = np.empty((count, 3, 4))
     for index, cluster in enumerate(chosen):
         own = np.flatnonzero(label == cluster)
         share = power[own] / power[own].sum() if power[own].sum() > 0 else np.full(len(own), 1 / len(own))
@@ -101,13 +109,20 @@ def gaussians_from_paths(
         # Power that arrives by the cluster from a transmitter, on average over all of them.
         strength[index] = power[own].sum() / paths.n_tx
         phase[index] = np.angle(paths.gain[own[np.argmax(power[own])]])
+        affine[index] = _image_map(paths, tx_pos_m, receivers, own)
     repeated = np.bincount(chosen, minlength=len(centres))[chosen]
     relative = np.maximum(strength / repeated / strength.max(), LEAST_SHARE)
     amplitude = signal * np.sqrt(relative)
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
     return PathGaussians(
-        position + jitter, scale, opacity, signal, signals=amplitude * np.exp(1j * phase), opacities=opacities
+        position + jitter,
+        scale,
+        opacity,
+        signal,
+        signals=amplitude * np.exp(1j * phase),
+        opacities=opacities,
+        image_map=affine,
     )
 
 
@@ -144,3 +159,17 @@ def _nearest(features: FloatArray, centres: FloatArray) -> IntArray:
 
     label: IntArray = cKDTree(centres).query(features)[1].astype(np.int64)
     return label
+
+
+def _image_map(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], own: IntArray) -> FloatArray:
+    """Affine map [3, 4] from transmitter to image of the strongest chain among some paths."""
+    strongest = own[np.argmax(np.abs(paths.gain[own]))]
+    same = own[(paths.objects[own] == paths.objects[strongest]).all(axis=1) & (paths.rx[own] == paths.rx[strongest])]
+    rx = receivers[int(paths.rx[strongest])].position_m
+    image = rx + paths.arrival[same] * paths.length_m[same, None]
+    x = tx_pos_m[paths.tx[same]]
+    mean_x, mean_i = x.mean(axis=0), image.mean(axis=0)
+    # With few transmitters the map is a mirror's: orthogonal, as every chain of reflections is (Kabsch 1976).
+    u, s, vt = np.linalg.svd((image - mean_i).T @ (x - mean_x))
+    linear = np.eye(3) if len(same) < 4 or s[-1] < 1e-6 else u @ vt
+    return np.column_stack([linear, mean_i - linear @ mean_x])

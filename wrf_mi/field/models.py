@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from scipy.constants import speed_of_light
 
 from .encoding import encode, encoded_size
 from .gaussians import Gaussians, rows
@@ -23,6 +24,9 @@ GEOMETRY = ("position", "log_scale", "rotation")
 A field whose geometry and attenuation are the same for all transmitters says so by ``still``, and by
 ``signal_parameters`` which of its parameters, by the start of their names, reach its signals alone.
 """
+
+NEAREST_M = 1e-3
+"""Distances of a phase are not taken below that: where an image lies in a Gaussian's centre their slope has no end."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,8 @@ class WrfGsPlus:
     three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
     With ``still`` the first head is the only one: Gaussians then stand as they are for every transmitter, and the
     map from their signals to the receiver is the same for all.
+    With ``phase_hz`` each signal turns as a wave does on its way from the transmitter's image, x' = A x + b, to the
+    Gaussian: exp(-j 2 pi f abs(x' - position) / c), which a network need not learn; A and b stay as they started.
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
     rotation's to the quaternion before it is normalised; the heads start small, so that the static
     field is what training sees first.
@@ -131,10 +137,15 @@ class WrfGsPlus:
     width: int = 256
     skip: int = 4
     still: bool = False
+    phase_hz: float = 0.0
 
     blending = "alpha"
-    per_gaussian = (*GEOMETRY, "opacity", "signal")
-    signal_parameters = ("signal", "deform.")
+    signal_parameters = ("signal", "deform.", "image")
+
+    @property
+    def per_gaussian(self) -> tuple[str, ...]:
+        """Names of the parameters that each Gaussian has of its own."""
+        return (*GEOMETRY, "opacity", "signal", *(("image",) if self.phase_hz else ()))
 
     @property
     def heads(self) -> tuple[tuple[str, int, float], ...]:
@@ -147,6 +158,8 @@ class WrfGsPlus:
         sizes, weights = self.encoding.sizes, initial.geometry()
         weights["opacity"] = initial.opacity_logit()
         weights["signal"] = initial.static_signal(rng)
+        if self.phase_hz:
+            weights["image"] = initial.image()
         for i in range(self.layers):
             inputs = ({"hidden": self.width} if i else {}) | (sizes if i in (0, self.skip) else {})
             weights |= init_layer(f"deform.{i}", inputs, self.width, rng)
@@ -176,8 +189,25 @@ class WrfGsPlus:
             position=rows(params["position"]),
             scale=[dr.exp(s) for s in deformed("log_scale", "scale")],
             rotation=deformed("rotation", "rotation"),
-            signal=deformed("signal", "signal"),
+            signal=self._turned(deformed("signal", "signal"), params, tx_pos)
+            if self.phase_hz
+            else deformed("signal", "signal"),
             opacity=dr.tile(opacity, batch),
             attenuation=None,
             batch=batch,
         )
+
+    def _turned(self, signal: list[dr.ArrayBase], params: Params, tx_pos: dr.ArrayBase) -> list[dr.ArrayBase]:
+        """Signals [batch * n] with the phase of their ways from the transmitter's images."""
+        batch, position, image = tx_pos.shape[1], rows(params["position"]), rows(dr.detach(params["image"]))
+        x = [dr.repeat(c, dr.width(position[0])) for c in rows(tx_pos)]
+        away = []
+        for k in range(3):
+            a, b, c, d = (dr.tile(part, batch) for part in image[4 * k : 4 * k + 4])
+            away.append(a * x[0] + b * x[1] + c * x[2] + d - dr.tile(position[k], batch))
+        square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+        turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
+        # Whole turns off first: sines of large arguments have no digits left in float32.
+        sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
+        re, im = signal
+        return [re * cosine - im * sine, re * sine + im * cosine]

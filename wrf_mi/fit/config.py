@@ -64,12 +64,15 @@ class NetworkConfig:
         terms: of a factorised field; 0: 32.
         still: WRF-GS+ moves signals alone with the transmitter, not rotation and scale: the map from signals to
             the receiver is then the same for all transmitters.
+        phase_hz: carrier frequency of a phase that signals of WRF-GS+ have from the distance of the transmitter's
+            image, which ``initial.paths`` tells, else of the transmitter; 0: none.
     """
 
     width: int = 0
     layers: int = 0
     terms: int = 0
     still: bool = False
+    phase_hz: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,9 @@ def make_field(config: TrainConfig) -> Field:
     elif config.model == "wrf-gs+":
         if n.layers:
             sizes["skip"] = n.layers // 2
-        sizes["still"] = n.still
+        sizes["still"], sizes["phase_hz"] = n.still, n.phase_hz
+    if n.phase_hz and config.model != "wrf-gs+":
+        raise InputError(f"setting network.phase_hz: {config.model} has no such phase; leave it away")
     if n.terms:
         if config.model != "factorised":
             raise InputError(f"setting network.terms: {config.model} has none; leave it away")
@@ -179,6 +181,7 @@ class Trainer:
             "rotation": o.rotation,
             "opacity": o.opacity,
             "signal": o.signal,
+            "image": 0.0,
         }
         return {name: own.get(name, o.network) for name in self.state.adam}
 

@@ -44,12 +44,15 @@ def starts(
     Returns:
         By start: quantiles of SSIM for each seed, and the paired comparison of the means with a random start.
     """
-    given = {
+    given: dict[str, tuple[str, ...]] = {
         NOTHING: (),
         "point cloud": (f"initial.points={scan}",),
         "mesh": (f"initial.mesh={scene}",),
         "traced paths": (f"initial.paths={scene}",),
     }
+    if record.frequencies_hz is not None:
+        phase = f"network.phase_hz={float(record.frequencies_hz[0])}"
+        given["traced paths, phases from their images"] = (f"initial.paths={scene}", phase)
     scores: dict[str, list[Any]] = {name: [] for name in given}
     with tempfile.TemporaryDirectory() as work:
         for seed in seeds:
