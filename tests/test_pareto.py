@@ -14,6 +14,7 @@ from wrf_mi.core import Record
 from wrf_mi.report.methods import METHODS, Method, Place, Ready
 from wrf_mi.report.pareto import front, full_table, measure_methods, pareto_figure, table
 
+HELD_MB = 200
 BUSY_ROWS = 3_000_000
 """Numbers that the slow method sorts: a hundred times what the fast one does."""
 
@@ -90,6 +91,7 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
     def true(place: Place) -> Ready:
         def predict(tx_pos_m: np.ndarray) -> np.ndarray:
             np.sort(np.random.default_rng(0).random(BUSY_ROWS))
+            np.ones(HELD_MB * 1_000_000 // 8)
             apart = np.linalg.norm(place.record.tx_pos_m[None] - tx_pos_m[:, None], axis=-1)
             return truth[apart.argmin(axis=1)]
 
@@ -112,7 +114,8 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
     assert found["grey"]["error"]["value"] > 0.1
     assert found["true"]["over_reference"]["value"] > 5  # thousands, but for what a busy machine does to 10 us
     assert found["true"]["stored_mb"] == 3.0
-    assert found["true"]["memory_mb"]["one"] > 0.9 * BUSY_ROWS * 8 / 1e6
+    # What others in this process free meanwhile counts against it: seen to be some tens of MB after a thousand tests.
+    assert found["true"]["memory_mb"]["one"] > HELD_MB / 2
     assert found["true"]["split"]["warm"]["tracing"] > found["true"]["split"]["warm"]["execution"]
     assert "batch_ms" in found["grey"]
     assert "batch_ms" not in found["true"]
