@@ -40,15 +40,21 @@ class Record:
         name: of the data set.
         task: what ``observation`` holds. ``"spectrum"``: grey values [n_rx, n, height, width] in 0..1, float32.
             ``"rssi"``: received power [n_rx, n] in dBm, float32, NaN where nothing was received.
-            ``"csi"``: channel coefficients [n_rx, n, subcarriers], complex64.
-        tx_pos_m: positions of the moving end [n, 3], world frame, metres; by reciprocity it is the transmitter.
+            ``"csi"``: channel coefficients [n_rx, n, subcarriers] of receivers with one antenna or
+            [n_rx, n, antennas, subcarriers], complex64.
+        tx_pos_m: positions of the moving end [n, 3], world frame, metres; by reciprocity it is the transmitter. NaN
+            where the data do not tell.
         receivers: the ``n_rx`` receivers, which stand still.
         observation: first axes [n_rx, n].
         official: training and test rows (from 0) that came with the data, or None.
         folds: the spatial block of each row, shape [n], or None.
-        frequencies_hz: of the carrier, shape [1], or of each subcarrier; None where the data do not tell.
+        frequencies_hz: of the carrier, shape [1], or of each subcarrier of ``observation``; None where the data do not
+            tell.
         array_m: elements of the antenna array behind a spectrum [m, 3], receiver's frame, metres, or None.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
+        uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
+            ``observation``, the downlink's, are to be predicted: [n, antennas, uplink subcarriers], complex64; or None.
+        uplink_hz: frequency of each subcarrier of ``uplink``, or None.
         source: where it was read from.
     """
 
@@ -62,6 +68,8 @@ class Record:
     frequencies_hz: FloatArray | None = None
     array_m: FloatArray | None = None
     tx_heading_rad: FloatArray | None = None
+    uplink: NDArray[np.complex64] | None = None
+    uplink_hz: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:

@@ -1,0 +1,80 @@
+"""What every baseline is: a name, settings, a fit and a loader; what it predicts from are `Inputs`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from ..core import Record, Split
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+
+Listen = Callable[[str, float], None]
+"""Hears what is being done and the share of it that is done, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a method may know of m rows that it predicts; never their observation.
+
+    Attributes:
+        tx_pos_m: positions of the moving end [m, 3], metres; NaN where the data do not tell.
+        tx_heading_rad: how the transmitter is turned [m], or None.
+        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
+    """
+
+    tx_pos_m: FloatArray
+    tx_heading_rad: FloatArray | None = None
+    uplink: NDArray[Any] | None = None
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.tx_pos_m)
+
+
+def inputs_of(record: Record, rows: IntArray) -> Inputs:
+    """The inputs of some rows of a record."""
+    heading, uplink = record.tx_heading_rad, record.uplink
+    return Inputs(
+        record.tx_pos_m[rows], None if heading is None else heading[rows], None if uplink is None else uplink[rows]
+    )
+
+
+class Fitted(Protocol):
+    """A fitted baseline."""
+
+    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """What the receiver of that index observes, [m, ...] as in `wrf_mi.core.Record`."""
+        ...
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that is needed to predict again: no key begins with ``run/``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """One baseline.
+
+    Attributes:
+        name: as in ``wrf-mi train --model``.
+        tasks: tasks of `wrf_mi.core.Record` that it serves.
+        settings: frozen dataclass of its settings, all with defaults.
+        fit: ``fit(record, split, settings, seed, listen)``. ``split.validation`` may choose what is open; what is
+            returned has seen all of ``split.all_train`` and no other row.
+        load: ``load(arrays, record)``, from `Fitted.arrays` and the record without its observations in mind: poses,
+            frequencies and shapes only.
+        source: where the method is from.
+        needs_uplink: whether it predicts from the uplink alone.
+    """
+
+    name: str
+    tasks: tuple[str, ...]
+    settings: type
+    fit: Callable[[Record, Split, Any, int, Listen], Fitted]
+    load: Callable[[dict[str, NDArray[Any]], Record], Fitted]
+    source: str
+    needs_uplink: bool = False
