@@ -10,7 +10,7 @@ help:
 	@echo "make test       lint, types, import order, tests, notebooks"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      every stored figure, run time against error among them; hours"
-	@echo "make bench-quick  ratios of run times against the stored ones; a minute"
+	@echo "make bench-quick  ratios of run times against the stored ones, numbers under stress; two minutes"
 	@echo "make setup      only the set-up that the others begin with"
 	@echo "make clean      remove .venv, caches and packages; runs stay"
 
@@ -41,6 +41,7 @@ bench: $(READY)
 
 bench-quick: $(READY)
 	$(BIN)/wrf-mi bench --quick
+	$(BIN)/wrf-mi bench stress --quick
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from wrf_mi.cli import main
@@ -34,3 +36,9 @@ def refused(arguments: list[Any], message: str, capsys: pytest.CaptureFixture[st
     assert err.endswith("\n")
     assert err.count("\n") == 1, err
     assert re.search(message, err), err
+
+
+def stored(run: Path) -> dict[str, np.ndarray]:
+    """What ``predictions.npz`` of a run holds."""
+    with np.load(run / "predictions.npz", allow_pickle=False) as arrays:
+        return dict(arrays)

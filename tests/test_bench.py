@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -13,17 +14,29 @@ from wrf_mi.report import bench_plan
 from wrf_mi.report.bench import CASES, CHECKS, bench, check_table, read_results, table
 from wrf_mi.report.check import main
 from wrf_mi.report.pareto import full_table
+from wrf_mi.report.stress_summary import STAGES, summary_table
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-NEEDS_NO_DATA = ("traced-and-splatted", "hybrid-room", "hybrid-starts", "pareto", "scaling", "operator", "stress")
+NEEDS_NO_DATA = (
+    "traced-and-splatted",
+    "hybrid-room",
+    "hybrid-starts",
+    "pareto",
+    "scaling",
+    "operator",
+    "stress",
+    "determinism",
+)
 """Checks on what is made here; the traced room takes minutes."""
 ON_PAGE = {
     "pareto": "speed.md",
     "scaling": "speed.md",
     "operator": "speed.md",
     "budgets": "speed.md",
+    "training": "speed.md",
     "stress": "numerics.md",
+    "determinism": "numerics.md",
 }
 """Pages that show a check's table; those of hybrids have their own, and all others are in the README."""
 
@@ -101,6 +114,16 @@ def test_readme_shows_the_stored_results() -> None:
             assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
         assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+
+
+def test_readme_shows_the_worst_of_each_stage() -> None:
+    rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
+    shown = (CHECKOUT / "README.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
+    assert shown.strip() == summary_table(rows)
+    stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
+    assert set(stages) >= {words for words, _ in STAGES}
+    worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
+    assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
 
 
 def test_stored_results_are_complete() -> None:

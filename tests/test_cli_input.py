@@ -10,7 +10,7 @@ from calling import SET, refused
 
 from wrf_mi.cli import main
 from wrf_mi.core import InputError
-from wrf_mi.report.tx_file import read_transmitters
+from wrf_mi.report.tx_file import read_inputs
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
         (["predict", "run", "--tx", "a", "--input", "b", "--out", "c"], "not allowed with argument"),
         (["evaluate"], "required: RUN"),
         (["compare", "run"], "required: --out"),
-        (["train", "x", "--model", "nerf2", "--out", "y"], "invalid choice: 'nerf2'"),
+        (["train", "x", "--model", "nerf3", "--out", "y"], "invalid choice: 'nerf3'"),
         (["train", "x", "--seed", "one", "--out", "y"], "invalid int value: 'one'"),
         (["train", "x", "--n-train", "many", "--out", "y"], "argument --n-train: 'many' is no number"),
         (["train", "x", "--preset", "best", "--out", "y"], "invalid choice: 'best'"),
@@ -48,7 +48,7 @@ def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
         (["--set", "hold_out=2"], "setting hold_out: 2.0 is out of range, choose 0 to 1"),
         (["--set", "initial.points=none.ply"], "none.ply: no such file"),
         (["--set", "batch=100"], "training rows.*batches need 100"),
-        (["--set", "model=nerf2"], "model 'nerf2' cannot be trained here"),
+        (["--set", "model=nerf3"], "model 'nerf3' cannot be trained here"),
         (["--seed", "-1"], "setting seed: -1 is out of range"),
         (["--split", "nowhere"], "split 'nowhere'"),
         (["--split", ""], "split ''"),
@@ -153,7 +153,7 @@ def test_positions_that_are_refused(name: str, run: Path, tmp_path: Path, capsys
 def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "tx.npz", **arrays)
     with pytest.raises(InputError, match=message):
-        read_transmitters(None, tmp_path / "tx.npz")
+        read_inputs(None, tmp_path / "tx.npz")
 
 
 def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

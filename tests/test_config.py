@@ -160,7 +160,7 @@ def test_settings_that_are_refused(setting: str, message: str) -> None:
 @pytest.mark.parametrize(
     "setting",
     [
-        *(f"{name}=0" for name in ("steps", "batch", "log_every", "validate_every", "checkpoint_every")),
+        *(f"{name}=0" for name in ("batch", "log_every", "validate_every", "checkpoint_every")),
         "seed=-1",
         "hold_out=1.01",
         "structural_weight=-0.1",
@@ -226,8 +226,14 @@ def test_paper_preset_has_what_the_paper_states() -> None:
     assert config.structural_weight == 0.2
 
 
+def test_zero_steps_are_as_many_as_the_model_needs() -> None:
+    assert TrainConfig(model="wrf-gs+").scheduled().steps == 9000
+    assert TrainConfig(model="wrf-gs").scheduled().steps == 15000
+    assert TrainConfig(steps=7).scheduled() == TrainConfig(steps=7)
+
+
 def test_quick_preset_is_shorter() -> None:
-    assert with_settings(TrainConfig(), PRESETS["quick"]).steps < TrainConfig().steps
+    assert with_settings(TrainConfig(), PRESETS["quick"]).steps < TrainConfig().scheduled().steps
 
 
 def test_description_names_every_setting_and_can_be_set() -> None:

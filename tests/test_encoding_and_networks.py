@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import mitsuba as mi  # noqa: E402
 from wrf_mi.core import InputError, Receiver  # noqa: E402
 from wrf_mi.field import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians  # noqa: E402
 from wrf_mi.field.encoding import encode, encoded_size  # noqa: E402
-from wrf_mi.field.network import init_layer, linear, linear_of_pairs, relu  # noqa: E402
+from wrf_mi.field.network import dense, dense_of_pairs, init_layer, linear, relu  # noqa: E402
 
 FLOAT64_TOLERANCE = 1e-9
 """Ten octaves of a coordinate up to 100 m: sin(2^9 pi 100) in NumPy itself is good to 160,000 * 2e-16 = 4e-11."""
@@ -104,14 +105,14 @@ def test_layer_in_parts_is_the_product_with_the_concatenation(with_hidden: bool)
     n, batch = 5, 3
     x, y, h = rng.random((60, n)), rng.random((60, batch)), rng.random((23, batch * n))
     hidden = Tensor64(h) if with_hidden else None
-    out = linear_of_pairs(params, "layer", {"position": Tensor64(x)}, {"transmitter": Tensor64(y)}, hidden).numpy()
+    out = dense_of_pairs(params, "layer", {"position": Tensor64(x)}, {"transmitter": Tensor64(y)}, hidden).numpy()
     assert out.shape == (11, batch * n)
     matrix = np.concatenate([weights[f"layer.{part}"] for part in sizes], axis=1)
     for b in range(batch):
         for i in range(n):
             column = np.concatenate([x[:, i], y[:, b], *([h[:, b * n + i]] if with_hidden else [])])
             expected = matrix @ column + weights["layer.bias"][:, 0]
-            np.testing.assert_allclose(out[:, b * n + i], expected, rtol=PRODUCT_TOLERANCE)
+            np.testing.assert_allclose(out[:, b * n + i], np.maximum(expected, 0), rtol=PRODUCT_TOLERANCE)
 
 
 def test_linear_and_relu() -> None:
@@ -120,6 +121,38 @@ def test_linear_and_relu() -> None:
     out = linear(params, "layer", Tensor64(x)).numpy()
     np.testing.assert_allclose(out, weights["layer.hidden"] @ x + weights["layer.bias"], rtol=PRODUCT_TOLERANCE)
     np.testing.assert_array_equal(relu(Tensor64(out)).numpy(), np.maximum(out, 0))
+    np.testing.assert_array_equal(dense(params, "layer", Tensor64(x)).numpy(), np.maximum(out, 0))
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("with_hidden", [False, True])
+def test_slope_of_a_hidden_layer_is_that_of_its_parts(batch: int, with_hidden: bool) -> None:
+    """The derivative that sums rows against the one of Dr.Jit, of the same sum written out."""
+    n, rng = 5, np.random.default_rng(11)
+    _, params = draw_layer("layer", {"position": 4, "transmitter": 3} | ({"hidden": 2} if with_hidden else {}), 7)
+    x, y, h = (Tensor64(rng.standard_normal(shape)) for shape in ((4, n), (3, batch), (2, batch * n)))
+    inputs = {**params, "x": x, "y": y} | ({"h": h} if with_hidden else {})
+    weight = Tensor64(rng.standard_normal((7, batch * n)))
+
+    def slopes(layer: Callable[[], Any]) -> list[np.ndarray]:
+        dr.enable_grad(inputs)
+        dr.clear_grad(inputs)
+        dr.backward(dr.sum(layer() * weight))
+        return [dr.grad(p).numpy().copy() for p in inputs.values()]
+
+    def written_out() -> Any:
+        gaussian = dr.reshape(params["layer.position"] @ x, (7, 1, n))
+        own = dr.reshape(params["layer.transmitter"] @ y + params["layer.bias"], (7, batch, 1))
+        total = dr.reshape(gaussian + own, (7, batch * n))
+        return relu(total + params["layer.hidden"] @ h if with_hidden else total)
+
+    def fused() -> Any:
+        return dense_of_pairs(params, "layer", {"position": x}, {"transmitter": y}, h if with_hidden else None)
+
+    for ours, expected in zip(slopes(fused), slopes(written_out), strict=True):
+        assert np.abs(expected).max() > 0
+        np.testing.assert_allclose(ours, expected, rtol=PRODUCT_TOLERANCE, atol=PRODUCT_TOLERANCE)
 
 
 def test_layers_start_as_he_et_al() -> None:

@@ -13,6 +13,7 @@ from scipy.constants import speed_of_light
 from traced_rooms import write_xml
 
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.hybrid import csi
 from wrf_mi.hybrid.csi import CsiHybrid, CsiSettings, fit_csi
 from wrf_mi.hybrid.csi_decode import decode
 from wrf_mi.hybrid.csi_paths import images_of, seen_from
@@ -200,6 +201,16 @@ def test_errors_are_as_large_as_stated(fitted: CsiHybrid, measured: Record) -> N
     error = np.abs(estimate.mean - measured.observation[0, test])
     assert (error < 3 * estimate.std).mean() > 0.85
     assert (estimate.std > 0).all()
+
+
+def test_many_places_are_predicted_in_parts(
+    fitted: CsiHybrid, measured: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = fitted.predict(measured.tx_pos_m[:30], 0)
+    monkeypatch.setattr(csi, "AT_ONCE", 7)
+    parts = fitted.predict(measured.tx_pos_m[:30], 0)
+    for one, other in ((parts.mean, whole.mean), (parts.std, whole.std)):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
 
 
 def test_arrays_hold_all_that_predicts(fitted: CsiHybrid, measured: Record, tmp_path: Path) -> None:

@@ -237,6 +237,36 @@ def test_matched_gain_and_kept_values(truth: Truth, kind: str) -> None:
         fit.set_values({traced.gain_name: np.zeros(3)})
 
 
+def test_nothing_is_traced_after_the_first_steps(truth: Truth) -> None:
+    """Later batches, rates and views replay what was recorded; another loss is recorded anew."""
+    fit = truth.fit(True, True)
+    fit.batch = 7
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
+        fit.run(5, final_factor=0.5)
+        recordings = fit.recordings
+        dr.kernel_history_clear()
+        fit.run(6, final_factor=0.1)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) >= 6
+    assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
+    assert fit.recordings == recordings > 0
+
+
+def test_a_new_search_for_paths_counts_at_once(truth: Truth) -> None:
+    """The recording holds for the paths that it was made with: after another search it is not used any more."""
+    fits = [truth.fit(True, False) for _ in range(2)]
+    for fit in fits:
+        fit.step()
+    traced = fits[1].views[0].traced
+    assert traced is not None
+    elsewhere = truth.own.position_m - np.array([0.0, 0.0, 0.4])
+    traced._search(elsewhere)  # as `refresh` does once the receiver has moved
+    assert traced.searches == 2
+    prediction, loss = fits[1].predict(), fits[1].step()
+    expected = np.abs(prediction - truth.spectra[:TRAIN]).mean()
+    assert loss == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_seed_decides(truth: Truth) -> None:
     losses = []
     for seed in (0, 0, 1):

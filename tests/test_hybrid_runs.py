@@ -20,7 +20,7 @@ from traced_rooms import SHOEBOX as ROOM
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.report.compare import compare
-from wrf_mi.report.hybrid_run import evaluate_hybrid, load_hybrid, open_hybrid, train_hybrid
+from wrf_mi.report.hybrid_run import HybridRun, evaluate_hybrid, open_hybrid, train_hybrid
 from wrf_mi.report.metrics import inside_interval, ssim
 from wrf_mi.report.run_folder import read_run
 from wrf_mi.report.watch import Stages
@@ -324,7 +324,6 @@ def test_calls_that_are_refused(
         ([*train, "--scene", tmp_path / "none.xml"], "none.xml"),
         ([*train, "--depth", 2], "takes --scene, --material, --split, --n-train, --seed and --set"),
         ([*train, "--preset", "quick"], "takes --scene, --material"),
-        ([*train, "--deterministic"], "takes --scene, --material"),
         (["train", waves, "--model", "hybrid"], "train needs DATASET and --out RUN"),
         (["train", waves, "--model", "hybrid", "--out", waves], "exists and is not empty; choose another --out"),
         (["train", "--resume", run, "--model", "hybrid"], "leave data set and settings away"),
@@ -417,10 +416,8 @@ def test_stages_show_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys:
     assert "second" in shown
 
 
-def test_model_is_read_as_it_was_fitted(waves: Path, run: Path) -> None:
-    from wrf_mi.hybrid.models import kind_of
-
-    model, seconds = load_hybrid(run, kind_of(load(waves), with_scene=False), None)
+def test_model_is_read_as_it_was_fitted(run: Path) -> None:
+    model, seconds = HybridRun.stored(run).model_of(run)
     assert seconds == json.loads((run / "metrics.json").read_text())["train_seconds"]
     arrays: Any = stored(run)
     np.testing.assert_allclose(model.predict(arrays["tx_pos"], 1).mean, arrays["prediction"][1], atol=ROUNDING)

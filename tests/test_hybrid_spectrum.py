@@ -13,7 +13,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.hybrid import spectrum_rays
+from wrf_mi.hybrid import spectrum, spectrum_rays
 from wrf_mi.hybrid.spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
 from wrf_mi.hybrid.spectrum_fit import Constants, fit_constants, fit_maps, map_places, scan_offsets
 from wrf_mi.hybrid.spectrum_loss import Grid
@@ -203,6 +203,20 @@ SCENES: list[Any] = []
 @pytest.fixture(scope="module", autouse=True)
 def keep_scene(tmp_path_factory: pytest.TempPathFactory) -> None:
     SCENES.append(open_scene(write_xml(tmp_path_factory.mktemp("kept"), SHOEBOX), HZ, THICKNESS_M))
+
+
+def test_many_transmitters_are_predicted_in_parts(
+    fitted: tuple[Record, SpectrumHybrid], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums of some waves in another order; the deviation, the same for all, is held once."""
+    record, hybrid = fitted
+    whole = hybrid.predict(record.tx_pos_m[:20], 0)
+    monkeypatch.setattr(spectrum, "AT_ONCE", 7)
+    parts = hybrid.predict(record.tx_pos_m[:20], 0)
+    np.testing.assert_allclose(parts.mean, whole.mean, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(parts.std, whole.std)
+    assert parts.std.strides[0] == 0
+    assert hybrid.predict(np.zeros((0, 3)), 0).mean.shape == (0, HEIGHT, WIDTH)
 
 
 def test_a_fit_predicts_new_places_better_than_the_mesh_as_given(fitted: tuple[Record, SpectrumHybrid]) -> None:

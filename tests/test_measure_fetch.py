@@ -26,6 +26,7 @@ needs_data = pytest.mark.skipif(
 )
 ROWS = 6
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room")
+NAMES += ("traced-csi-flat", "traced-csi-office")
 PICKLES = Path(__file__).parent / "data"
 DATASET = DataSet("small", "spectrum", "MIT", "made up", base_url="http://unused")
 

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from wrf_mi.cli import _parser
+from wrf_mi.cli_bench import TABLES
 from wrf_mi.core import Receiver, Record
 from wrf_mi.fit.config import TrainConfig, describe, with_settings
 from wrf_mi.measure import write_spectrum_folder
@@ -101,7 +102,7 @@ def test_commands_parse(path: Path) -> None:
             pytest.fail(f"{path.name}: {line}")
         with_settings(TrainConfig(), getattr(parsed, "set", []))
         for name in getattr(parsed, "names", []):
-            assert name in {**CASES, **CHECKS}, line
+            assert name in {*CASES, *CHECKS, TABLES}, line
 
 
 def test_readme_shows_every_step_of_the_way() -> None:

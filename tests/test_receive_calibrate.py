@@ -13,9 +13,10 @@ from wrf_mi.core import InputError, Receiver, Record, unit_vectors
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import load, make_splits
 from wrf_mi.receive import Array, Lags, instrument_report
+from wrf_mi.receive.beams import mirror_order
 from wrf_mi.receive.calibrate import _grid, fit_array, phase_gradient
 from wrf_mi.receive.gains import self_calibrate
-from wrf_mi.receive.retrieve import align_signals, mirror_order, retrieve_signals, unscale
+from wrf_mi.receive.retrieve import align_signals, retrieve_signals, unscale
 
 FREQUENCY_HZ = 920e6
 ELEMENTS = planar_array(4, 4, 0.16)

@@ -9,7 +9,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.receive import channel, csi, element_signals, received_power, rssi_dbm
+from wrf_mi.receive import antenna_csi, channel, csi, element_signals, received_power, rssi_dbm
 
 EXACT = 1e-12
 
@@ -53,6 +53,19 @@ def test_channel_coefficients():
             wave = paths.gain[p] * np.exp(-2j * np.pi * f * paths.length_m[p] / speed_of_light)
             expected[paths.rx[p], paths.tx[p], k] += wave
     # 5e5 rad in float64 leave 1e-10: the phase is not taken in single precision.
+    np.testing.assert_allclose(result, expected, atol=1e-9)
+    assert (result[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("at_once", [1, 1 << 20])
+def test_channel_coefficients_at_antennas(at_once: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(channel, "WAVES_AT_ONCE", at_once)
+    paths, arrays, array_m = made(), receivers(), planar_array(2, 3, 0.06)
+    frequencies = 2.4e9 + 1e6 * np.array([0.0, 1.0, 3.0, 4.0, 2.0])  # gaps of several widths
+    result = antenna_csi(paths, arrays, array_m, frequencies)
+    expected = np.stack([element_signals(paths, arrays, array_m, f) for f in frequencies], axis=-1)
+    assert result.shape == (3, 4, 6, 5)
+    # 5e4 rad in float64 leave 1e-11, gone through once for each subcarrier.
     np.testing.assert_allclose(result, expected, atol=1e-9)
     assert (result[:, 3] == 0).all()
 

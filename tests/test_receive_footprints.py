@@ -8,6 +8,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import unit_vectors
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.receive import footprints
 from wrf_mi.receive.footprints import gaussian_signals
 
 FREQUENCY_HZ = 920e6
@@ -81,3 +82,17 @@ def test_a_small_footprint_is_a_plane_wave():
     assert gaussian_signals(np.stack([n, n, n]), np.zeros(3), ELEMENTS, FREQUENCY_HZ).shape == (3, 16)
     with pytest.raises(ValueError, match="order 3"):
         gaussian_signals(n, 0.1, ELEMENTS, FREQUENCY_HZ, 3)
+
+
+def test_chunks_are_the_whole(monkeypatch: pytest.MonkeyPatch):
+    """Two Gaussians at once, and one where an array alone has more pairs than are taken at once."""
+    rng = np.random.default_rng(1)
+    n = unit_vectors(rng.uniform(0, 2 * np.pi, (5, 3)), rng.uniform(-1, 1, (5, 3)))
+    root = 0.1 * rng.normal(size=(5, 3, 3, 3))
+    covariance = root @ root.swapaxes(-1, -2)
+    whole = gaussian_signals(n, covariance, ELEMENTS, FREQUENCY_HZ)
+    for pairs in (2 * len(ELEMENTS), 3):
+        monkeypatch.setattr(footprints, "PAIRS_AT_ONCE", pairs)
+        np.testing.assert_allclose(gaussian_signals(n, covariance, ELEMENTS, FREQUENCY_HZ), whole, rtol=1e-12)
+        same = gaussian_signals(n, covariance[0, 0], ELEMENTS, FREQUENCY_HZ)
+        np.testing.assert_allclose(same[0, 0], whole[0, 0], rtol=1e-12)

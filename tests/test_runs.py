@@ -22,8 +22,8 @@ import drjit as dr  # noqa: E402
 from wrf_mi.core import InputError, Record, Split  # noqa: E402
 from wrf_mi.fit.config import TrainConfig  # noqa: E402
 from wrf_mi.fit.folder import load_predictor, read_checkpoint  # noqa: E402
-from wrf_mi.fit.trainer import Progress  # noqa: E402
-from wrf_mi.measure import load_split, make_splits, write_spectrum_folder  # noqa: E402
+from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
+from wrf_mi.measure import load, load_split, make_splits, write_spectrum_folder  # noqa: E402
 from wrf_mi.report.metrics import ssim  # noqa: E402
 from wrf_mi.report.runs import Interrupted, Run, evaluate_run, resume, train  # noqa: E402
 
@@ -114,6 +114,24 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
     train(folder, tmp_path / "whole", config)
     for name, values in arrays_of(tmp_path / "whole").items():
         np.testing.assert_array_equal(arrays_of(tmp_path / "killed")[name], values, err_msg=name)
+
+
+def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(folder: Path, tmp_path: Path) -> None:
+    """One row's truth is not a number; with that mended, the run goes on as if nothing had been."""
+    config = settings("steps=20", "checkpoint_every=2", "log_every=20", "validate_every=20", "deterministic=true")
+    broken = load(folder)  # keeps its source, which is what a resumed run reads
+    split = official(broken)
+    reached = Trainer(broken, split, config).schedule.rows[:, 0].tolist()
+    row = next(r for r in reached if reached.index(r) % 2 == 0 and reached.index(r) > 8)
+    step = reached.index(row) + 1
+    broken.observation[0, row, 4, 5] = np.nan
+    with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
+        train(broken, tmp_path / "broken", config)
+    assert int(read_checkpoint(tmp_path / "broken")["step"]) == step - 1
+    resume(tmp_path / "broken")
+    train(folder, tmp_path / "whole", config)
+    for name, values in arrays_of(tmp_path / "whole").items():
+        np.testing.assert_array_equal(arrays_of(tmp_path / "broken")[name], values, err_msg=name)
 
 
 def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_path: Path) -> None:

@@ -10,14 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy.constants import speed_of_light
 from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room, write_xml
 
 from wrf_mi.cli import main
 from wrf_mi.core import InputError, Record
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.receive import rssi_dbm
 from wrf_mi.report.traced import CONVERGENCE, trace_run
 from wrf_mi.trace import TraceOptions, trace_paths
 from wrf_mi.trace.target import choose_options, remainder
+from wrf_mi.trace.tracer import Instrument
 
 RX = receiver([3.1, 2.2, 1.5])
 PLAIN = TraceOptions(upright=True)
@@ -108,3 +111,28 @@ def test_run_states_its_convergence(tmp_path: Path) -> None:
     assert stated["error_db"] <= 4.0
     assert stated["options"] == yaml.safe_load((folder / "config.yaml").read_text())["options"]
     assert [t["value"] for t in stated["trials"] if t["part"] == "depth"][:2] == [1, 2]
+
+
+def test_spectra_are_judged_by_themselves(shoebox: Any) -> None:
+    """Waves interfere at an array: what is chosen keeps spectra within the target, at another position too."""
+    array_m = planar_array(4, 4, 0.5 * speed_of_light / FREQUENCY_HZ)
+    instrument = Instrument("spectrum", (RX,), np.array([FREQUENCY_HZ]), array_m, (18, 36))
+    target_db = 4.0
+    here = inside(3)
+    by_power = choose_options(shoebox, here[:2], RX, target_db, PLAIN, kinds=())
+    choice = choose_options(shoebox, here[:2], RX, target_db, PLAIN, kinds=(), spectra=instrument.observe)
+    assert by_power.judged_by == ("power",)
+    assert by_power.spectrum_error is None
+    assert all(trial.spectrum is None for trial in by_power.trials)
+    assert choice.reached
+    assert choice.options.max_depth >= by_power.options.max_depth
+    fine = replace(FINE, max_depth=choice.options.max_depth + 1)
+    coarse, true = (instrument.observe(trace_paths(shoebox, here, RX, o).paths)[0] for o in (choice.options, fine))
+    error = np.linalg.norm(coarse - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert error.max() <= 10 ** (target_db / 20) - 1
+    for trial in choice.trials[1:]:
+        assert trial.spectrum is not None
+        assert trial.change_db >= 20 * np.log10(1 + trial.spectrum) - 1e-12
+    stated = json.loads(json.dumps(choice.plain()))
+    assert stated["judged_by"] == ["power", "spectrum"]
+    assert stated["spectrum_error"] == pytest.approx(10 ** (choice.error_db / 20) - 1)

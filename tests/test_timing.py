@@ -152,6 +152,7 @@ def test_exponent_is_that_of_the_larger_half() -> None:
     found = exponent(sizes, cost)
     np.testing.assert_allclose([found.low, found.value, found.high], 1.5, atol=0.01)
     assert larger_half(6) == slice(3, 6)
+    assert larger_half(4) == slice(1, 4)
     assert larger_half(3) == slice(1, 3)
     assert larger_half(2) == slice(0, 2)
     with pytest.raises(ValueError, match="two or more"):

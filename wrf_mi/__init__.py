@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .fit.config import TrainConfig, with_settings
     from .fit.trainer import Trainer
     from .measure import fetch, make_splits
+    from .report.baseline_run import open_baseline, train_baseline
     from .report.compare import compare
     from .report.figures import spectrum_table
     from .report.hybrid_run import open_hybrid, train_hybrid
@@ -42,12 +43,14 @@ _HOME = {
     "load": "trace:load_record",
     "make_scene": "scene.make",
     "make_splits": "measure",
+    "open_baseline": "report.baseline_run",
     "open_hybrid": "report.hybrid_run",
     "resume": "report.runs",
     "scene_view": "report.view",
     "spectrum_table": "report.figures",
     "trace_run": "report.traced",
     "train": "report.runs",
+    "train_baseline": "report.baseline_run",
     "train_hybrid": "report.hybrid_run",
     "with_settings": "fit.config",
 }
@@ -68,12 +71,14 @@ __all__ = [
     "load",
     "make_scene",
     "make_splits",
+    "open_baseline",
     "open_hybrid",
     "resume",
     "scene_view",
     "spectrum_table",
     "trace_run",
     "train",
+    "train_baseline",
     "train_hybrid",
     "with_settings",
 ]

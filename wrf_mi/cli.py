@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__
+from .baselines.models import METHODS
+from .cli_bench import bench_command
 from .cli_train import print_json, progress_bar, show_metrics, sweep_command, trace_command, train_command
 from .core import BackendError, InputError
 
@@ -46,8 +48,8 @@ def _data_list(a: Arguments) -> int:
         print_json(rows)
         return 0
     for row in rows:
-        print(f"{row['name']:<17}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
-        print(f"{'':<17}{row['origin']}")
+        print(f"{row['name']:<19}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
+        print(f"{'':<19}{row['origin']}")
     return 0
 
 
@@ -101,12 +103,13 @@ def _evaluate(a: Arguments) -> int:
 def _predict(a: Arguments) -> int:
     from .parallel import open_scheduler
     from .report.runs import predict_to_file
-    from .report.tx_file import read_transmitters
+    from .report.tx_file import read_inputs
 
-    positions, heading = read_transmitters(a.tx, a.input)
+    inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
         given = scheduler if a.scheduler else None
-        shapes = predict_to_file(a.run, positions, a.out, heading, given, not a.no_operator)
+        asked = (a.run, inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
+        shapes = predict_to_file(*asked, given, not a.no_operator, inputs.uplink)
     if a.json:
         print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
@@ -133,31 +136,6 @@ def _compare(a: Arguments) -> int:
 
     index = compare(a.runs, a.out)
     print(f"comparison: {index}")
-    return 0
-
-
-def _bench(a: Arguments) -> int:
-    from .parallel import open_scheduler
-    from .report.bench import CASES, CHECKS, bench
-
-    if a.store and not a.quick:
-        raise InputError("--store: belongs to --quick; cases are stored in any case")
-    if a.quick and a.scheduler:
-        raise InputError("--quick: its pairs are interleaved in one process; leave --scheduler away")
-    if a.quick:
-        if a.names:
-            raise InputError(f"--quick: measures its own pairs; leave {a.names[0]} away")
-        from .report.bench_quick import quick
-
-        result = quick(Path(a.out), a.store)
-        if a.json:
-            print_json(result)
-        return 0
-    with open_scheduler(a.scheduler) as scheduler:
-        given = scheduler if a.scheduler else None
-        rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs), given)
-    if a.json:
-        print_json(rows)
     return 0
 
 
@@ -214,9 +192,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
     sub.add_argument("--replace", action="store_true", help="take the place of an existing scene folder")
 
-    sub = command(
-        "train", train_command, "fit a field to measured spectra, or a hybrid to any measurements, and score it"
-    )
+    text = "fit a field to measured spectra, or a hybrid or a baseline to any measurements, and score it"
+    sub = command("train", train_command, text)
     _add_training(sub)
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
     sub.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
@@ -227,7 +204,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
     sub.add_argument("--out", metavar="RUN", required=True, help="run folder to make")
     _add_tracing(sub)
-    target = "choose depth, rays, diffraction and scattering until received power is converged to so many dB"
+    target = "choose depth, rays, diffraction and scattering until power, and spectra, are converged to so many dB"
     sub.add_argument("--target-error", type=float, metavar="DB", help=target)
     sub.add_argument("--split", help="as for train; official by default")
     sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
@@ -250,8 +227,9 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
     given = sub.add_mutually_exclusive_group(required=True)
+    text = "array tx_pos [m, 3] in metres (and heading_rad [m]), or uplink [m, antennas, subcarriers]"
     given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
-    given.add_argument("--input", metavar="FILE.npz", help="array tx_pos [m, 3] in metres (and heading_rad [m])")
+    given.add_argument("--input", metavar="FILE.npz", help=text)
     sub.add_argument("--out", required=True, metavar="FILE.npz")
     _add_operator(sub)
     _add_scheduler(sub)
@@ -273,14 +251,17 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("runs", nargs="+", metavar="RUN")
     sub.add_argument("--out", required=True, metavar="DIR")
 
-    sub = command("bench", _bench, "measure the README's figures; goes on where it was stopped")
-    sub.add_argument("names", nargs="*", metavar="NAME", help="cases to measure (default: all)")
+    sub = command("bench", bench_command, "measure the README's figures; goes on where it was stopped")
+    sub.add_argument("names", nargs="*", metavar="NAME", help="cases to measure (default: all), or tables")
     sub.add_argument("--out", default="benchmarks/results", metavar="DIR", help="where results are written")
     sub.add_argument("--runs", default="runs/bench", metavar="DIR", help="where run folders are kept")
     _add_scheduler(sub)
-    text = "ratios of interleaved pairs in about a minute; fails if one is clearly above twice the stored one"
+    text = "a minute: ratios of interleaved pairs, fails if one is clearly above twice the stored one; with the NAME"
+    text += " stress few cases of it, fails if a bound is not held; with tables a small version in ten minutes"
     sub.add_argument("--quick", action="store_true", help=text)
     sub.add_argument("--store", action="store_true", help="with --quick: store the ratios instead")
+    text = "with tables: begin no row after so many hours; the next call goes on (default: measure all)"
+    sub.add_argument("--hours", type=float, metavar="H", help=text)
 
     sub = command("demo", _demo, "the main job on real spectra, or on a traced room where there are none")
     sub.add_argument("--out", metavar="RUN", help="run folder (default: a new one in runs/)")
@@ -292,9 +273,8 @@ def _add_training(sub: Any) -> None:
     sub.add_argument(
         "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
     )
-    sub.add_argument(
-        "--model", choices=("wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing"), help="default: wrf-gs+"
-    )
+    models = list(dict.fromkeys(("wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", *METHODS)))
+    sub.add_argument("--model", choices=models, help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
     sub.add_argument("--scene", metavar="SCENE", help="for hybrid, or for ray-tracing, which is then the command trace")
     _add_tracing(sub)
     sub.add_argument(
@@ -302,7 +282,7 @@ def _add_training(sub: Any) -> None:
     )
     sub.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
     sub.add_argument("--seed", type=int, metavar="N", help="default: 0")
-    sub.add_argument("--deterministic", action="store_true", help="bit-identical results, on one thread")
+    sub.add_argument("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
     sub.add_argument("--preset", choices=("default", "paper", "quick"), help="a named set of settings")
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting; repeatable")
 

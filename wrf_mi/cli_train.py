@@ -11,13 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from .backend import init
+from .baselines.models import METHODS, PAPER
 from .core import InputError
 
 Arguments = argparse.Namespace
 
 
 def train_command(a: Arguments) -> int:
-    """``train``: a field, a hybrid, or a traced run."""
+    """``train``: a field, a hybrid, a baseline, or a traced run."""
     if a.help_settings:
         print(_settings_text())
         return 0
@@ -27,8 +31,12 @@ def train_command(a: Arguments) -> int:
             raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
         return _resume(a)
     _check_options(a)
+    if a.deterministic:
+        init("llvm", threads=1)
     if a.model == "ray-tracing":
         return trace_command(a)
+    if (baseline := _baseline(a)) is not None:
+        return _train_baseline(a, baseline)
     return _train_hybrid(a) if a.model == "hybrid" else _train_field(a)
 
 
@@ -36,15 +44,31 @@ def _traced(a: Arguments) -> tuple[Any, ...]:
     return a.paths, a.depth, a.reflections, a.rays, a.calibrate
 
 
+def _baseline(a: Arguments) -> str | None:
+    """Name of the baseline that is to be trained: WRF-GS and WRF-GS+ are such where the data are no spectra."""
+    model = a.model or "wrf-gs+"
+    if model not in METHODS:
+        return None
+    if model in PAPER:
+        from .measure.registry import holds_spectra
+
+        return None if not a.dataset or holds_spectra(a.dataset) else model
+    return model
+
+
 def _check_options(a: Arguments) -> None:
     """Refuse options of ``train`` that do not belong together."""
     if a.model == "ray-tracing":
-        if not (a.scene and a.dataset and a.out) or a.set or a.preset or a.deterministic:
+        if not (a.scene and a.dataset and a.out) or a.set or a.preset:
             raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
         return
     if a.model == "hybrid":
-        if any(value is not None for value in (*_traced(a), a.preset)) or a.deterministic:
+        if any(value is not None for value in (*_traced(a), a.preset)):
             raise InputError("train --model hybrid takes --scene, --material, --split, --n-train, --seed and --set")
+    elif (baseline := _baseline(a)) is not None:
+        if any(value is not None for value in (a.scene, a.material, a.preset, *_traced(a))):
+            other = "a scene belongs to --model ray-tracing or hybrid, a preset to fields of spectra"
+            raise InputError(f"{baseline} on {a.dataset}: takes --split, --n-train, --seed and --set; {other}")
     elif any(value is not None for value in (a.scene, a.material, *_traced(a))):
         raise InputError("--scene and what is traced in it belong to --model ray-tracing (--scene also to hybrid)")
     if not a.dataset or not a.out:
@@ -52,18 +76,30 @@ def _check_options(a: Arguments) -> None:
 
 
 def _resume(a: Arguments) -> int:
+    if _states_determinism(Path(a.resume)):
+        init("llvm", threads=1)
+    from .report.baseline_run import is_baseline, resume_baseline
     from .report.hybrid_run import is_hybrid, resume_hybrid
     from .report.runs import resume
     from .report.watch import Stages
 
     folder = Path(a.resume)
-    if is_hybrid(folder):
+    if is_hybrid(folder) or is_baseline(folder):
+        go_on = resume_hybrid if is_hybrid(folder) else resume_baseline
         with Stages() as stages:
-            resume_hybrid(folder, stages.listen)
+            go_on(folder, stages.listen)
         return _show_stored(folder, a.json)
     with progress_bar() as watch:
         run = resume(folder, watch.listen, watch.stop)
     return show_metrics(run.metrics, folder, a.json)
+
+
+def _states_determinism(folder: Path) -> bool:
+    """Whether a run's settings ask for it; plain YAML, as all else that reads a run chooses a backend first."""
+    try:
+        return bool(yaml.safe_load((folder / "config.yaml").read_text())["settings"]["deterministic"])
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+        return False  # what is wrong with it is said where it is read
 
 
 def _train_field(a: Arguments) -> int:
@@ -101,6 +137,16 @@ def _train_hybrid(a: Arguments) -> int:
     return _show_stored(folder, a.json)
 
 
+def _train_baseline(a: Arguments, model: str) -> int:
+    from .report.baseline_run import train_baseline
+    from .report.watch import Stages
+
+    asked: dict[str, Any] = {"split": _split(a), "n_train": a.n_train, "seed": a.seed or 0, "settings": tuple(a.set)}
+    with Stages() as stages:
+        folder = train_baseline(a.dataset, a.out, model, **asked, listen=stages.listen)
+    return _show_stored(folder, a.json)
+
+
 def _split(a: Arguments) -> str:
     return "official" if a.split is None else a.split
 
@@ -108,10 +154,13 @@ def _split(a: Arguments) -> str:
 def _settings_text() -> str:
     from .fit.config import describe
     from .hybrid.models import settings_of_hybrids
+    from .report.baseline_run import settings_of_baselines
 
     parts = ["wrf-gs, wrf-gs+, factorised:", describe()]
     for name, settings in settings_of_hybrids().items():
         parts += [f"\nhybrid, {name}:", describe(settings)]
+    for name, settings in settings_of_baselines().items():
+        parts += [f"\n{name}{', no spectra' if name in PAPER else ''}:", describe(settings)]
     return "\n".join(parts)
 
 
@@ -149,7 +198,7 @@ def _trace_options(a: Arguments) -> Any:
 def sweep_command(a: Arguments, parse: Callable[[list[str]], Arguments]) -> int:
     """``sweep``: a run of ``train`` for each combination; ``parse`` reads the arguments of a call of the command."""
     from .parallel import open_scheduler
-    from .report.sweep import OPTIONS, check_failures, check_fit, plan_sweep, run_sweep, sweep_table
+    from .report.sweep import OPTIONS, check_baseline_run, check_failures, check_fit, plan_sweep, run_sweep, sweep_table
 
     given = {key: getattr(a, key.replace("-", "_")) for key in OPTIONS}
     options = {key: str(value) for key, value in given.items() if value is not None}
@@ -157,6 +206,9 @@ def sweep_command(a: Arguments, parse: Callable[[list[str]], Arguments]) -> int:
     for run in sweep.runs:
         one = parse([*run.arguments, "--out", str(run.folder)])
         _check_options(one)
+        if (baseline := _baseline(one)) is not None:
+            check_baseline_run(baseline, one.dataset, (_split(one), one.seed or 0, one.n_train), tuple(one.set))
+            continue
         traced, field = one.model == "ray-tracing", one.model not in ("ray-tracing", "hybrid")
         settings: Any = _field_config(one) if field else _trace_options(one) if traced else tuple(one.set)
         drawn = settings.seed if field else one.seed or 0
@@ -186,10 +238,9 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     task = TASKS[metrics["task"]]
     title = f"{task.label} on {metrics['n_test']} test rows"
     print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
-    named = (
-        (metrics["model"], metrics[task.block]),
-        (f"{task.reference_name} ({task.reference})", metrics["reference"][task.reference]),
-    )
+    held = metrics["reference"]
+    named = [(metrics["model"], metrics[task.block])]
+    named += [(f"{words} ({key})", held[key]) for key, words in task.references.items() if key in held]
     for name, block in named:
         print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
     if "inside_90" in metrics:

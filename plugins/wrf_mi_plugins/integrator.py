@@ -23,6 +23,7 @@ from wrf_mi.splat.bundles import RayLists, ray_bundles  # noqa: E402
 from wrf_mi.splat.rays import Walls, blend_rays  # noqa: E402
 
 from .acceleration import traced_lists  # noqa: E402
+from .hidden import without_hidden  # noqa: E402
 from .sensor import RIGID_TOLERANCE, PerceptionPlane, pose_of  # noqa: E402
 from .shape import gaussian_shape_of, interleave, read_gaussians  # noqa: E402
 from .walls import find_crossings, wall_scene, wall_shapes, walls_of  # noqa: E402
@@ -92,6 +93,8 @@ class TracedField(ADIntegrator):
     ``thickness_<name>``    float   m     0.1       slab thickness of a material ``mat-<name>`` that
                                                     is known by its BSDF's id alone, e.g.
                                                     ``thickness_itu_glass``
+    ``opaque_power``        float         0         Gaussians behind walls that pass at most this
+                                                    share of the power are left out; 0: none
     ======================= ======= ===== ========= ================================================== ==============
 
     .. code-block:: python
@@ -103,6 +106,9 @@ class TracedField(ADIntegrator):
             "gaussians": gaussian_shape(gaussians),
         })
         image = mi.render(scene)
+
+    With ``opaque_power`` p no pixel's field changes by more than sqrt(p) M, M the largest abs(signal) (alpha blending)
+    or the sum of all (product blending), nor a derivative by a signal by more than sqrt(p) (`wrf_mi_plugins.hidden`).
 
     The rays' hits are found by Mitsuba's ray tracing (`wrf_mi_plugins.acceleration`) and kept: a render after which
     only signals, opacities or attenuations changed traces nothing. Sensors must be points: `wrf_perception_plane`,
@@ -117,6 +123,9 @@ class TracedField(ADIntegrator):
         super().__init__(props)
         self.with_walls = bool(props.get("walls", True))
         self.frequency_hz = mi.Float(float(props.get("frequency_hz", 0.0)))
+        self.opaque_power = float(props.get("opaque_power", 0.0))
+        if not 0 <= self.opaque_power < 1:
+            raise InputError(f"{props.plugin_name()}: opaque_power {self.opaque_power}; give a share from 0 to below 1")
         self.polarization = [float(c) for c in props.get("polarization", mi.ScalarVector3f(0, 1, 0))]
         self.thickness_m = {n.removeprefix(THICKNESS): float(props[n]) for n in props if n.startswith(THICKNESS)}
         if not np.isfinite(self.polarization).all() or not np.any(self.polarization):
@@ -188,6 +197,8 @@ class TracedField(ADIntegrator):
             (data.index, *look.key), lambda: (_lists(gaussians, footprints, look.pose, bundles), data, look.direction)
         )[0]
         walls = self._walls(scene, look) if self.with_walls else None
+        if walls is not None and self.opaque_power:
+            lists = without_hidden(lists, bundles, gaussians, footprints, walls, self.opaque_power)
         parts = blend_rays(
             footprints, gaussians.signal, lists, bundles, gaussians.opacity, gaussians.attenuation, walls
         )

@@ -88,8 +88,14 @@ def measured_parts(error_m: float, seed: int) -> dict[str, tuple[str, Mesh]]:
     return {name: (GENERIC, mesh) for name, mesh in meshes.items()}
 
 
-def write_scene(folder: Path, parts: Parts, description: str) -> Path:
+def write_scene(folder: Path, parts: Parts, description: str, origin: str = "wrf_mi_scenes.furnished") -> Path:
     """Write parts as a scene folder that Mitsuba and Sionna RT both open: ``scene.xml``, ``meshes/`` and ``scene.yml``.
+
+    Args:
+        folder: to write into.
+        parts: radio material and mesh of each part by its name.
+        description: one line.
+        origin: the module that made them.
 
     Returns:
         The scene file.
@@ -104,7 +110,7 @@ def write_scene(folder: Path, parts: Parts, description: str) -> Path:
     facts = {
         "description": description,
         "licence": "MIT",
-        "origin": "made by wrf_mi_scenes.furnished",
+        "origin": f"made by {origin}",
         "frame": "right-handed; x east, y north, z up; origin at the floor's south-west corner",
         "units": "m",
         "xml": xml.name,

@@ -76,7 +76,9 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
             if before is not None:
                 warnings.warn(f"Mitsuba's variant changes from {before} to {_active.variant}", stacklevel=2)
             mi.set_variant(_active.variant)
-        if threads is not None:
+        if threads is not None and threads != dr.thread_count():
+            # Kernels that wait have room for sums of as many threads as there were when they were launched.
+            dr.sync_thread()
             dr.set_thread_count(threads)
         return _active
 

@@ -2,11 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.core.angles import FloatArray
+
+from .by_receiver import ByReceiver, fit_each, load_each
+from .method import Listen, Method
+
+NAME = "idw"
+
+
+REFERENCE: Mapping[str, tuple[int, float]] = {
+    "spectrum": (4, 0.0),
+    # Of 0 to 1.6 m the best on tenths of flat-ble's training run that were held out in turn, in the order of time.
+    "rssi": (100, 0.4),
+    "csi": (4, 0.0),
+}
+"""Neighbours and softening in metres by task: the blend that every run is held against."""
 
 
 class InverseDistance:
@@ -53,11 +72,23 @@ class InverseDistance:
         self._tree, self._values = KDTree(positions[observed]), values[observed]
         return self
 
-    def predict(self, tx_pos: ArrayLike) -> NDArray[np.floating]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Settings and the rows that were kept."""
+        settings = np.array([self.k, self.power, self.softening_m], float)
+        return {"settings": settings, "tx_pos_m": np.asarray(self._tree.data), "value": self._values}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> InverseDistance:
+        """What `arrays` returned."""
+        k, power, softening_m = map(float, arrays["settings"])
+        return cls(int(k), power, softening_m).fit(arrays["tx_pos_m"], arrays["value"])
+
+    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
         """Blend the neighbours of each position.
 
         Args:
             tx_pos: shape [m, 3], metres.
+            tx_heading_rad: changes nothing.
 
         Returns:
             Shape [m, ...], in the observations' unit and type.
@@ -75,3 +106,49 @@ class InverseDistance:
         for row, (w, i) in enumerate(zip(weight, neighbour, strict=True)):
             blended[row] = np.tensordot(w, self._values[i], axes=1)
         return blended
+
+
+@dataclass(frozen=True)
+class IdwSettings:
+    """Settings of the blend.
+
+    Attributes:
+        neighbours: number of training rows that are blended; null: the task's, as in the reference of every run.
+        power: exponent of the distance.
+        softening_m: added to every distance, metres; null: the task's.
+    """
+
+    neighbours: int | None = None
+    power: float = 2.0
+    softening_m: float | None = None
+
+
+def fit(record: Record, split: Split, settings: IdwSettings, seed: int, listen: Listen) -> ByReceiver:
+    """Keep the training rows that each receiver received.
+
+    Raises:
+        InputError: settings out of range, positions that are not known, or no row that was received.
+    """
+    k, softening_m = REFERENCE[record.task]
+    k = k if settings.neighbours is None else settings.neighbours
+    softening_m = softening_m if settings.softening_m is None else settings.softening_m
+
+    def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
+        return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
+
+    return fit_each(NAME, record, split, listen, one)
+
+
+def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
+    """What `ByReceiver.arrays` returned."""
+    return load_each(NAME, arrays, record, lambda receiver, kept: InverseDistance.from_arrays(kept))
+
+
+METHOD = Method(
+    NAME,
+    tuple(REFERENCE),
+    IdwSettings,
+    fit,
+    load,
+    "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
+)

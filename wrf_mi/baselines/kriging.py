@@ -13,8 +13,9 @@ information when block sizes are unequal" (1971) (restricted likelihood).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -65,6 +66,64 @@ def log_distance(receiver_m: ArrayLike) -> Trend:
     return columns
 
 
+@dataclass(frozen=True)
+class KrigedMean:
+    """What a fitted kriging predicts: a trend and weights of the training rows' correlations.
+
+    Attributes:
+        kernel: a key of `KERNELS`.
+        lengths: correlation length in metres, and over headings where there are any.
+        positions_m: of the rows [n, 3].
+        circle: cosine and sine of their headings [n, 2], or None.
+        coefficients: of the trend's columns for each component [p, q].
+        weights: of the rows for each component [n, q].
+        like: empty array of the shape and type of observations, [0, ...].
+        trend: columns of the trend.
+    """
+
+    kernel: str
+    lengths: FloatArray
+    positions_m: FloatArray
+    circle: FloatArray | None
+    coefficients: NDArray[np.inexact]
+    weights: NDArray[np.inexact]
+    like: NDArray[np.inexact]
+    trend: Trend
+
+    def correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
+        """Correlations [m, n] of positions [m, 3] with the rows.
+
+        Raises:
+            InputError: headings that the fit did not have, or the other way round.
+        """
+        if (tx_heading_rad is None) != (self.circle is None):
+            had = "no headings" if self.circle is None else "headings"
+            raise InputError(f"kriging: fitted with {had}; predict with the same")
+        turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
+        asked = _coordinates(positions_m, turned, self.lengths)
+        return KERNELS[self.kernel](cdist(asked, _coordinates(self.positions_m, self.circle, self.lengths)))
+
+    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
+        """As `Kriging.predict`."""
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        cross = self.correlations(positions, tx_heading_rad)
+        mean = self.trend(positions) @ self.coefficients + cross @ self.weights
+        return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All but the trend."""
+        circle = np.zeros((0, 2)) if self.circle is None else self.circle
+        names = ("lengths", "positions_m", "coefficients", "weights", "like")
+        return {"kernel": np.asarray(self.kernel), "circle": circle} | {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], trend: Trend) -> KrigedMean:
+        """What `arrays` returned, with the trend."""
+        names = ("lengths", "positions_m", "coefficients", "weights", "like")
+        circle = arrays["circle"] if len(arrays["circle"]) else None
+        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **{name: arrays[name] for name in names})
+
+
 class Kriging:
     """Kriging of real or complex observations over positions and, if given, headings.
 
@@ -105,7 +164,7 @@ class Kriging:
         if likelihood_rows < 2:
             raise InputError(f"kriging: likelihood of {likelihood_rows} rows; choose 2 or more")
         self.length_m, self.noise, self.heading_length = length_m, noise, heading_length
-        self.kernel, self.trend, self.trend_fit = KERNELS[kernel], trend, trend_fit
+        self.kernel, self.trend, self.trend_fit = kernel, trend, trend_fit
         self.likelihood_rows, self.seed = likelihood_rows, seed
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
@@ -128,7 +187,7 @@ class Kriging:
         observed = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
         if not observed.any():
             raise InputError(f"{len(values)} training rows: none of them was received; use another split")
-        self._shape, self._type = values.shape[1:], np.result_type(values, np.float32)
+        like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
         wide = complex if np.iscomplexobj(values) else float
         y = values[observed].reshape(int(observed.sum()), -1).astype(wide)
         self._positions = positions[observed]
@@ -139,8 +198,8 @@ class Kriging:
         start = 0
         if self.trend_fit == "ols":
             # The field is what the least-squares trend leaves; taken as known from here on.
-            self._ols = np.linalg.lstsq(columns, y, rcond=None)[0]
-            start = columns @ self._ols
+            coefficients = np.linalg.lstsq(columns, y, rcond=None)[0]
+            start = columns @ coefficients
             columns = columns[:, :0]
         self._lengths, self.chosen_noise = self._choose(y - start, columns)
         try:
@@ -149,9 +208,19 @@ class Kriging:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
         self._whitened = solve_triangular(self._factor[0], columns, lower=True)
         field = y - start
-        self._beta = _trend_of(self._factor, columns, field)
-        self._weights = cho_solve(self._factor, field - columns @ self._beta)
-        quadratic = (field.conj() * self._weights).real.sum(axis=0)
+        beta = _trend_of(self._factor, columns, field)
+        weights = cho_solve(self._factor, field - columns @ beta)
+        self.mean = KrigedMean(
+            self.kernel,
+            self._lengths,
+            self._positions,
+            self._circle,
+            beta if self.trend_fit == "gls" else coefficients,
+            weights,
+            like,
+            self.trend,
+        )
+        quadratic = (field.conj() * weights).real.sum(axis=0)
         # The trend's own degrees of freedom leave the residual too small by their share.
         self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
         return self
@@ -175,9 +244,7 @@ class Kriging:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
-        _, cross, columns, start = self._asked(tx_pos, tx_heading_rad)
-        mean: NDArray[np.inexact] = (start + columns @ self._beta + cross @ self._weights).astype(self._type)
-        return mean.reshape(len(mean), *self._shape)
+        return self.mean.predict(tx_pos, tx_heading_rad)
 
     def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Estimate:
         """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
@@ -185,7 +252,9 @@ class Kriging:
         The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
         """
         mean = self.predict(tx_pos, tx_heading_rad)
-        _, cross, columns, _ = self._asked(tx_pos, tx_heading_rad)
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        cross = self.mean.correlations(positions, tx_heading_rad)
+        columns = self.trend(positions)[:, : self._whitened.shape[1]]
         half = solve_triangular(self._factor[0], cross.T, lower=True)
         share = 1 + self.chosen_noise - np.square(half).sum(axis=0)
         if columns.shape[1]:
@@ -194,29 +263,10 @@ class Kriging:
         std = np.sqrt(np.maximum(share, 0))[:, None] * np.sqrt(self._variance)
         return Estimate(mean, std.reshape(mean.shape))
 
-    def _asked(
-        self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.inexact] | float]:
-        """Positions, correlations with the training rows, columns of the joint trend, and the trend known before."""
-        if (tx_heading_rad is None) != (self._circle is None):
-            had = "no headings" if self._circle is None else "headings"
-            raise InputError(f"kriging: fitted with {had}; predict with the same")
-        positions = np.atleast_2d(np.asarray(tx_pos, float))
-        asked = self._coordinates(positions, None if tx_heading_rad is None else _circle(tx_heading_rad), self._lengths)
-        cross = self.kernel(cdist(asked, self._coordinates(self._positions, self._circle, self._lengths)))
-        columns = self.trend(positions)
-        if self.trend_fit == "ols":
-            return positions, cross, columns[:, :0], columns @ self._ols
-        return positions, cross, columns, 0.0
-
-    def _coordinates(self, positions_m: FloatArray, circle: FloatArray | None, lengths: FloatArray) -> FloatArray:
-        scaled = positions_m / lengths[0]
-        return scaled if circle is None else np.concatenate([scaled, circle / lengths[1]], axis=1)
-
     def _covariance(self, rows: slice | NDArray[np.intp], lengths: FloatArray, noise: float) -> FloatArray:
         circle = None if self._circle is None else self._circle[rows]
-        x = self._coordinates(self._positions[rows], circle, lengths)
-        covariance = self.kernel(cdist(x, x))
+        x = _coordinates(self._positions[rows], circle, lengths)
+        covariance = KERNELS[self.kernel](cdist(x, x))
         covariance[np.diag_indices_from(covariance)] += noise
         return covariance
 
@@ -266,6 +316,12 @@ class Kriging:
         extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
         length = np.clip(extent / 10, *LENGTH_M)
         return np.log([length, *([] if self._circle is None else [1.0]), 0.1])
+
+
+def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: FloatArray) -> FloatArray:
+    """Positions and headings in correlation lengths."""
+    scaled = positions_m / lengths[0]
+    return scaled if circle is None else np.concatenate([scaled, circle / lengths[1]], axis=1)
 
 
 def _circle(heading_rad: ArrayLike) -> FloatArray:

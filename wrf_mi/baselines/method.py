@@ -34,6 +34,15 @@ class Inputs:
         """Number of rows."""
         return len(self.tx_pos_m)
 
+    def rows(self, chosen: slice) -> Inputs:
+        """Some of them."""
+        heading, uplink = self.tx_heading_rad, self.uplink
+        return Inputs(
+            self.tx_pos_m[chosen],
+            None if heading is None else heading[chosen],
+            None if uplink is None else uplink[chosen],
+        )
+
 
 def inputs_of(record: Record, rows: IntArray) -> Inputs:
     """The inputs of some rows of a record."""

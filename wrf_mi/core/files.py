@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import InputError
 
@@ -32,6 +33,34 @@ def text_lines(path: Path) -> list[str]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({one_line(error)}); give a UTF-8 text file") from None
     return text.rstrip().splitlines()
+
+
+@contextmanager
+def readable(path: Path, missing: str, remedy: str) -> Iterator[None]:
+    """Says in one line that a file of ours cannot be read, whatever the block that reads it finds.
+
+    Args:
+        path: the file.
+        missing: the whole line where it is not there.
+        remedy: end of the line where it is damaged.
+
+    Raises:
+        InputError: naming the file.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(missing) from None
+    except InputError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
+        raise InputError(f"{path}: not readable ({one_line(error)}); {remedy}") from None
+
+
+def stored_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """All arrays of an ``.npz`` file; to be called within `readable`."""
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
 
 
 @contextmanager

@@ -50,11 +50,14 @@ class Record:
         folds: the spatial block of each row, shape [n], or None.
         frequencies_hz: of the carrier, shape [1], or of each subcarrier of ``observation``; None where the data do not
             tell.
-        array_m: elements of the antenna array behind a spectrum [m, 3], receiver's frame, metres, or None.
+        array_m: elements of the antenna array behind a spectrum, or of channel coefficients the antennas, [m, 3],
+            receiver's frame, metres, or None.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
             ``observation``, the downlink's, are to be predicted: [n, antennas, uplink subcarriers], complex64; or None.
         uplink_hz: frequency of each subcarrier of ``uplink``, or None.
+        truth: ``observation`` without its noise, where it is synthetic, or None. For scores alone (see `scored`): a
+            method may not look at it.
         source: where it was read from.
     """
 
@@ -70,11 +73,22 @@ class Record:
     tx_heading_rad: FloatArray | None = None
     uplink: NDArray[np.complex64] | None = None
     uplink_hz: FloatArray | None = None
+    truth: NDArray[np.float32] | NDArray[np.complex64] | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:
         """Number of transmitter positions (rows)."""
         return len(self.tx_pos_m)
+
+    @property
+    def scored(self) -> NDArray[np.float32] | NDArray[np.complex64]:
+        """What predictions are held against: the truth where it is known, else the observation."""
+        return self.observation if self.truth is None else self.truth
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether every row's position is known."""
+        return bool(np.isfinite(self.tx_pos_m).all())
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ Dr.Jit alone.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import drjit as dr
@@ -39,3 +40,9 @@ def to_float(values: ArrayLike) -> Any:
 def to_tensor(values: ArrayLike) -> Any:
     """A Dr.Jit float32 tensor of the same shape."""
     return mi.TensorXf(to_float(values), np.shape(values))
+
+
+def quads(float_type: Any) -> Any:
+    """The type of four numbers of a float array's type, which gathers and scatters move as one packet."""
+    module = sys.modules[float_type.__module__]
+    return module.Array4f64 if dr.type_v(float_type) == dr.VarType.Float64 else module.Array4f

@@ -21,7 +21,7 @@ from ..core import InputError
 from .gaussians import Gaussians, rows
 from .initial import InitialGaussians
 from .models import GEOMETRY, Encoding
-from .network import Params, Weights, init_layer, linear, relu
+from .network import Params, Weights, dense, init_layer, linear
 
 
 @dataclass(frozen=True)
@@ -70,24 +70,26 @@ class Factorised:
 
     def functions(self, params: Params, tx_pos: dr.ArrayBase) -> dr.ArrayBase:
         """Values of phi at transmitters [3, batch] in metres: [2 K, batch], real parts, then imaginary ones."""
-        hidden = relu(linear(params, "terms.0", self.encoding.transmitter(tx_pos), "transmitter"))
+        hidden = dense(params, "terms.0", self.encoding.transmitter(tx_pos), "transmitter")
         for i in range(1, self.layers):
-            hidden = relu(linear(params, f"terms.{i}", hidden))
+            hidden = dense(params, f"terms.{i}", hidden)
         return linear(params, "terms.out", hidden)
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
-        batch, k = tx_pos.shape[1], self.terms
-        phi, own = self.functions(params, tx_pos), params["signal"]
-        f_re, f_im = (dr.moveaxis(phi[part, :], 0, 1) for part in (slice(0, k), slice(k, 2 * k)))
-        c_re, c_im = own[0:k, :], own[k : 2 * k, :]
+        batch, k, own = tx_pos.shape[1], self.terms, params["signal"]
+        n, c_re, c_im = own.shape[1], own[0:k, :], own[k : 2 * k, :]
+        # One real product of everything. In the derivative of four, Dr.Jit 1.5 on two threads now and then read a
+        # part before it was written, and lost what reached phi by it.
+        both = dr.concat([dr.concat([c_re, c_im], axis=1), dr.concat([-c_im, c_re], axis=1)], axis=0)
+        signal = dr.moveaxis(self.functions(params, tx_pos), 0, 1) @ both
         opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
         return Gaussians(
             position=rows(params["position"]),
-            scale=[dr.tile(dr.exp(s), batch) for s in rows(params["log_scale"])],
-            rotation=[dr.tile(q, batch) for q in rows(params["rotation"])],
-            signal=[(f_re @ c_re - f_im @ c_im).array, (f_re @ c_im + f_im @ c_re).array],
-            opacity=dr.tile(opacity, batch),
+            scale=[dr.exp(s) for s in rows(params["log_scale"])],
+            rotation=rows(params["rotation"]),
+            signal=[signal[:, 0:n].array, signal[:, n : 2 * n].array],
+            opacity=opacity,
             attenuation=None,
             batch=batch,
         )

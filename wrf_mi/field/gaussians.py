@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -19,6 +19,9 @@ class Gaussians:
         attenuation: complex factor delta (re, im), two arrays [batch * n], |delta| < 1; None under alpha blending.
         signal: complex signal (re, im), two arrays [batch * n]. Signed; nothing clamps it.
         batch: number of transmitters.
+
+    Where geometry and blending are the same for all transmitters, scale, rotation, opacity and attenuation may have
+    one number a Gaussian, [n]: ``shared`` then, and `spread` repeats them.
     """
 
     position: list[dr.ArrayBase]
@@ -38,6 +41,27 @@ class Gaussians:
     def count(self) -> int:
         """Number of Gaussians for one transmitter."""
         return dr.width(self.position[0])
+
+    @property
+    def shared(self) -> bool:
+        """Whether several transmitters have one set of geometry, opacity or attenuation."""
+        return self.batch > 1 and dr.width(self.scale[0]) == self.count
+
+    def spread(self) -> Gaussians:
+        """The same with all arrays [batch * n]."""
+        if not self.shared:
+            return self
+
+        def wide(arrays: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
+            return [dr.tile(a, self.batch) for a in arrays]
+
+        return replace(
+            self,
+            scale=wide(self.scale),
+            rotation=wide(self.rotation),
+            opacity=None if self.opacity is None else dr.tile(self.opacity, self.batch),
+            attenuation=None if self.attenuation is None else wide(self.attenuation),
+        )
 
 
 def rows(tensor: dr.ArrayBase) -> list[dr.ArrayBase]:

@@ -68,8 +68,9 @@ def random_gaussians(
     size_deg: float = 7.0,
     opacity: float = 0.1,
     signal: float = 0.3,
+    sphere: bool = False,
 ) -> InitialGaussians:
-    """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere.
+    """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere or full sphere.
 
     The paper draws points "within a specified range". What a receiver sees is directions, so the range
     here is one of directions and distances: distances are uniform in ``distance_m`` and scales such that a
@@ -79,7 +80,8 @@ def random_gaussians(
     position, scale = np.empty((count, 3)), np.empty(count)
     for receiver, own in zip(receivers, share, strict=True):
         # A margin below the horizon: footprints of Gaussians there reach above it.
-        elevation = np.arcsin(rng.uniform(-np.sin(np.radians(size_deg)), 1.0, len(own)))
+        lowest = -1.0 if sphere else -np.sin(np.radians(size_deg))
+        elevation = np.arcsin(rng.uniform(lowest, 1.0, len(own)))
         direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(own)), elevation)
         distance = rng.uniform(*distance_m, len(own))
         position[own] = receiver.position_m + (direction * distance[:, None]) @ receiver.to_world.T

@@ -16,7 +16,7 @@ from scipy.constants import speed_of_light
 from .encoding import encode, encoded_size
 from .gaussians import Gaussians, rows
 from .initial import InitialGaussians
-from .network import Params, Weights, init_layer, linear, linear_of_pairs, relu
+from .network import Params, Weights, dense, dense_of_pairs, init_layer, linear
 
 GEOMETRY = ("position", "log_scale", "rotation")
 """Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
@@ -96,23 +96,22 @@ class WrfGs:
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
         batch = tx_pos.shape[1]
-        hidden = relu(linear(params, "attenuation.0", self.encoding.position(params["position"]), "position"))
+        hidden = dense(params, "attenuation.0", self.encoding.position(params["position"]), "position")
         for i in range(1, self.layers):
-            hidden = relu(linear(params, f"attenuation.{i}", hidden))
+            hidden = dense(params, f"attenuation.{i}", hidden)
         z = linear(params, "attenuation.delta", hidden)
         re, im = rows(z)
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
-        seen = relu(
-            linear_of_pairs(params, "signal.0", {"feature": hidden}, {"transmitter": self.encoding.transmitter(tx_pos)})
-        )
-        signal = linear(params, "signal.out", relu(linear(params, "signal.1", seen)))
+        encoded = {"transmitter": self.encoding.transmitter(tx_pos)}
+        seen = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
+        signal = linear(params, "signal.out", dense(params, "signal.1", seen))
         return Gaussians(
             position=rows(params["position"]),
-            scale=[dr.tile(dr.exp(s), batch) for s in rows(params["log_scale"])],
-            rotation=[dr.tile(q, batch) for q in rows(params["rotation"])],
+            scale=[dr.exp(s) for s in rows(params["log_scale"])],
+            rotation=rows(params["rotation"]),
             signal=rows(signal),
             opacity=None,
-            attenuation=[dr.tile(re * norm, batch), dr.tile(im * norm, batch)],
+            attenuation=[re * norm, im * norm],
             batch=batch,
         )
 
@@ -172,17 +171,19 @@ class WrfGsPlus:
         batch = tx_pos.shape[1]
         position = {"position": self.encoding.position(params["position"])}
         transmitter = {"transmitter": self.encoding.transmitter(tx_pos)}
-        hidden = relu(linear_of_pairs(params, "deform.0", position, transmitter))
+        hidden = dense_of_pairs(params, "deform.0", position, transmitter)
         for i in range(1, self.layers):
             if i == self.skip:
-                hidden = relu(linear_of_pairs(params, f"deform.{i}", position, transmitter, hidden))
+                hidden = dense_of_pairs(params, f"deform.{i}", position, transmitter, hidden)
             else:
-                hidden = relu(linear(params, f"deform.{i}", hidden))
+                hidden = dense(params, f"deform.{i}", hidden)
         offset = {head: rows(linear(params, f"deform.{head}", hidden)) for head, _, _ in self.heads}
 
         def deformed(name: str, head: str) -> list[dr.ArrayBase]:
+            if head not in offset:
+                return rows(params[name])
             static = [dr.tile(a, batch) for a in rows(params[name])]
-            return [a + d for a, d in zip(static, offset[head], strict=True)] if head in offset else static
+            return [a + d for a, d in zip(static, offset[head], strict=True)]
 
         opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
         return Gaussians(
@@ -192,7 +193,7 @@ class WrfGsPlus:
             signal=self._turned(deformed("signal", "signal"), params, tx_pos)
             if self.phase_hz
             else deformed("signal", "signal"),
-            opacity=dr.tile(opacity, batch),
+            opacity=opacity if self.still else dr.tile(opacity, batch),
             attenuation=None,
             batch=batch,
         )

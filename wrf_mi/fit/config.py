@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -129,16 +130,21 @@ class DensityConfig:
     reset_opacity: float = 0.05
 
 
+LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
+"""Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
+OTHERWISE = 15000
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """All settings of a fit.
 
     Attributes:
         model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
-        steps: optimiser steps.
+        steps: optimiser steps; 0: as many as the model needs, see `LONG_ENOUGH`.
         batch: transmitters in a step.
         seed: of starting values and of the order of rows.
-        deterministic: bit-identical results from run to run, at the price of computing on one thread.
+        deterministic: bit-identical results from run to run, at the price of computing on one thread of the CPU.
         hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
             to the end, as every choice of settings must; less ends with a fit on all training rows.
         structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
@@ -149,7 +155,7 @@ class TrainConfig:
     """
 
     model: str = "wrf-gs+"
-    steps: int = 15000
+    steps: int = 0
     batch: int = 1
     seed: int = 0
     deterministic: bool = False
@@ -164,6 +170,10 @@ class TrainConfig:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     skip: Skip = field(default_factory=Skip)
+
+    def scheduled(self) -> TrainConfig:
+        """The same with the number of steps that is meant."""
+        return self if self.steps else dataclasses.replace(self, steps=LONG_ENOUGH.get(self.model, OTHERWISE))
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
@@ -190,7 +200,6 @@ _SHARE: _Range = (lambda x: 0 <= x <= 1, "0 to 1")
 _NOT_NEGATIVE: _Range = (lambda x: x >= 0, "0 or more")
 
 _RANGES: Mapping[str, _Range] = {
-    "steps": _COUNT,
     "batch": _COUNT,
     "hold_out": _SHARE,
     "structural_weight": _SHARE,
@@ -245,6 +254,10 @@ PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick"
 """Named sets of settings, as ``--set`` takes them."""
 
 
+Settings = TypeVar("Settings")
+"""A frozen dataclass of plain values or of such dataclasses."""
+
+
 def to_dict(config: TrainConfig) -> dict[str, Any]:
     """Nested dictionary of plain values."""
     return dataclasses.asdict(config)
@@ -256,27 +269,48 @@ def from_dict(values: Mapping[str, Any], source: str = "config") -> TrainConfig:
     Raises:
         InputError: an unknown setting or a value of the wrong type, named with ``source``.
     """
-    return _build(TrainConfig, values, source, "")
+    return settings_from(TrainConfig, values, source)
+
+
+def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
+    """The same for any dataclass of settings."""
+    return cast(Settings, _build(kind, values, source, ""))
 
 
 def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}, setting {prefix[:-1] or 'top'}: expected a mapping, got {values!r}")
-    types = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(kind)
     arguments = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
-        if key not in types:
-            known = ", ".join(f"{prefix}{k}" for k in types)
+        if key not in hints:
+            known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
-        if dataclasses.is_dataclass(types[key]):
-            arguments[key] = _build(types[key], value, source, f"{name}.")
+        if dataclasses.is_dataclass(hints[key]):
+            arguments[key] = _build(hints[key], value, source, f"{name}.")
         else:
-            arguments[key] = _convert(value, types[key], name, source)
+            arguments[key] = _convert(value, hints[key], name, source)
     return kind(**arguments)
 
 
-def _convert(value: Any, kind: type, name: str, source: str) -> Any:
+def _convert(value: Any, kind: Any, name: str, source: str) -> Any:
+    choices = typing.get_args(kind)
+    if types.NoneType in choices:  # X | None
+        if value is None:
+            return None
+        (kind,) = (choice for choice in choices if choice is not types.NoneType)
+    if typing.get_origin(kind) is typing.Literal:
+        if value not in choices:
+            raise InputError(f"{source}, setting {name}: {value!r}; choose from {', '.join(map(str, choices))}")
+        return value
+    if typing.get_origin(kind) is tuple:
+        parts = value if isinstance(value, list | tuple) else []
+        kinds = choices[:1] * len(parts) if Ellipsis in choices else choices
+        if not parts or len(parts) != len(kinds):
+            count = "" if Ellipsis in choices else f"{len(kinds)} "
+            raise InputError(f"{source}, setting {name}: expected a list of {count}values, got {value!r}")
+        return tuple(_convert(one, own, name, source) for one, own in zip(parts, kinds, strict=True))
     good = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
     # YAML reads 1e-3 as text.
     if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
@@ -287,10 +321,6 @@ def _convert(value: Any, kind: type, name: str, source: str) -> Any:
     if not good:
         raise InputError(f"{source}, setting {name}: expected {kind.__name__}, got {value!r}")
     return value
-
-
-Settings = TypeVar("Settings")
-"""A frozen dataclass of plain values or of such dataclasses."""
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
@@ -325,4 +355,9 @@ def dump(config: TrainConfig) -> str:
 def describe(settings: Any | None = None) -> str:
     """One line a setting, with its default, for ``wrf-mi train --help-settings``; those of a fit if none are given."""
     values = dataclasses.asdict(TrainConfig() if settings is None else settings)
-    return "\n".join(f"{name}={value}" for name, value in _flat(values, ""))
+    return "\n".join(f"{name}={_shown(value)}" for name, value in _flat(values, ""))
+
+
+def _shown(value: Any) -> Any:
+    """As ``--set`` takes it."""
+    return "null" if value is None else list(value) if isinstance(value, tuple) else value

@@ -17,7 +17,8 @@ import importlib.metadata
 import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..backend import init
 from ..core import InputError, Receiver, Record, Split
-from ..core.files import one_line, write_arrays, write_atomically
+from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
 from .packed import pack_params, unpack_params
@@ -64,7 +65,7 @@ class RunConfig:
 
 def versions() -> dict[str, str]:
     """Versions of what computes."""
-    packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scikit-image")
+    packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image", "scikit-learn")
     backend = init()
     return {
         "wrf-mi": __version__,
@@ -94,15 +95,54 @@ def read_config(folder: Path) -> RunConfig:
     Raises:
         InputError: missing, not YAML, or settings that this version does not know.
     """
-    path = folder / CONFIG
-    try:
-        content = yaml.safe_load(path.read_text())
+    with stated_config(folder) as content:
         names = (content["dataset"], content["split"], content.get("n_train"), content["settings"])
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no {CONFIG}, so not a run folder; give one made by train") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not readable ({str(error).splitlines()[0]}); restore it") from None
-    return RunConfig(names[0], names[1], names[2], from_dict(names[3], str(path)))
+    return RunConfig(names[0], names[1], names[2], from_dict(names[3], str(folder / CONFIG)))
+
+
+@contextmanager
+def stated_config(folder: Path, made_by: str = "train") -> Iterator[dict[str, Any]]:
+    """What ``config.yaml`` of a run of any kind says; the block may take from it what has to be there.
+
+    Args:
+        folder: of the run.
+        made_by: command that makes such runs.
+
+    Raises:
+        InputError: missing, not YAML, or without what the block takes.
+    """
+    path = folder / CONFIG
+    with readable(path, f"{folder}: no {CONFIG}, so not a run folder; give one made by {made_by}", "restore it"):
+        content = yaml.safe_load(path.read_text())
+        if not isinstance(content, dict):
+            raise InputError(f"{path}: not readable (no settings in it); restore it")
+        yield content
+
+
+def check_new(folder: Path, other: str = "") -> None:
+    """See that a folder can be made.
+
+    Args:
+        folder: a run folder to be.
+        other: what else might have been meant, after "choose another --out".
+
+    Raises:
+        InputError: it holds something already.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not empty; choose another --out{other}")
+
+
+def part_folders(folder: Path, splits: Sequence[Split]) -> list[tuple[Path, Split]]:
+    """Where each split of a run is kept: one at the top, several in ``fold0``, ..."""
+    if len(splits) == 1:
+        return [(folder, splits[0])]
+    return [(folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
+
+
+def stored_parts(folder: Path) -> list[Path]:
+    """The folders of a run that hold a split."""
+    return [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"))
 
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
@@ -146,16 +186,12 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
         InputError: missing, damaged, or of another format version.
     """
     path = folder / CHECKPOINT
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
+    missing = f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume"
+    with readable(path, missing, "restore it or train anew"):
+        arrays = stored_arrays(path)
         version = int(arrays["format"])
         if version == PACKED_FORMAT:
             arrays |= {f"mean/{name}": values for name, values in unpack_params(arrays).items()}
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume") from None
-    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{path}: not readable ({one_line(error)}); restore it or train anew") from None
     if version not in (FORMAT, PACKED_FORMAT):
         known = f"{FORMAT} and {PACKED_FORMAT}"
         raise InputError(f"{path}: format {version}, this version reads {known}; use the version that wrote it")
@@ -186,10 +222,7 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     Raises:
         InputError: the folder holds something already, or the split has rows that the record has not.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            f"{folder}: exists and is not empty; choose another --out, or go on with train --resume {folder}"
-        )
+    check_new(folder, f", or go on with train --resume {folder}")
     trainer = Trainer(record, split, run.settings)
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)

@@ -16,7 +16,7 @@ from ..field.device import to_tensor
 from ..field.gaussians import Gaussians
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
-from .step import Field, Params, device_pose, make_prediction
+from .step import Field, Params, Prediction, device_pose
 from .still import StillField, stands_still
 
 
@@ -59,14 +59,14 @@ class Predictor:
         """Use other parameters (Dr.Jit tensors) from now on."""
         if params["position"].shape[1] != self._count:
             # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
-            self._predict, self._count = make_prediction(self._field, self._skip), params["position"].shape[1]
+            self._predict, self._count = Prediction(self._field, self._skip), params["position"].shape[1]
         self._params, self._still = params, None
         dr.eval(self._params)
 
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
-        return self._field.gaussians(self._params, to_tensor(columns))
+        return self._field.gaussians(self._params, to_tensor(columns)).spread()
 
     def still(self) -> StillField:
         """The field as operators; forgotten when parameters change."""

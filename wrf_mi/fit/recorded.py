@@ -1,35 +1,5 @@
-"""Functions that Dr.Jit records once and replays."""
+"""Functions that Dr.Jit records once and replays; see `wrf_mi.field.recorded`."""
 
-from __future__ import annotations
+from ..field.recorded import Recorded
 
-import gc
-from collections.abc import Callable
-from typing import Any
-
-import drjit as dr
-
-
-class Recorded:
-    """A function that Dr.Jit records on its first call and replays from then on (`dr.freeze`).
-
-    Python's garbage collector waits meanwhile: an array that it frees while Dr.Jit records, one that wraps
-    NumPy's memory for instance, ends the process.
-    """
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._frozen: Any = dr.freeze(function)
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Call the function."""
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
-            return self._frozen(*arguments)
-        finally:
-            if collecting:
-                gc.enable()
-
-    @property
-    def n_recordings(self) -> int:
-        """How often the function was recorded."""
-        return self._frozen.n_recordings
+__all__ = ["Recorded"]

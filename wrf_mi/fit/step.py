@@ -18,6 +18,7 @@ from drjit.opt import Adam
 
 from ..core import Receiver
 from ..field import Factorised, WrfGs, WrfGsPlus
+from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.skip import NOTHING, Skip
@@ -94,7 +95,7 @@ class StepReport:
 
 @dataclass
 class Trouble:
-    """The first step whose loss or gradient was not finite; from then on no step is taken.
+    """The first step whose loss, parameters, gradient or its square were not finite; from then on no step is taken.
 
     Attributes:
         step: its number from 1; 0: none so far.
@@ -124,6 +125,14 @@ def watched(name: str) -> bool:
     of all that reaches the layer.
     """
     return "." not in name or name.endswith(".bias")
+
+
+def _health(param: Any) -> Any:
+    """A number that is finite where a parameter, its gradient and the square of that, which Adam takes, are.
+
+    A Gaussian whose shape or place is NaN is not seen, so that the loss alone would not tell.
+    """
+    return dr.sum(dr.square(dr.grad(param).array) + dr.abs(dr.detach(param).array))
 
 
 def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callable[..., Any]:
@@ -163,7 +172,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         prediction = grey(field, params, tx_pos, pose, plane)
         loss = loss_of(prediction, truth, batch, plane.height, plane.width)
         dr.backward(loss)
-        sums = [dr.detach(loss), *(dr.sum(dr.abs(dr.grad(params[name]).array)) for name in groups)]
+        sums = [dr.detach(loss), *(_health(params[name]) for name in groups)]
         fine = [dr.isfinite(s) for s in sums]
         good = reduce(operator.and_, fine)
         untroubled = trouble.step == 0
@@ -186,12 +195,36 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
     return step
 
 
-def make_prediction(field: Field, skip: Skip = NOTHING) -> Callable[..., Any]:
-    """A recorded prediction: ``predict(params, tx_pos, pose, plane) -> greys``, without gradients."""
+class Prediction:
+    """A prediction ``predict(params, tx_pos, pose, plane) -> greys``, without gradients.
 
-    @Recorded
-    def predict(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+    It is recorded, but for fields of so many Gaussians that networks see them in parts (`gaussians_in_parts`): there,
+    recording saves nothing, and lists of tiles, which a recorded function cannot count, have room for all.
+
+    Args:
+        field: the model.
+        skip: what is not evaluated.
+    """
+
+    def __init__(self, field: Field, skip: Skip = NOTHING) -> None:
+        self._field, self._skip = field, skip
+
+        @Recorded
+        def recorded(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+            with dr.suspend_grad():
+                return grey(field, params, tx_pos, pose, plane, skip)
+
+        self._recorded = recorded
+
+    def __call__(self, params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
+        """Greys [batch * height * width]."""
+        if params["position"].shape[1] * tx_pos.shape[1] <= AT_ONCE:
+            return self._recorded(params, tx_pos, pose, plane)
         with dr.suspend_grad():
-            return grey(field, params, tx_pos, pose, plane, skip)
+            re, im = splat(gaussians_in_parts(self._field, params, tx_pos), pose, plane, self._skip)
+            return dr.sqrt(re * re + im * im + DARK)
 
-    return predict
+    @property
+    def n_recordings(self) -> int:
+        """How often it was recorded."""
+        return self._recorded.n_recordings

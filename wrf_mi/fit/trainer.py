@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend import init
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
@@ -31,7 +32,7 @@ from .step import Field, Loss, TrainingData, Trouble, device_pose, make_step, no
 
 
 class NumericsError(RuntimeError):
-    """A loss or gradient was not finite; says within which steps and which groups were watched."""
+    """A loss, gradient, parameter or moment was not finite; says at which step, and which of them."""
 
     exit_status = 1
 
@@ -129,6 +130,7 @@ class Trainer:
 
     Raises:
         InputError: settings or data that cannot be trained on.
+        BackendError: a deterministic fit in a process that computes on a GPU already.
     """
 
     def __init__(
@@ -146,14 +148,15 @@ class Trainer:
             what = f"{record.name}: task {record.task!r}; learned fields are fitted to spectra"
             raise InputError(f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
         check_rows(split, record, f"split {split.name}")
+        config = config.scheduled()
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
         self.field = field or make_field(config)
         self._loss = loss or partial(_paper_loss, eta=config.structural_weight)
         self.schedule = plan(config, split, len(record.receivers))
         if config.deterministic:
-            # Parallel sums add in the order in which threads finish.
-            dr.set_thread_count(1)
+            # Sums over threads, and on a GPU, add in the order in which parts finish.
+            init("llvm", threads=1)
         if state is None:
             rng = np.random.default_rng([config.seed, 0])
             start = initial or initial_gaussians(config.initial, record, split.train, rng)
@@ -229,7 +232,8 @@ class Trainer:
             Whether the last step was reached.
 
         Raises:
-            NumericsError: a loss or gradient that is not finite; parameters are as before that step.
+            NumericsError: a loss or gradient that is not finite, raised right after that step, which was not taken:
+                parameters are as before it. Or parameters or moments that are not, found before a score or checkpoint.
         """
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
@@ -255,6 +259,8 @@ class Trainer:
             state.urge += report.urge
             dr.eval(losses, state.urge)
             state.step, state.urge_steps, since = t + 1, state.urge_steps + 1, since + 1
+            if trouble.step[0]:  # one number, but reading it waits for the step
+                self._require_finite(trouble)
             self.seconds = before + time.perf_counter() - start
             last = state.step == config.steps
             if state.step in schedule.density:

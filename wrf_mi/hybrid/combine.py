@@ -64,6 +64,11 @@ class Ports:
         self.offset_m = [on_device(c, Float64) for c in np.transpose(np.asarray(offset_m, float))]
         self.wavenumber = on_device(_wavenumber(np.asarray(frequency_hz, float)), Float64)
 
+    @property
+    def arrays(self) -> list[Any]:
+        """All that it keeps on the device."""
+        return [*self.offset_m, self.wavenumber]
+
 
 def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     """Coherent sum of a receiver's paths at m ports: sum over paths of g (d / d_m) exp(-j k_m d_m).
@@ -114,6 +119,10 @@ class Steering:
         phase = _wavenumber(frequency_hz) * np.asarray(offset_m, float) @ np.asarray(directions, float).T
         self._parts: FloatArray = np.stack([np.cos(phase), np.sin(phase)])
         self._device: dict[Any, tuple[Any, Any]] = {}
+
+    def arrays(self, float_type: Any) -> list[Any]:
+        """All that it keeps on the device for signals of a float type."""
+        return list(self._matrices(float_type))
 
     def _matrices(self, float_type: Any) -> tuple[Any, Any]:
         if float_type not in self._device:
@@ -221,6 +230,11 @@ class PixelReceiver:
     def _ports(self) -> Ports:
         return Ports(self.elements_m, np.full(len(self.elements_m), self.frequency_hz))
 
+    def arrays(self, float_type: Any) -> list[Any]:
+        """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
+        weights = _weights(self.height, self.width, 1, float_type)
+        return [*self._ports.arrays, *self._steering.arrays(float_type), weights]
+
     def elements(self, traced: TracedPaths, float_type: Any) -> Complex:
         """Signals of the array's elements, [batch * m], of the traced paths."""
         re, im = path_sum(traced, self._ports)
@@ -287,6 +301,10 @@ class CsiReceiver:
     @cached_property
     def _ports(self) -> Ports:
         return Ports(np.zeros((len(self.frequencies_hz), 3)), np.array(self.frequencies_hz))
+
+    def arrays(self, float_type: Any) -> list[Any]:
+        """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
+        return [*self._ports.arrays, _weights(self.height, self.width, 2, float_type)]
 
     def signals(self, traced: TracedPaths | None, learned: Complex | None) -> tuple[Complex | None, Complex | None]:
         """Both sides at the antenna, [batch * k]; None where a side is None."""

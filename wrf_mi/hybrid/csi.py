@@ -39,6 +39,8 @@ Complex = NDArray[np.complex128]
 Listen = Callable[[str, float], None]
 
 DEFAULTS = CsiSettings()
+AT_ONCE = 1024
+"""Positions that are predicted together: each has hundreds of candidates for paths."""
 CLEAR_M = 0.05
 """Rays search from so far off a wall that the antenna is mounted on."""
 
@@ -82,13 +84,17 @@ class CsiHybrid:
             raise InputError(f"predict: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [m, 3]")
         if not 0 <= receiver < len(self.receivers):
             raise InputError(f"predict: no receiver {receiver}; give 0 to {len(self.receivers) - 1}")
+        first = range(0, max(len(position), 1), AT_ONCE)
+        mean, std = zip(*(self._part(position[begin : begin + AT_ONCE], receiver) for begin in first), strict=True)
+        return Estimate(np.concatenate(mean), np.concatenate(std))
+
+    def _part(self, position: FloatArray, receiver: int) -> tuple[Complex, FloatArray]:
         rows = Rows(np.zeros((len(position), 0), complex), position, np.full(len(position), receiver))
         seen = seen_by_rows(self.model, rows)
         odds = self.visibility.log_odds(self.model.walls, self.model.images, seen)
         mean, variance = mixed(self.model, rows, seen, odds, self.sharpness, self.covariance)
         more, left = self.rest[receiver].predict(position)
-        total = np.sqrt(variance + left[:, None])
-        return Estimate(mean + more, total)
+        return mean + more, np.sqrt(variance + left[:, None])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that is needed to predict again, as plain arrays."""

@@ -17,6 +17,7 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..field import InitialGaussians
 from ..field.device import on_device, to_tensor
+from ..field.recorded import Recorded
 from ..splat.tiles import perception_plane
 from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from .learned import Field, learned_field
@@ -26,7 +27,11 @@ from .traced import TracedField
 
 Model = PixelReceiver | CsiReceiver
 Loss = Callable[..., Any]
-"""``loss(prediction, truth, batch, *shape)`` of flat arrays, a Dr.Jit float of one value; `spectrum_loss` is one."""
+"""``loss(prediction, truth, batch, *shape)`` of flat arrays, a Dr.Jit float of one value; `spectrum_loss` is one.
+
+It is recorded once and replayed: what it makes of NumPy arrays it makes before, and what it counts in Python stays as
+it is.
+"""
 
 FIELD = "field."
 MATCHING = 3
@@ -125,11 +130,17 @@ class JointFit:
         self.losses: list[float] = []
         self._truth = [_flat(view.observation) for view in self.views]
         self._order = np.zeros(0, int)
+        self._steps: dict[int, tuple[Any, Recorded]] = {}
 
     @property
     def parameters(self) -> dict[str, Any]:
         """All parameters by name, as Dr.Jit tensors; those that are fitted carry gradients."""
         return {**self.fixed, **dict(self.adam.items())}
+
+    @property
+    def recordings(self) -> int:
+        """How often the present steps were traced: once or twice for each view; a search for paths begins anew."""
+        return sum(step.n_recordings for _, step in self._steps.values())
 
     def values(self) -> dict[str, NDArray[np.float32]]:
         """All parameters by name, as NumPy arrays."""
@@ -183,23 +194,52 @@ class JointFit:
         """
         number = len(self.losses) % len(self.views)
         view, rows = self.views[number], self._next_rows()
-        parameters = self.parameters
         if view.traced is not None:
-            view.traced.refresh(parameters)
-        prediction = self._report(view, parameters, rows, self.tx_pos_m[rows], view.traced)
-        loss = self._loss(prediction, self._truth_of(number, rows), len(rows), *view.model.shape)
-        dr.backward(loss)
-        health = dr.detach(loss)
-        for name in self.adam:
-            health = health + dr.sum(dr.abs(dr.grad(parameters[name]).array))
-        finite = dr.isfinite(health)
-        # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
-        self.adam.set_learning_rate({name: mi.Float(self.rates[name] * factor) for name in self.adam})
-        self.adam.step(active=finite)
+            view.traced.refresh(self.parameters)
+        positions, device_rows = self._on_device(self.tx_pos_m[rows]), on_device(rows, mi.UInt32)
+        take = self._recorded_step(number, positions, device_rows)
+        share = dr.opaque(mi.Float, float(factor))
+        loss, finite = take(self.adam, self.fixed, self._truth[number], positions, device_rows, share)
         if not finite[0]:
             raise FloatingPointError(f"step {len(self.losses)}: loss or gradient not finite; lower the learning rates")
-        self.losses.append(float(dr.detach(loss)[0]))
+        self.losses.append(float(loss[0]))
         return self.losses[-1]
+
+    def _recorded_step(self, number: int, positions: Any, rows: Any) -> Callable[..., Any]:
+        """The step of one view, recorded: anew after a search for paths, whose number and places stand in it."""
+        view = self.views[number]
+        key = (self._loss, 0 if view.traced is None else view.traced.searches)
+        if number in self._steps and self._steps[number][0] == key:
+            return self._steps[number][1]
+        with dr.suspend_grad():
+            # What is made from NumPy's memory at first use must be there before a recording begins.
+            dr.eval(self._report(view, self.parameters, rows, positions, view.traced))
+        loss_of, rates = self._loss, self.rates
+
+        def read() -> list[Any]:
+            plane = perception_plane(view.model.height, view.model.width, mi.Float)
+            traced = [] if view.traced is None else view.traced.arrays
+            return [plane, view.model.arrays(mi.Float), traced]
+
+        def step(adam: Adam, fixed: Any, truth: Any, positions: Any, rows: Any, factor: Any) -> tuple[Any, Any]:
+            # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
+            adam.set_learning_rate({name: factor * rates[name] for name in adam})
+            parameters = {**fixed, **dict(adam.items())}
+            batch = dr.width(rows)
+            prediction = self._report(view, parameters, rows, positions, view.traced)
+            loss = loss_of(prediction, _rows_of(truth, rows, len(self.tx_pos_m)), batch, *view.model.shape)
+            dr.backward(loss)
+            health = dr.detach(loss)
+            for name in adam:
+                health = health + dr.sum(dr.abs(dr.grad(parameters[name]).array))
+            finite = dr.isfinite(health)
+            adam.step(eval=False, active=finite)
+            loss = dr.detach(loss)
+            dr.eval(adam, loss, finite)
+            return loss, finite
+
+        self._steps[number] = key, Recorded(step, read)
+        return self._steps[number][1]
 
     def run(self, steps: int, final_factor: float = 1.0, listen: Callable[[int, float], None] | None = None) -> float:
         """Take steps; learning rates fall geometrically to ``final_factor`` of theirs.
@@ -236,7 +276,8 @@ class JointFit:
             if traced is not None:
                 traced = traced if tx_pos_m is None else traced.at(positions)
                 traced.refresh(parameters)
-            report = self._report(own, parameters, np.arange(len(positions)), positions, traced)
+            rows = on_device(np.arange(len(positions)), mi.UInt32)
+            report = self._report(own, parameters, rows, self._on_device(positions), traced)
             return np.asarray(report.numpy(), float).reshape(len(positions), *own.model.shape)
 
     def learned(self, tx_pos_m: ArrayLike | None = None, view: int = 0) -> NDArray[np.complex128]:
@@ -248,30 +289,29 @@ class JointFit:
         own = self.views[view]
         positions = self.tx_pos_m if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
         with dr.suspend_grad():
-            signal = self._learned(own, self.parameters, positions)
+            signal = self._learned(own, self.parameters, self._on_device(positions))
         if signal is None:
             raise ValueError("learned: this fit has no learned side")
         return (signal[0].numpy() + 1j * signal[1].numpy().astype(float)).reshape(len(positions), -1)
 
-    def _learned(self, view: View, parameters: Mapping[str, Any], tx_pos_m: FloatArray) -> Any:
+    @staticmethod
+    def _on_device(tx_pos_m: FloatArray) -> Any:
+        """Positions [n, 3] as the tensor [3, n] that fields take."""
+        return to_tensor(np.ascontiguousarray(tx_pos_m.T))
+
+    def _learned(self, view: View, parameters: Mapping[str, Any], positions: Any) -> Any:
         if self.field is None:
             return None
         own = {name.removeprefix(FIELD): value for name, value in parameters.items() if name.startswith(FIELD)}
-        gaussians = self.field.gaussians(own, to_tensor(np.ascontiguousarray(tx_pos_m.T)))
+        gaussians = self.field.gaussians(own, positions)
         plane = perception_plane(view.model.height, view.model.width, mi.Float)
         return learned_field(gaussians, receiver_pose(view.receiver, parameters, mi.Float), plane, view.model.sphere)
 
     def _report(
-        self, view: View, parameters: Mapping[str, Any], rows: Any, tx_pos_m: FloatArray, traced: TracedField | None
+        self, view: View, parameters: Mapping[str, Any], rows: Any, positions: Any, traced: TracedField | None
     ) -> Any:
-        paths = None if traced is None else traced(parameters, on_device(rows, mi.UInt32))
-        return view.model(paths, self._learned(view, parameters, tx_pos_m))
-
-    def _truth_of(self, view: int, rows: NDArray[np.int64]) -> Any:
-        size = dr.width(self._truth[view]) // len(self.tx_pos_m)
-        lane = dr.arange(mi.UInt32, len(rows) * size)
-        row = dr.gather(mi.UInt32, on_device(rows, mi.UInt32), lane // size)
-        return dr.gather(mi.Float, self._truth[view], row * size + lane % size)
+        paths = None if traced is None else traced(parameters, rows)
+        return view.model(paths, self._learned(view, parameters, positions))
 
     def _next_rows(self) -> NDArray[np.int64]:
         """The next batch: every row once before any comes again."""
@@ -281,6 +321,14 @@ class JointFit:
             self._order = np.concatenate([self._order, self._rng.permutation(len(self.tx_pos_m))])
         rows, self._order = self._order[: self.batch], self._order[self.batch :]
         return rows
+
+
+def _rows_of(values: Any, rows: Any, count: int) -> Any:
+    """Some of ``count`` equal parts of a flat array, behind each other."""
+    size = dr.width(values) // count
+    lane = dr.arange(mi.UInt32, dr.width(rows) * size)
+    row = dr.gather(mi.UInt32, rows, lane // size)
+    return dr.gather(type(values), values, row * size + lane % size)
 
 
 def _check(view: View, tx_pos_m: FloatArray) -> None:

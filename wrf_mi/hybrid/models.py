@@ -71,6 +71,9 @@ def kind_of(record: Record, with_scene: bool) -> HybridKind:
 
         return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
     if record.task == "csi":
+        if record.observation.ndim != 3:
+            antennas = record.observation.shape[2]
+            raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
         from .csi import CsiHybrid, CsiSettings, fit_csi
 
         return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays)

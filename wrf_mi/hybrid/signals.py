@@ -23,7 +23,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from ..core.angles import FloatArray
-from ..receive.retrieve import align_signals, mirror_order
+from ..receive.beams import mirror_order
+from ..receive.retrieve import align_signals
 from .signal_kernels import ComplexArray, Covariances, Shares, fit_shares
 
 RICH = 8

@@ -31,6 +31,8 @@ from .spectrum_rest import Rest
 Arrays = dict[str, NDArray[Any]]
 FORMAT = 1
 """Version of `SpectrumHybrid.arrays`."""
+AT_ONCE = 256
+"""Transmitters that are predicted together: more are no faster each, and all would take three times their spectra."""
 LEAST_ROWS = 20
 """With fewer training rows nothing is fitted."""
 
@@ -107,7 +109,7 @@ class SpectrumHybrid:
         """Spectra of transmitters [m, 3] (metres) at one receiver, grey in 0..1: [m, height, width].
 
         The antenna is isotropic, so a heading changes nothing. The deviation of a pixel is that of validation rows;
-        where nothing was fitted, that of the predicted spectrum itself.
+        where nothing was fitted, that of the predicted spectrum itself; an array of it is read-only.
 
         Raises:
             InputError: positions of another shape or not finite.
@@ -115,13 +117,16 @@ class SpectrumHybrid:
         positions = np.asarray(tx_pos_m, float)
         if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
             raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
-        model = self.models[receiver]
-        mean = model.spectra(positions)
-        if model.error is None:
-            deviation = np.broadcast_to(mean.std(axis=(1, 2), keepdims=True), mean.shape)
-        else:
-            deviation = np.broadcast_to(model.error, mean.shape)
-        return Estimate(mean, deviation.astype(float))
+        model, one = self.models[receiver], self.models[receiver].instrument
+        mean = np.empty((len(positions), one.height, one.width), np.float32)
+        # The same for all transmitters, or for all pixels of one: held once, not for each.
+        error = np.empty((len(positions), 1, 1)) if model.error is None else model.error.astype(float)
+        for first in range(0, len(positions), AT_ONCE):
+            own = slice(first, first + AT_ONCE)
+            mean[own] = model.spectra(positions[own])
+            if model.error is None:
+                error[own] = mean[own].std(axis=(1, 2), keepdims=True)
+        return Estimate(mean, np.broadcast_to(error, mean.shape))
 
     def arrays(self) -> Arrays:
         """All that is needed to predict again, see `from_arrays`; the mesh's triangles are among it."""

@@ -148,6 +148,11 @@ class TracedField:
         return self._chains.exists.numpy() > 0
 
     @property
+    def arrays(self) -> list[Any]:
+        """What a call reads on the device beside its arguments: a recording takes it as inputs."""
+        return [self._chains, self._constants]
+
+    @property
     def gain_name(self) -> str:
         """Parameter [2]: logarithm of the instrument's amplitude, and its phase in rad."""
         return f"receiver.{self.receiver.name}.gain"

@@ -12,12 +12,12 @@ of a box filter is a box filter, so the reverse pass gathers and has no atomic s
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import drjit as dr
 
 from wrf_mi.core import InputError
+from wrf_mi.field.device import quads
 
 WINDOW = 7
 """Side of the window in pixels, scikit-image's default."""
@@ -60,28 +60,36 @@ def _check(prediction: Any, truth: Any, batch: int, height: int, width: int) -> 
             raise InputError(f"{name} has {len(array)} values, {batch} x {height} x {width} needs {size}: reshape it")
 
 
-def _quads(float_type: type) -> Any:
-    """The type of four such floats, which gathers and scatters move as one packet."""
-    module = sys.modules[float_type.__module__]
-    return module.Array4f64 if dr.type_v(float_type) == dr.VarType.Float64 else module.Array4f
-
-
 def _store(values: list[Any], float_type: Any) -> Any:
     """Write four arrays [n] as one interleaved array [4 n]."""
     n = max(dr.width(v) for v in values)
     out = dr.empty(float_type, 4 * n)
     index = dr.arange(dr.uint32_array_t(float_type), n)
-    dr.scatter(out, _quads(float_type)(*values), index, mode=dr.ReduceMode.Permute)
+    dr.scatter(out, quads(float_type)(*values), index, mode=dr.ReduceMode.Permute)
     return out
 
 
-def _row_moments(x: Any, y: Any, rows: int, width: int) -> Any:
-    """Means of x and y, squared deviations of both, and co-deviations over 7 pixels of a row, [rows, width - 6, 4]."""
+def _middle(x: Any, y: Any, image: Any, height: int, width: int) -> tuple[Any, Any]:
+    """The middle pixel of an image, from which all of its pixels are counted.
+
+    The reverse pass takes x_p - mean_x as a difference of two sums over windows. Counted from zero, a flat image's
+    would have no digit left.
+    """
+    place = image * (height * width) + (height // 2 * width + width // 2)
+    return dr.gather(type(x), x, place), dr.gather(type(y), y, place)
+
+
+def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
+    """Of 7 pixels of a row: means of x and y from `_middle`, squared deviations of both together, and co-deviations.
+
+    Shape [batch * height, width - 6, 4].
+    """
     inner = width - BORDER
-    i = dr.arange(dr.uint32_array_t(type(x)), rows * inner)
+    i = dr.arange(dr.uint32_array_t(type(x)), batch * height * inner)
     start = i + (i // inner) * BORDER
-    xs = [dr.gather(type(x), x, start + k) for k in range(WINDOW)]
-    ys = [dr.gather(type(y), y, start + k) for k in range(WINDOW)]
+    mid_x, mid_y = _middle(x, y, i // (height * inner), height, width)
+    xs = [dr.gather(type(x), x, start + k) - mid_x for k in range(WINDOW)]
+    ys = [dr.gather(type(y), y, start + k) - mid_y for k in range(WINDOW)]
     mean_x, mean_y = sum(xs) * (1 / WINDOW), sum(ys) * (1 / WINDOW)
     squares: Any = 0
     products: Any = 0
@@ -92,29 +100,33 @@ def _row_moments(x: Any, y: Any, rows: int, width: int) -> Any:
     return _store([mean_x, mean_y, squares, products], type(x))
 
 
-def _windows(moments: Any, batch: int, height: int, width: int) -> tuple[Any, Any]:
+def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) -> tuple[Any, Any]:
     """Similarity [batch, height - 6, width - 6] of each window, and what the reverse pass needs of it.
 
     With the derivatives of the similarity by mean (a), variance (b) and covariance (c) of a window, pixel p
     receives sum over its windows of a / 49 + b * 2 (x_p - mean_x) / 48 + c * (y_p - mean_y) / 48, which is
-    box(offset) + x_p box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0).
+    box(offset) + x_p box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0), where x and y count
+    from `_middle`.
     """
     float_type = type(moments)
     inner_h, inner_w = height - BORDER, width - BORDER
     i = dr.arange(dr.uint32_array_t(float_type), batch * inner_h * inner_w)
-    start = i + (i // (inner_h * inner_w)) * (BORDER * inner_w)
-    rows = [dr.gather(_quads(float_type), moments, start + k * inner_w) for k in range(WINDOW)]
+    image = i // (inner_h * inner_w)
+    start = i + image * (BORDER * inner_w)
+    rows = [dr.gather(quads(float_type), moments, start + k * inner_w) for k in range(WINDOW)]
     total = sum(rows)
-    ux, uy = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
+    own_x, own_y = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
     squares: Any = 0
     products: Any = 0
     for row in rows:
-        dx, dy = row[0] - ux, row[1] - uy
+        dx, dy = row[0] - own_x, row[1] - own_y
         squares = dr.fma(dx, dx, dr.fma(dy, dy, squares))
         products = dr.fma(dx, dy, products)
     variances = (total[2] + WINDOW * squares) * (1 / (PIXELS - 1))
     covariance = (total[3] + WINDOW * products) * (1 / (PIXELS - 1))
 
+    mid_x, mid_y = _middle(x, y, image, height, width)
+    ux, uy = mid_x + own_x, mid_y + own_y
     means_below = dr.rcp(dr.fma(ux, ux, dr.fma(uy, uy, C1)))
     spread_below = dr.rcp(variances + C2)
     means = dr.fma(2 * ux, uy, C1) * means_below
@@ -122,14 +134,17 @@ def _windows(moments: Any, batch: int, height: int, width: int) -> tuple[Any, An
     similarity = means * spread
     by_x = similarity * spread_below * (-2 / (PIXELS - 1))
     by_y = means * spread_below * (2 / (PIXELS - 1))
-    by_mean = (uy * spread - ux * similarity) * means_below * (2 / PIXELS)
-    return similarity, _store([by_mean - by_x * ux - by_y * uy, by_x, by_y, float_type(0)], float_type)
+    # (uy - ux means) without its cancellation: means = 1 - apart^2 means_below.
+    apart = (mid_y - mid_x) + (own_y - own_x)
+    by_mean = spread * apart * dr.fma(ux * apart, means_below, 1) * means_below * (2 / PIXELS)
+    offset = by_mean - by_x * own_x - by_y * own_y
+    return similarity, _store([offset, by_x, by_y, float_type(0)], float_type)
 
 
 def _gradient(x: Any, y: Any, parts: Any, batch: int, height: int, width: int) -> Any:
     """Derivative of the sum of each image's similarities by its pixels, [batch, height, width]."""
     float_type = type(x)
-    uint, quads = dr.uint32_array_t(float_type), _quads(float_type)
+    uint, four = dr.uint32_array_t(float_type), quads(float_type)
     inner_h, inner_w = height - BORDER, width - BORDER
     i = dr.arange(uint, batch * height * inner_w)
     line = i // inner_w
@@ -139,7 +154,7 @@ def _gradient(x: Any, y: Any, parts: Any, batch: int, height: int, width: int) -
     columns: Any = 0
     for k in range(WINDOW):
         inside = (row >= k) & (row < inner_h + k)
-        columns = columns + dr.gather(quads, parts, start - k * inner_w, inside)
+        columns = columns + dr.gather(four, parts, start - k * inner_w, inside)
     columns = _store(list(columns), float_type)
 
     i = dr.arange(uint, batch * height * width)
@@ -149,16 +164,17 @@ def _gradient(x: Any, y: Any, parts: Any, batch: int, height: int, width: int) -
     total: Any = 0
     for k in range(WINDOW):
         inside = (column >= k) & (column < inner_w + k)
-        total = total + dr.gather(quads, columns, start - k, inside)
-    return dr.fma(x, total[1], dr.fma(y, total[2], total[0]))
+        total = total + dr.gather(four, columns, start - k, inside)
+    mid_x, mid_y = _middle(x, y, line // height, height, width)
+    return dr.fma(x - mid_x, total[1], dr.fma(y - mid_y, total[2], total[0]))
 
 
 class _Ssim(dr.CustomOp):
     """Structural similarity with a reverse pass of two box filters."""
 
     def eval(self, prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
-        moments = _row_moments(prediction, truth, batch * height, width)
-        similarity, self.parts = _windows(moments, batch, height, width)
+        moments = _row_moments(prediction, truth, batch, height, width)
+        similarity, self.parts = _windows(prediction, truth, moments, batch, height, width)
         self.prediction, self.truth = prediction, truth
         self.shape = batch, height, width
         count = (height - BORDER) * (width - BORDER)

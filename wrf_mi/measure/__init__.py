@@ -1,7 +1,10 @@
 """Measurements: records, their files, their public originals and their splits."""
 
+from .argos import read_argos
 from .ble_folder import read_ble_folder
 from .fetch import fetch
+from .nerf2_ble import read_nerf2_ble
+from .nerf2_csi import read_nerf2_csi, write_nerf2_csi
 from .newrf import read_newrf
 from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
 from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
@@ -17,10 +20,14 @@ __all__ = [
     "load",
     "load_split",
     "make_splits",
+    "read_argos",
     "read_ble_folder",
+    "read_nerf2_ble",
+    "read_nerf2_csi",
     "read_newrf",
     "read_spectrum_folder",
     "save_split",
     "user_cache",
+    "write_nerf2_csi",
     "write_spectrum_folder",
 ]

@@ -54,6 +54,11 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     tables = [read_csv(folder / file) for file in (TRAINING, TEST)]
     n_train, n_test = (len(table.rows) for table in tables)
     heading = [table.numbers("heading") for table in tables]
+    strength = np.concatenate([_signal_strength(table, ids) for table in tables], axis=1)
+    deaf = np.flatnonzero(np.isnan(strength).all(axis=1))
+    if len(deaf):
+        text = f"{RSSI}{ids[deaf[0]]} is empty in every row, in {TEST} too"
+        raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
     return Record(
         name=name or folder.resolve().name,
         task="rssi",
@@ -62,7 +67,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
             Receiver(f"anchor{i}", position, np.array([0.0, 0.0, 0.0, 1.0]))
             for i, position in zip(ids, anchors_m, strict=True)
         ),
-        observation=np.concatenate([_signal_strength(table, ids) for table in tables], axis=1),
+        observation=strength,
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=np.concatenate(heading),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -12,7 +13,11 @@ import pooch
 
 from ..core import InputError, Record
 from ..core.arrays import planar_array
+from .argos import SUFFIXES, read_argos
 from .ble_folder import ANCHORS, read_ble_folder
+from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
+from .nerf2_ble import POWERS, read_nerf2_ble
+from .nerf2_csi import CHANNELS, STATION, read_nerf2_csi
 from .newrf import read_newrf
 from .spectrum_folder import GATEWAYS, parse_folds, read_spectrum_folder
 
@@ -129,6 +134,16 @@ KNOWN = (
         origin="traced on this machine by Sionna RT in the laboratory with furniture (wrf_mi.trace.load_record)",
         note="room/ in it is the scene that a model may be given: bare walls, some centimetres off, of one material.",
     ),
+    *(
+        DataSet(
+            name=f"traced-csi-{place}",
+            task="csi",
+            licence="MIT",
+            origin=f"traced on this machine by Sionna RT in a made-up {place} (wrf_mi.trace.load_record)",
+            note="uplink and downlink are noisy at 25 dB; scores are held against the downlink without noise.",
+        )
+        for place in ("flat", "office")
+    ),
 )
 
 
@@ -187,17 +202,18 @@ def datasets() -> list[DataSetStatus]:
 
 
 def load(name_or_folder: str | Path) -> Record:
-    """Read a data set: a folder, a room's ``.npz`` file, or a known one by its name.
+    """Read a data set: a folder, a room's ``.npz`` file, a capture in HDF5, or a known one by its name.
 
     A path to a folder is taken first, then ``<name>/`` below ``WRF_MI_DATA``, then in the user's cache. A folder with
-    ``anchors.csv`` is read as `read_ble_folder` does, one with an ``.npz`` file alone as `read_newrf`, any other as
-    `read_spectrum_folder`.
+    ``gateway_rssi.csv`` or ``gateway_position.yml`` is read as `read_nerf2_ble` does, one with ``csidata.npy`` or
+    ``base-station.yml`` as `read_nerf2_csi`, one with ``anchors.csv`` as `read_ble_folder`, one with an ``.npz`` file
+    alone as `read_newrf`, one with a capture as `read_argos`, any other as `read_spectrum_folder`.
 
     Raises:
         InputError: not there (the line says how to get it), or what the reader finds wrong.
     """
     path = Path(name_or_folder)
-    if path.is_dir() or (path.is_file() and path.suffix == ".npz"):
+    if path.is_dir() or (path.is_file() and path.suffix in (".npz", *SUFFIXES)):
         return _read(path)
     if isinstance(name_or_folder, Path) or path.name != name_or_folder:
         raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
@@ -211,15 +227,41 @@ def load(name_or_folder: str | Path) -> Record:
     return _complete(dataset, _read(folder / (dataset.file or ""), dataset.name))
 
 
+LAYOUTS: tuple[tuple[tuple[str, ...], Callable[[Path, str | None], Record]], ...] = (
+    ((POWERS, BLE_GATEWAYS), read_nerf2_ble),
+    ((CHANNELS, STATION), read_nerf2_csi),
+    ((ANCHORS,), read_ble_folder),
+)
+"""Files of which a folder has one at least, and what reads it: so that a missing one is named."""
+
+
+def holds_spectra(name_or_folder: str | Path) -> bool:
+    """Whether a data set is one of spectra, told without reading it: of known ones by name, else by the files there.
+
+    What is neither a path nor known counts as such: to read it will say what is wrong.
+    """
+    path = Path(name_or_folder)
+    if path.exists():
+        return _reader(path) is read_spectrum_folder
+    return all(dataset.task == "spectrum" for dataset in KNOWN if dataset.name == str(name_or_folder))
+
+
 def _read(path: Path, name: str | None = None) -> Record:
+    return _reader(path)(path, name)
+
+
+def _reader(path: Path) -> Callable[[Path, str | None], Record]:
     if path.is_file():
-        return read_newrf(path, name)
+        return read_argos if path.suffix in SUFFIXES else read_newrf
     if not (path / GATEWAYS).exists():
-        if (path / ANCHORS).exists():
-            return read_ble_folder(path, name)
+        for files_of, read in LAYOUTS:
+            if any((path / file).exists() for file in files_of):
+                return read
         if any(path.glob("*.npz")):
-            return read_newrf(path, name)
-    return read_spectrum_folder(path, name)
+            return read_newrf
+        if any(one.suffix in SUFFIXES for one in path.iterdir()):
+            return read_argos
+    return read_spectrum_folder
 
 
 def _complete(dataset: DataSet, record: Record) -> Record:

@@ -27,10 +27,22 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..core import InputError, Receiver, Record
-from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
 from ..core.types import IntArray
+from .folder_files import (
+    INDEX_FILES,
+    POSITIONS,
+    finite_numbers,
+    read_official,
+    read_positions,
+    read_yaml,
+    unit_quaternion,
+    whole_number,
+    write_lines,
+    write_positions,
+)
 
 GATEWAYS = "gateway_info.yml"
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
@@ -55,9 +67,9 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder; give one that holds {GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
-    info = _read_info(gateways)
+    info = read_yaml(gateways)
     receivers = _receivers(gateways, info)
-    positions = _read_positions(folder / "tx_pos.csv")
+    positions = read_positions(folder / POSITIONS)
     images = folder / "spectrum"
     places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
     return Record(
@@ -66,7 +78,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         tx_pos_m=positions,
         receivers=receivers,
         observation=_read_images(places, len(positions)),
-        official=_read_official(folder, len(positions)),
+        official=read_official(folder, len(positions), first=1),
         folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
         frequencies_hz=_frequency(gateways, info),
         array_m=_array(gateways, info),
@@ -112,13 +124,12 @@ def write_spectrum_folder(
         content = {"dataset_name": record.name, **poses, **_instrument(record)}
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        rows = [",".join(repr(float(v)) for v in position) for position in record.tx_pos_m]
-        _write_lines(part / "tx_pos.csv", ["x,y,z", *rows])
+        write_positions(part / POSITIONS, record.tx_pos_m)
         if record.official is not None:
-            for kind, index in zip(("train", "test"), record.official, strict=True):
-                _write_lines(part / f"{kind}_index.txt", [f"{row + 1:05d}" for row in index])
+            for file, index in zip(INDEX_FILES, record.official, strict=True):
+                write_lines(part / file, [f"{row + 1:05d}" for row in index])
         if record.folds is not None:
-            _write_lines(part / "blocked_folds.txt", [str(fold) for fold in record.folds])
+            write_lines(part / "blocked_folds.txt", [str(fold) for fold in record.folds])
         for name, data in (extra or {}).items():
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(data.encode() if isinstance(data, str) else data)
@@ -131,7 +142,7 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     Raises:
         InputError: a line that is no number, a wrong number of lines, or folds that are not 0, 1, ... in full.
     """
-    folds = np.array([_whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
+    folds = np.array([whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
     if len(folds) != rows:
         raise InputError(f"{path}: {len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv")
     count = int(folds.max(initial=-1)) + 1
@@ -142,17 +153,6 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     return folds
 
 
-def _write_lines(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
-
-
-def _whole_number(path: Path, line: int, text: str) -> int:
-    digits = text.strip()
-    if not (digits.isascii() and digits.isdecimal()):
-        raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
-    return int(digits)
-
-
 def _instrument(record: Record) -> dict[str, Any]:
     known: dict[str, Any] = {}
     if record.frequencies_hz is not None:
@@ -160,14 +160,6 @@ def _instrument(record: Record) -> dict[str, Any]:
     if record.array_m is not None:
         known["array"] = {"elements_m": record.array_m.tolist()}
     return known
-
-
-def _read_info(path: Path) -> dict[Any, Any]:
-    try:
-        info = yaml.safe_load("\n".join(text_lines(path)))
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
-    return info if isinstance(info, dict) else {}
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
@@ -208,41 +200,9 @@ def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
     for name, pose in poses.items():
         if not isinstance(name, str) or Path(name).name != name:
             raise InputError(f"{path}: {name!r} cannot name a folder; call receivers gateway1, gateway2, ...")
-        position = _numbers(path, name, pose, "position", 3)
-        orientation = _numbers(path, name, pose, "orientation", 4)
-        norm = float(np.linalg.norm(orientation))
-        if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
-            raise InputError(f"{path}: {name}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w")
-        receivers.append(Receiver(name, position, orientation))
+        position = finite_numbers(path, f"{name}: position", pose.get("position"), 3)
+        receivers.append(Receiver(name, position, unit_quaternion(path, name, pose.get("orientation"))))
     return tuple(receivers)
-
-
-def _numbers(path: Path, name: str, pose: dict[str, object], key: str, count: int) -> FloatArray:
-    try:
-        values = np.array(pose.get(key), dtype=float)
-    except (TypeError, ValueError):
-        values = np.empty(0)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise InputError(f"{path}: {name}: {key} is {pose.get(key)!r}; give a list of {count} finite numbers")
-    return values
-
-
-def _read_positions(path: Path) -> FloatArray:
-    header, *rows = text_lines(path) or [""]
-    if [column.strip().lower() for column in header.split(",")] != ["x", "y", "z"]:
-        raise InputError(f"{path}: line 1: header is {header[:40]!r}; it must be x,y,z")
-    if not rows:
-        raise InputError(f"{path}: no positions in it; give one row x,y,z in metres per spectrum")
-    positions = np.empty((len(rows), 3))
-    for row, text in enumerate(rows, start=1):
-        try:
-            positions[row - 1] = [float(value) for value in text.split(",", 3)]
-        except ValueError:
-            raise InputError(f"{path}: row {row}: {text[:60]!r}; give three numbers x,y,z in metres") from None
-    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
-    if len(bad):
-        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]]!r} is not finite; correct or remove the row")
-    return positions
 
 
 def _read_images(places: list[Path], rows: int) -> NDArray[np.float32]:
@@ -286,31 +246,6 @@ def _read_grey(path: Path, row: int) -> NDArray[np.float32]:
     if mode not in GREY_LEVELS:
         raise InputError(f"{path}: row {row}: image mode {mode}; give a grey PNG of 8 or 16 bits")
     return values.astype(np.float32) / np.float32(GREY_LEVELS[mode])
-
-
-def _read_official(folder: Path, rows: int) -> tuple[IntArray, IntArray] | None:
-    paths = folder / "train_index.txt", folder / "test_index.txt"
-    if not any(path.exists() for path in paths):
-        return None
-    train, test = (_read_index(path, rows) for path in paths)
-    both = np.intersect1d(train, test)
-    if len(both):
-        raise InputError(f"{paths[1]}: row {both[0] + 1} is in {paths[0].name} as well; remove it from one of them")
-    return train, test
-
-
-def _read_index(path: Path, rows: int) -> IntArray:
-    seen: dict[int, int] = {}
-    for line, text in enumerate(text_lines(path), start=1):
-        row = _whole_number(path, line, text)
-        if not 1 <= row <= rows:
-            raise InputError(f"{path}: line {line}: row {row} is out of range; tx_pos.csv has rows 1 to {rows}")
-        if row in seen:
-            raise InputError(f"{path}: line {line}: row {row} stands in line {seen[row]} already; remove one of them")
-        seen[row] = line
-    if not seen:
-        raise InputError(f"{path}: no rows in it; give one row number per line")
-    return np.array(list(seen), np.int64) - 1
 
 
 def _read_folds(path: Path, rows: int) -> IntArray | None:

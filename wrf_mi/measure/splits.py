@@ -114,10 +114,13 @@ def position_folds(record: Record) -> IntArray:
     """The spatial fold 0, 1, ... of each row, shape [n]: the record's own, or seeded k-means clusters.
 
     Raises:
-        InputError: there are too few distinct positions for five clusters.
+        InputError: positions are not known, or there are too few distinct ones for five clusters.
     """
     if record.folds is not None:
         return record.folds
+    if not record.has_positions:
+        text = "blocks need the position of every row, which these data do not tell"
+        raise InputError(f"{record.name}: {text}; use the split random or trajectory")
     distinct = len(np.unique(record.tx_pos_m, axis=0))
     if distinct < FOLDS:
         raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")

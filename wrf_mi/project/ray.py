@@ -85,15 +85,23 @@ def _cross(a: list[Any], b: list[Any]) -> list[Any]:
 def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     """What the rays of a receiver need of Gaussians. Differentiable in position, scale, rotation and pose.
 
+    Computed in float64 and rounded at the end: a Gaussian of axes 1e5 to 1 has a and b of as unlike lengths, and a lean
+    that multiplies the shorter one's errors. So that rounding hurts neither, they are turned to be perpendicular.
+
     Args:
         gaussians: for one transmitter (batch 1).
         pose: of the receiver.
     """
-    offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
-    local = pose.to_local(offset)
+    single: Any = type(gaussians.position[0])
+    double: Any = dr.float64_array_t(single)
+    position, scales, rotation, place = (
+        [double(c) for c in part] for part in (gaussians.position, gaussians.scale, gaussians.rotation, pose.position)
+    )
+    pose = Pose(place, [[double(c) for c in row] for row in pose.to_world])
+    local = pose.to_local([p - x for p, x in zip(position, pose.position, strict=True)])
     depth = dr.sqrt(dot(local, local))
     # As in `project`: what is a tie there is one here.
-    exact = centre_distance(gaussians.position, pose.position)
+    exact = centre_distance(position, pose.position)
     visible = exact >= NEAR_M
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
@@ -104,27 +112,38 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     low = (LOW_PASS_RAD * distance) ** 2
     whiten = [
         [m * dr.rsqrt(scale * scale + low) for m in pose.to_local(axis)]
-        for scale, axis in zip(gaussians.scale, own_axes(gaussians.rotation), strict=True)
+        for scale, axis in zip(scales, own_axes(rotation), strict=True)
     ]
     seen = [dot(row, safe) for row in whiten]
     length = dr.sqrt(dot(seen, seen))
     third = [s / length for s in seen]
     first, second = tangent_basis(third)
-    a = [c * distance for c in _combine(first, whiten)]
-    b = [c * distance for c in _combine(second, whiten)]
+    a, b = _perpendicular(*([c * distance for c in _combine(row, whiten)] for row in (first, second)))
     g3 = [c / length for c in _combine(third, whiten)]
     # Dual vectors of a and b in the tangent plane give the lean.
     to_first, to_second = _cross(b, safe), _cross(safe, a)
     determinant = dot(a, to_first)
     mahalanobis = length * distance
+    mask: Any = dr.mask_t(single)
     return RayFootprints(
-        direction=[dr.select(visible, c, 0) for c in n],
-        whitened=(a, b),
-        lean=(dot(g3, to_first) / determinant, dot(g3, to_second) / determinant),
-        depth_extent=dr.rcp(mahalanobis * mahalanobis),
+        direction=[single(dr.select(visible, c, 0)) for c in n],
+        whitened=([single(c) for c in a], [single(c) for c in b]),
+        lean=(single(dot(g3, to_first) / determinant), single(dot(g3, to_second) / determinant)),
+        depth_extent=single(dr.rcp(mahalanobis * mahalanobis)),
         depth=exact,
-        visible=visible,
+        visible=mask(visible),
     )
+
+
+def _perpendicular(a: list[Any], b: list[Any]) -> tuple[list[Any], list[Any]]:
+    """The same pair of vectors turned into each other until they are perpendicular, the longer one first.
+
+    By an angle without a derivative: what is made of them does not depend on it.
+    """
+    p, q = [dr.detach(c) for c in a], [dr.detach(c) for c in b]
+    sine, cosine = dr.sincos(0.5 * dr.atan2(2 * dot(p, q), dot(p, p) - dot(q, q)))
+    turned = [cosine * x + sine * y for x, y in zip(a, b, strict=True)]
+    return turned, [cosine * y - sine * x for x, y in zip(a, b, strict=True)]
 
 
 def hulls(gaussians: Gaussians, pose: Pose, margin_rad: float) -> Hulls:

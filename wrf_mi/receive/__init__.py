@@ -2,7 +2,7 @@
 
 from .antenna import Array, Pattern, instrument_report
 from .array import array_response, bartlett_spectrum, minmax_scale
-from .channel import csi, element_signals, received_power, rssi_dbm
+from .channel import antenna_csi, csi, element_signals, received_power, rssi_dbm
 from .footprints import gaussian_signals
 from .lags import Lags
 
@@ -10,6 +10,7 @@ __all__ = [
     "Array",
     "Lags",
     "Pattern",
+    "antenna_csi",
     "array_response",
     "bartlett_spectrum",
     "csi",

@@ -7,15 +7,17 @@ relative to the array's origin.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..core.angles import FloatArray, pixel_directions
+from ..core.angles import FloatArray
+from .beams import beams
 
 ComplexArray = NDArray[np.complex128]
+
+LEAST = 1e-100
+"""Signals between this and its inverse have squares in the range of double precision; others are scaled."""
 
 
 def array_response(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
@@ -51,16 +53,17 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
 
     Source: Van Trees, "Optimum Array Processing" (2002), section 6.2; the real spectra obey it.
     """
-    steering = _steering(np.asarray(positions_m, float).tobytes(), frequency_hz, height, width)
     signals = np.asarray(h, dtype=complex)
-    return np.abs(signals @ steering.T).reshape(*signals.shape[:-1], height, width)
-
-
-@lru_cache(maxsize=4)
-def _steering(positions: bytes, frequency_hz: float, height: int, width: int) -> ComplexArray:
-    """Conjugate response of every pixel [height * width, m]; as long to compute as all the rest for one spectrum."""
-    elements = np.frombuffer(positions).reshape(-1, 3)
-    return array_response(elements, pixel_directions(height, width).reshape(-1, 3), frequency_hz).conj()
+    # Squares of numbers beyond these limits are out of range.
+    largest = np.abs(signals).max(initial=0)
+    factor = 1.0 if LEAST < largest < 1 / LEAST or not largest else largest
+    flat: ComplexArray = signals.reshape(-1, signals.shape[-1])
+    if factor != 1:
+        flat = flat / factor
+    images = beams(positions_m, frequency_hz, height, width).magnitude(flat)
+    if factor != 1:
+        images *= factor
+    return images.reshape(*signals.shape[:-1], height, width)
 
 
 def minmax_scale(spectrum: ArrayLike) -> FloatArray:

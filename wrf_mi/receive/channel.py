@@ -15,6 +15,8 @@ ComplexArray = NDArray[np.complex128]
 
 PAIRS_AT_ONCE = 1 << 22
 """Pairs of path and array element or subcarrier at once: 64 MiB of complex numbers for each of a few."""
+WAVES_AT_ONCE = 1 << 20
+"""Pairs of path and antenna whose waves turn from subcarrier to subcarrier: less, as each is gone through again."""
 
 
 def element_signals(
@@ -73,6 +75,61 @@ def csi(paths: Paths, frequencies_hz: ArrayLike) -> ComplexArray:
         phase = np.exp(-2j * np.pi / speed_of_light * paths.length_m[part, None] * frequencies)
         np.add.at(channel, (paths.rx[part], paths.tx[part]), paths.gain[part, None] * phase)
     return channel
+
+
+def antenna_csi(
+    paths: Paths, receivers: Receiver | Sequence[Receiver], positions_m: ArrayLike, frequencies_hz: ArrayLike
+) -> ComplexArray:
+    """Channel coefficient at each antenna of arrays per subcarrier; spherical waves as in `element_signals`.
+
+    Args:
+        paths: traced to the arrays' origins at the carrier, sorted by receiver and transmitter.
+        receivers: poses of the ``n_rx`` arrays.
+        positions_m: antennas [m, 3] in the array's frame, metres.
+        frequencies_hz: of the subcarriers, shape [k].
+
+    Returns:
+        Shape [n_rx, n_tx, m, k], 0 where no path arrives.
+    """
+    everyone = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
+    elements = np.stack([np.asarray(positions_m, float) @ receiver.to_world.T for receiver in everyone])
+    frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
+    channel = np.zeros((paths.n_rx * paths.n_tx, elements.shape[1], len(frequencies)), np.complex128)
+    step = max(1, WAVES_AT_ONCE // elements.shape[1])
+    for start in range(0, len(paths), step):
+        part = slice(start, start + step)
+        length, rx = paths.length_m[part, None], paths.rx[part]
+        distance = np.linalg.norm((paths.arrival[part] * length)[:, None, :] - elements[rx], axis=-1)
+        amplitude = paths.gain[part, None] * length / distance
+        add_waves(channel, rx * paths.n_tx + paths.tx[part], amplitude, distance / speed_of_light, frequencies)
+    return channel.reshape(paths.n_rx, paths.n_tx, *channel.shape[1:])
+
+
+def add_waves(
+    channel: ComplexArray,
+    owner: NDArray[np.int64],
+    amplitude: ComplexArray,
+    delay_s: FloatArray,
+    frequencies_hz: FloatArray,
+) -> None:
+    """Add amplitude exp(-j 2 pi f delay) of waves to the channels that they belong to.
+
+    Args:
+        channel: coefficients [n, m, k] of n channels at m antennas, added to in place.
+        owner: channel of each of p waves, ascending, shape [p].
+        amplitude: of each wave at each antenna, shape [p, m].
+        delay_s: likewise, seconds.
+        frequencies_hz: shape [k].
+    """
+    owners, first = np.unique(owner, return_index=True)
+    gaps = np.diff(frequencies_hz)
+    # From one subcarrier to the next a wave turns by one angle: a product in place of an exponential.
+    turns = {gap: np.exp(-2j * np.pi * gap * delay_s) for gap in np.unique(gaps)}
+    wave = amplitude * np.exp(-2j * np.pi * frequencies_hz[0] * delay_s)
+    for k in range(len(frequencies_hz)):
+        if k:
+            wave *= turns[gaps[k - 1]]
+        channel[owners, :, k] += np.add.reduceat(wave, first, axis=0)
 
 
 def received_power(paths: Paths, frequencies_hz: ArrayLike | None = None) -> FloatArray:

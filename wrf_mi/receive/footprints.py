@@ -28,7 +28,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
+from ..core.angles import FloatArray
+
 ComplexArray = NDArray[np.complex128]
+
+PAIRS_AT_ONCE = 1 << 16
+"""Pairs of Gaussian and element at once: 1 MB of complex numbers for each of some arrays, in the cache of a core."""
 
 
 def gaussian_signals(
@@ -52,22 +57,35 @@ def gaussian_signals(
     """
     if order not in (1, 2):
         raise ValueError(f"gaussian_signals: order {order}; give 1 or 2")
-    n, spread = np.asarray(directions, float), np.asarray(covariance, float)
-    if spread.shape == n.shape[:-1]:
-        spread = np.square(spread)[..., None, None] * np.eye(3)
-    across = np.eye(3) - n[..., :, None] * n[..., None, :]
-    c = across @ spread @ across
+    n, spread, p = np.asarray(directions, float), np.asarray(covariance, float), np.asarray(positions_m, float)
+    shape = n.shape[:-1]
+    spread = spread.ravel() if spread.shape == shape else np.broadcast_to(spread, (*shape, 3, 3)).reshape(-1, 3, 3)
+    n = n.reshape(-1, 3)
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
-    p = np.asarray(positions_m, float)
-    along = wavenumber * (n @ p.T)
-    q = wavenumber * (across[..., None, :, :] @ p[..., None])[..., 0]
-    trace = np.trace(c, axis1=-2, axis2=-1)[..., None]
-    determinant = ((trace[..., 0] ** 2 - np.trace(c @ c, axis1=-2, axis2=-1)) / 2)[..., None]
-    determinant = np.maximum(determinant, 0)
-    width = np.einsum("...mi,...ij,...mj->...m", q, c, q)
+    out = np.empty((len(n), len(p)), complex)
+    step = max(PAIRS_AT_ONCE // max(len(p), 1), 1)
+    for first in range(0, len(n), step):
+        own = slice(first, first + step)
+        out[own] = _signals(n[own], spread[own], wavenumber * p, order)
+    return out.reshape(*shape, len(p))
+
+
+def _signals(n: FloatArray, spread: FloatArray, p: FloatArray, order: int) -> ComplexArray:
+    """Of directions [n, 3], covariances [n, 3, 3] or deviations [n], and positions times the wave number [m, 3]."""
+    if spread.ndim == 1:
+        spread = np.square(spread)[:, None, None] * np.eye(3)
+    across = np.eye(3) - n[:, :, None] * n[:, None, :]
+    c = across @ spread @ across
+    along = n @ p.T
+    # The part across n is p less the part along: of it only quadratic forms are needed.
+    square = np.square(p).sum(axis=1) - np.square(along)
+    trace = np.trace(c, axis1=1, axis2=2)[:, None]
+    determinant = np.maximum((trace**2 - np.trace(c @ c, axis1=1, axis2=2)[:, None]) / 2, 0)
+    # C n = 0, so the form of p is that of its part across.
+    width = np.einsum("nmi,mi->nm", p @ c, p)
     z = 3 + 1j * along if order == 2 else np.zeros_like(along)
     # Of the 2 x 2 matrix B = I + z C: det B, and C B^-1 = (C + z det C I) / det B (Cayley and Hamilton).
     whole = 1 + z * trace + z**2 * determinant
-    exponent = 1j * along - (width + z * determinant * np.square(q).sum(axis=-1)) / (2 * whole)
+    exponent = 1j * along - (width + z * determinant * square) / (2 * whole)
     signals: ComplexArray = 2 * np.pi * np.sqrt(determinant / whole) * np.exp(exponent)
     return signals

@@ -26,7 +26,7 @@ from ..splat.operator import Images, in_blocks, magnitudes, weight_strips
 from ..splat.tiles import Plane
 from .antenna import Array, Pattern
 from .array import array_response
-from .retrieve import mirror_order
+from .beams import mirror_order
 
 ComplexArray = NDArray[np.complex64]
 

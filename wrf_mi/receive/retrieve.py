@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
-from scipy.spatial.distance import cdist
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from .beams import mirror_order
 from .lags import Lags
 
 ComplexArray = NDArray[np.complex128]
@@ -158,16 +158,6 @@ def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[F
         ftol=1e-9,
     )
     return best.x, float(np.sqrt(2 * best.cost))
-
-
-def mirror_order(elements_m: ArrayLike) -> NDArray[np.int64] | None:
-    """Which element lies opposite to each through the array's centre, [m]; None where one has no opposite."""
-    elements = np.asarray(elements_m, float)
-    centre = elements.mean(axis=0)
-    distance = cdist(2 * centre - elements, elements)
-    opposite = distance.argmin(axis=1)
-    extent = max(float(np.ptp(elements, axis=0).max()), np.finfo(float).tiny)
-    return opposite if distance.min(axis=1).max() < 1e-6 * extent else None
 
 
 def align_signals(signals: ArrayLike, tx_pos_m: ArrayLike, elements_m: ArrayLike) -> ComplexArray:

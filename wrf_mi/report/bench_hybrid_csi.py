@@ -37,6 +37,8 @@ SEEDS = (1, 2, 3)
 """Of the scan's noise and of the fits."""
 POSES = 6
 RAYS = 1 << 20
+SCANNED = "scene"
+"""Folder of the scene that `scanned_scene` makes."""
 ENCODING = Encoding(position_octaves=6, position_scale_m=4.0, tx_octaves=6, tx_scale_m=4.0)
 GAUSSIANS, LAYERS, WIDTH, STEPS, BATCH = 150, 4, 64, 1000, 16
 """Of the learned field alone."""
@@ -113,7 +115,7 @@ def channels(room: str | Path, seeds: Sequence[int] = SEEDS, learned_steps: int 
 
 
 def scanned_scene(room: str | Path, work: Path, seed: int, range_noise_m: float = RANGE_NOISE_M) -> Any:
-    """The room as a scene made of a simulated scan from `POSES` places."""
+    """The room as a scene made of a simulated scan from `POSES` places, stored in the folder `SCANNED` of ``work``."""
     file = Path(room)
     record = read_newrf(file)
     assert record.frequencies_hz is not None
@@ -124,7 +126,7 @@ def scanned_scene(room: str | Path, work: Path, seed: int, range_noise_m: float 
     stands = spread(moving[high & (_clearance(scene_surfaces(original).triangles)(moving) > SCANNER_CLEAR_M)], POSES)
     points = simulate_scan(original.mi_scene, stands, range_noise_m=range_noise_m, seed=seed)
     scan = write_arrays(work / "scan.npz", {"points": points})
-    return open_scene(make_scene(scan, work / "scene").folder, frequency_hz)
+    return open_scene(make_scene(scan, work / SCANNED).folder, frequency_hz)
 
 
 def learned_field_alone(record: Record, train: IntArray, test: IntArray, seed: int, steps: int = STEPS) -> Complex:

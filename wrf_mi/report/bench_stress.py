@@ -6,8 +6,7 @@ Each row says how many cases ran and the worst of them.
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,36 +14,26 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.constants import speed_of_light
-from skimage.metrics import structural_similarity
-from wrf_mi_scenes.build_laboratory import sheet
-from wrf_mi_scenes.furnished import write_scene
 
 from ..core import Record
-from ..core.angles import FloatArray
 from ..field import FIELDS, Encoding, random_gaussians
 from ..field.network import Weights
 from ..fit.config import TrainConfig, with_settings
 from ..fit.trainer import NumericsError, Trainer
-from ..loss.ssim import ssim as similarity
 from ..measure import make_splits
-from ..trace import TraceOptions, open_scene, trace_paths
+from .bench import BenchFailed
 from .stress_curves import curves, draw
-from .stress_fields import BLENDINGS, HARD, RECEIVER, Field, gradient, image, layers, made, reference
+from .stress_fields import BLENDINGS, HARD, RECEIVER, Field, felt_values, gradient, image, layers, made, reference
+from .stress_losses import losses
+from .stress_plugins import plugin_gradients, plugin_images
+from .stress_receivers import derivatives, of_fields
+from .stress_rows import EXACT, IMAGE, GradientWorst, Row, Worst, relative, row, worst_of
+from .stress_traced import phases, traced_gradients
+from .stress_twins import twins
 
 SIZE = (30, 60)
 SMALL = (8, 16)
 """Pixels where tens of thousands of layers go through NumPy."""
-IMAGE = 1e-4
-"""Relative L2 error of an image."""
-GRADIENT = 1e-3
-"""Relative error, in norm, of a derivative in float32."""
-EXACT = 1e-5
-"""Median relative error of a derivative in float64 against central differences."""
-PHASE = 1e-3
-"""Radians."""
-UNFELT = 1e-3
-"""A group whose derivatives, times its parameters, are below this share of the largest group's counts as that large."""
 PICTURE = Path("docs/images/numerics.png")
 """Written where the command is called in a checkout of the project, and only there."""
 SHORT = (
@@ -53,7 +42,9 @@ SHORT = (
 )
 SAID = re.compile(r"step \d+: .*not finite: \w+")
 RANDOM = "random fields"
-Row = dict[str, str]
+NEITHER = "0 neither"
+HARDEST = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in depth", "opacity 0, 1 and 1 - 1e-7")
+"""Families whose derivatives the quick form takes."""
 DOUBLE: Any = dr.float64_array_t(mi.Float)
 
 
@@ -67,16 +58,16 @@ def images(random: int, of_each: int) -> list[Row]:
 def _images(
     name: str, family: Callable[[np.random.Generator], Field], count: int, bound: float, size: tuple[int, int] = SIZE
 ) -> Row:
-    worst, edge, pixels = 0.0, 0, 0
+    worst, edge, pixels = Worst(), 0, 0
     for seed in range(count):
         field = family(np.random.default_rng(seed))
         for blending in BLENDINGS:
             truth, clear = reference(field, blending, size)
             found = image(field, blending, size)
-            worst = max(worst, _relative((found - truth)[clear], truth))
+            worst.add(relative((found - truth)[clear], truth) if np.isfinite(found).all() else np.nan)
             edge, pixels = edge + int((~clear).sum()), pixels + truth.size
     what = f"image, {name}, {2 * count} cases"
-    return _row(what, worst, bound, f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out")
+    return worst.row(what, bound, f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out")
 
 
 def gradients(of_each: int, names: Iterable[str] = (RANDOM, *HARD)) -> list[Row]:
@@ -90,22 +81,13 @@ def _ordinary(rng: np.random.Generator) -> Field:
 
 
 def _gradients(name: str, family: Callable[[np.random.Generator], Field], count: int) -> Row:
-    worst, group = 0.0, ""
+    worst = GradientWorst()
     for seed in range(count):
         field = family(np.random.default_rng(seed))
         for blending in BLENDINGS:
-            single = gradient(field, blending, SIZE, mi.Float, seed)
-            double = gradient(field, blending, SIZE, DOUBLE, seed)
-            values = field.groups(blending)
-            values["position"] = values["position"] - RECEIVER.position_m
-            felt = {key: float(np.linalg.norm(double[key] * values[key])) for key in double}
-            least = UNFELT * max(felt.values())
-            for key in double:
-                error = float(np.linalg.norm((single[key] - double[key]) * values[key])) if least else 0.0
-                error = error / max(felt[key], least) if error else error
-                if not error <= worst:
-                    worst, group = error, key
-    return _row(f"derivatives, {name}, {2 * count} cases", worst, GRADIENT, f" ({group})" if group else "")
+            single, double = (gradient(field, blending, SIZE, kind, seed) for kind in (mi.Float, DOUBLE))
+            worst.add(single, double, felt_values(field, blending))
+    return worst.row(f"derivatives, {name}, {2 * count} cases")
 
 
 def field_functions(models: Iterable[str] = tuple(FIELDS), tries: int = 9) -> list[Row]:
@@ -139,7 +121,7 @@ def field_functions(models: Iterable[str] = tuple(FIELDS), tries: int = 9) -> li
             if not median <= worst:
                 worst, group = median, name
         what = f"derivatives of {model} in float64 against differences, {len(plain)} groups, {tries} directions each"
-        rows.append(_row(what, worst, EXACT, f" ({group})" if group else ""))
+        rows.append(row(what, worst, EXACT, f" ({group})" if group else ""))
     return rows
 
 
@@ -159,70 +141,6 @@ def _functional(field: Any, tx: Any, rng: np.random.Generator) -> Callable[[dict
         return total
 
     return value
-
-
-def phases() -> list[Row]:
-    """Phases of traced paths against mirror images in closed form: halls of metal, up to two reflections."""
-    return [_phases(28e9, (100.0, 60.0, 12.0)), _phases(915e6, (10_000.0, 4_000.0, 300.0))]
-
-
-def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int = 30) -> Row:
-    length, width, height = size_m
-    walls = {f"{axis}{at:g}": sheet(axis, at, *spans) for axis, at, spans in (
-        (0, 0.0, ((0.0, width), (0.0, height))), (0, length, ((0.0, width), (0.0, height))),
-        (1, 0.0, ((0.0, length), (0.0, height))), (1, width, ((0.0, length), (0.0, height))),
-        (2, 0.0, ((0.0, length), (0.0, width))), (2, height, ((0.0, length), (0.0, width))),
-    )}  # fmt: skip
-    rng = np.random.default_rng(0)
-    tx, rx = rng.uniform(0.1, 0.9, (count, 3)) * size_m, rng.uniform(0.1, 0.9, 3) * size_m
-    with tempfile.TemporaryDirectory() as work:
-        xml = write_scene(Path(work), {name: ("itu_metal", wall) for name, wall in walls.items()}, "Hall of metal")
-        scene = open_scene(xml, frequency_hz)
-        options = TraceOptions(max_depth=2, rays=1 << 14, upright=True)
-        paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
-    worst = single = 0.0
-    for row, place in enumerate(tx):
-        found, exact = np.sort(paths.length_m[paths.tx == row]), _mirror_images(place, rx, np.array(size_m))
-        if len(found) != len(exact):
-            worst = float("inf")
-            continue
-        worst = max(worst, float(np.abs(found - exact).max()))
-        single = max(single, float(np.abs(found.astype(np.float32) - exact).max()))
-    wavenumber = 2 * np.pi * frequency_hz / speed_of_light
-    what = f"phase at {frequency_hz / 1e9:g} GHz in {length:g} m, {len(paths)} paths"
-    return _row(what, wavenumber * worst, PHASE, f" rad; with lengths in float32 {wavenumber * single:.0e} rad")
-
-
-def _mirror_images(tx: FloatArray, rx: FloatArray, size: FloatArray, depth: int = 2) -> FloatArray:
-    """Lengths of all paths of up to ``depth`` reflections in a box, sorted.
-
-    Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
-    """
-    numbers = np.array(np.meshgrid(*[np.arange(-depth, depth + 1)] * 3)).reshape(3, -1).T
-    numbers = numbers[np.abs(numbers).sum(axis=1) <= depth]
-    image = np.where(numbers % 2 == 0, numbers * size + tx, (numbers + 1) * size - tx)
-    return np.sort(np.linalg.norm(image - rx, axis=1))
-
-
-def losses(count: int) -> list[Row]:
-    """The differentiable similarity against scikit-image's in float64: random, flat, nearly flat, and out of range."""
-    rng = np.random.default_rng(0)
-    kinds: dict[str, Callable[[], FloatArray]] = {
-        "random": lambda: rng.uniform(size=SIZE),
-        "flat": lambda: np.full(SIZE, rng.uniform()),
-        "nearly flat": lambda: rng.uniform() + 1e-4 * rng.normal(size=SIZE),
-        "of 0 to 1000": lambda: 1e3 * rng.uniform(size=SIZE),
-    }
-    rows = []
-    for name, make in kinds.items():
-        worst = 0.0
-        for _ in range(count):
-            one, other = (make().astype(np.float32) for _ in range(2))
-            truth = structural_similarity(one.astype(float), other.astype(float), data_range=1)
-            found = float(similarity(mi.Float(one.ravel()), mi.Float(other.ravel()), 1, *SIZE)[0])
-            worst = max(worst, abs(found - truth))
-        rows.append(_row(f"similarity of images, {name}, {count} cases", worst, IMAGE))
-    return rows
 
 
 def fits(count: int) -> Row:
@@ -267,31 +185,66 @@ def fits(count: int) -> Row:
         unseen += not all(np.isfinite(values).all() for params in saved for values in params.values())
     what = f"fits with random bad learning rates and starts, {count} cases"
     value = f"{finished} ended finite, {said} said at which step which group was not, {unseen} did neither"
-    return {"what": what, "value": value, "asked": "0 neither"}
-
-
-def _relative(error: Any, truth: Any) -> float:
-    size = float(np.linalg.norm(truth))
-    off = float(np.linalg.norm(error))
-    return off / size if size else off
-
-
-def _row(what: str, worst: float, bound: float, more: str = "") -> Row:
-    return {"what": what, "value": f"worst {worst:.1e}{more}", "asked": f"at most {bound:g}"}
+    return {"what": what, "value": value, "asked": NEITHER}
 
 
 def main() -> dict[str, Any]:
     """All of it at full size, and errors against what makes them, as a picture."""
-    rows = [*images(1000, 25), *gradients(10), *field_functions(), *phases(), *losses(50)]
+    rows = [
+        *images(1000, 25),
+        *gradients(10),
+        *field_functions(),
+        *of_fields(50, 5),
+        *derivatives(2),
+        *twins(25),
+        *losses(10),
+        *phases(),
+        *traced_gradients(),
+        *plugin_images(50, 5),
+        *plugin_gradients(2),
+        fits(100),
+    ]
     found = curves()
     if PICTURE.parent.is_dir():
         draw(found, PICTURE)
-    return {"rows": [*rows, fits(100)], "curves": found}
+    return {"rows": rows, "curves": found}
 
 
-def worst_of(row: Row) -> tuple[float, float]:
-    """The worst case of a row and its bound."""
-    return float(row["value"].split()[1].rstrip(";")), float(row["asked"].split()[-1])
+QUICK: Sequence[Callable[[], list[Row]]] = (
+    lambda: images(5, 1),
+    lambda: gradients(1, HARDEST),
+    lambda: field_functions(tries=3),
+    lambda: of_fields(2, 1),
+    lambda: derivatives(1, ("spectrum", "RSSI"), ("random", *HARDEST[:1])),
+    lambda: twins(1),
+    lambda: losses(1),
+    lambda: phases(5),
+    lambda: traced_gradients(2),
+    lambda: plugin_images(2, 1, 0),
+    lambda: plugin_gradients(1, HARDEST[:1]),
+    lambda: [fits(4)],
+)
+"""The same with few cases of each; for a minute."""
 
 
-__all__ = ["field_functions", "fits", "gradients", "images", "losses", "main", "phases", "worst_of"]
+def quick() -> dict[str, Any]:
+    """A few cases of each row.
+
+    Raises:
+        BenchFailed: a bound is not held.
+    """
+    rows = [one for part in QUICK for one in part()]
+    if missed := [f"{one['what']}: {one['value']}, asked {one['asked']}" for one in rows if not held(one)]:
+        raise BenchFailed(f"bench stress --quick: {'; '.join(missed)}")
+    return {"rows": rows}
+
+
+def held(row: Row) -> bool:
+    """Whether a row's bound is held."""
+    if row["asked"] == NEITHER:
+        return row["value"].endswith(" 0 did neither")
+    worst, bound = worst_of(row)
+    return worst <= bound
+
+
+__all__ = ["field_functions", "fits", "gradients", "held", "images", "main", "phases", "quick", "worst_of"]

@@ -113,10 +113,10 @@ def _rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
         known = {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
         own = {"run": run.name, "dataset": run.dataset, "seed": run.seed, "metric": task.label}
         rows.append(known | own | _summary(run.metrics[task.block]))
-    for name, run in _references(runs).items():
-        block = run.metrics["reference"][task.reference]
-        kept = {key: run.metrics[key] for key in ("split", "n_train", "n_test")}
-        own = {"run": name, "model": task.reference, "dataset": run.dataset, "metric": task.label}
+    for name, (run, key) in _references(runs).items():
+        block = run.metrics["reference"][key]
+        kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
+        own = {"run": name, "model": key, "dataset": run.dataset, "metric": task.label}
         rows.append(kept | own | _summary(block))
     return [{key: row.get(key) for key in COLUMNS} for row in rows]
 
@@ -125,14 +125,16 @@ def _summary(block: dict[str, Any]) -> dict[str, Any]:
     return {key: block.get(key) for key in ("median", "mean", "p10", "p90")}
 
 
-def _references(runs: Sequence[Run]) -> dict[str, Run]:
-    """The reference method by its name, once for runs with the same training and test rows."""
-    found: dict[str, Run] = {}
+def _references(runs: Sequence[Run]) -> dict[str, tuple[Run, str]]:
+    """Each reference by its name: a run that has it and its key, once for runs with the same training and test rows."""
+    found: dict[str, tuple[Run, str]] = {}
     for run in runs:
-        if any(np.array_equal(run.reference_score, r.reference_score, equal_nan=True) for r in found.values()):
-            continue
-        name = f"{TASKS[run.task].reference_name}, {run.metrics['split']}"
-        found[f"{name} of {run.name}" if name in found else name] = run
+        for key, scores in run.reference_scores.items():
+            known = (r.reference_scores[key] for r, k in found.values() if k == key)
+            if any(np.array_equal(scores, other, equal_nan=True) for other in known):
+                continue
+            name = f"{TASKS[run.task].references[key]}, {run.metrics['split']}"
+            found[f"{name} of {run.name}" if name in found else name] = run, key
     return found
 
 
@@ -140,7 +142,7 @@ def _pictures(slug: str, runs: Sequence[Run]) -> list[Picture]:
     task = TASKS[runs[0].task]
     cdf = figures.score_cdf(
         {run.name: run.score for run in runs},
-        {name: run.reference_score for name, run in _references(runs).items()},
+        {name: run.reference_scores[key] for name, (run, key) in _references(runs).items()},
         task.label,
     )
     samples = _spectra(runs) if runs[0].task == "spectrum" else _maps(runs)
@@ -186,30 +188,33 @@ def _spectra(runs: Sequence[Run]) -> tuple[str, Figure]:
         name = f"row {first.row[m]}" + (f", receiver {receiver}" if len(first.truth) > 1 else "")
         predictions = [None if p is None else run.prediction[receiver, p] for run, p in zip(runs, places, strict=True)]
         rows.append((name, [first.truth[receiver, m], *predictions, first.reference[receiver, m]]))
-    columns = ["truth", *(run.name for run in runs), f"{TASKS[first.task].reference_name} ({first.metrics['split']})"]
+    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
     percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
     heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"
     return heading, figures.spectrum_table(rows, columns)
 
 
 def _maps(runs: Sequence[Run]) -> tuple[str, Figure]:
-    """Heading and picture of each receiver's power over the first run's test positions."""
+    """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
     first = runs[0]
-    columns = ["truth", *(run.name for run in runs), f"{TASKS[first.task].reference_name} ({first.metrics['split']})"]
+    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
     rows = []
     for r, receiver in enumerate(first.receivers):
         aligned = [_aligned(run, first, r) for run in runs]
         maps = [first.truth[r], *aligned, first.reference[r]]
         rows.append((receiver, [None if values is None else _power_db(values) for values in maps]))
+    if not np.isfinite(first.tx_pos_m).all():
+        heading = f"Power at each receiver over the test rows of {first.name}"
+        return heading, figures.row_table(rows, columns, first.row, TASKS[first.task].quantity)
     heading = f"Power at each receiver over the test positions of {first.name}"
     return heading, figures.position_table(rows, columns, first.tx_pos_m, TASKS[first.task].quantity)
 
 
 def _power_db(values: np.ndarray) -> np.ndarray:
-    """RSSI as it is; the power of a channel's coefficients, summed over subcarriers, in dB."""
+    """RSSI as it is; the power of a channel's coefficients, summed over antennas and subcarriers, in dB."""
     if not np.iscomplexobj(values):
         return values
-    power = np.square(np.abs(values)).sum(axis=-1)
+    power = np.square(np.abs(values)).reshape(len(values), -1).sum(axis=-1)
     return 10 * np.log10(np.where(power > 0, power, np.nan))
 
 

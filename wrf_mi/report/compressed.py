@@ -21,6 +21,7 @@ from ..fit.folder import (
     CHECKPOINT,
     SPLIT,
     append_log,
+    check_new,
     load_predictor,
     load_rows,
     read_checkpoint,
@@ -32,6 +33,7 @@ from ..fit.predictor import Predictor
 from ..fit.trainer import Progress, final_params
 from ..measure import save_split
 from ..trace import load_record
+from .baseline_run import is_baseline
 from .evaluate import stored_metrics
 from .hybrid_run import is_hybrid
 from .runs import evaluate_run, is_blocked
@@ -110,9 +112,8 @@ def compress_run(
         InputError: not a run with one learned field, or a folder that is not empty.
     """
     source, folder = Path(run), Path(out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not empty; choose another --out")
-    if is_traced(source) or is_hybrid(source):
+    check_new(folder)
+    if is_traced(source) or is_hybrid(source) or is_baseline(source):
         raise InputError(f"{source}: not a learned field alone; compress a run of wrf-gs or wrf-gs+")
     if is_blocked(source):
         raise InputError(f"{source}: one field for each block; choose one, e.g. {source / 'fold0'}")

@@ -11,28 +11,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..baselines.idw import InverseDistance
 from ..core import InputError, Record, Split
-from ..core.angles import FloatArray
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
 from .metrics import TASKS, TaskScore, summary
-from .run_folder import METRICS, PREDICTIONS, Observations, reference_key
+from .references import reference_predictions
+from .run_folder import METRICS, PREDICTIONS, reference_key
 
 Predict = Callable[[IntArray, int], NDArray[Any]]
 """What the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or channel
-coefficients [m, subcarriers]. Rows, and not positions, because a method may use how the transmitter was turned."""
+coefficients [m, subcarriers] or [m, antennas, subcarriers]. Rows, and not positions, because a method may use how the
+transmitter was turned, or the uplink."""
 
 REPEATS = 20
-"""Single predictions that are timed; the median is stated."""
+"""Single predictions that are timed at most; the median is stated."""
+TIMED_S = 10.0
+"""After so many seconds no further one is begun: some methods optimise for each sample."""
 
 
 def milliseconds_per_sample(predict: Predict, rows: IntArray, repeats: int = REPEATS) -> float:
     """Median time of one prediction at one transmitter position, warm, in ms."""
     one = rows[:1]
     predict(one, 0)
-    times = []
-    for _ in range(repeats):
+    times: list[float] = []
+    while len(times) < repeats and sum(times) < TIMED_S:
         start = time.perf_counter()
         predict(one, 0)
         times.append(time.perf_counter() - start)
@@ -40,11 +42,11 @@ def milliseconds_per_sample(predict: Predict, rows: IntArray, repeats: int = REP
 
 
 def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Score a method on the test rows of a split, with the nearest-neighbour blend of its task beside it.
+    """Score a method on the test rows of a split, with the references that the data allow beside it.
 
     Args:
         record: of any task in `wrf_mi.report.metrics.TASKS`.
-        split: the blend is fitted on all its training rows, validation rows included.
+        split: references (`wrf_mi.report.references`) know all its training rows, validation rows included.
         predict: the method; finite wherever something was received.
 
     Returns:
@@ -58,14 +60,13 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
     rows, known = split.test, split.all_train
     if len(rows) == 0:
         raise InputError(f"split {split.name}: no test rows to score; use another split")
-    tx_pos, task = record.tx_pos_m[rows], TASKS[record.task]
-    truth = record.observation[:, rows]
+    truth = record.scored[:, rows]
     arrays = {
         "row": rows,
         "prediction": np.stack([predict(rows, r) for r in range(len(truth))]).astype(truth.dtype),
         "truth": truth,
-        "tx_pos": tx_pos,
-        reference_key(task): _reference(task, record, known, tx_pos).astype(truth.dtype),
+        "tx_pos": record.tx_pos_m[rows],
+        **{reference_key(key): values for key, values in reference_predictions(record, known, rows).items()},
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
     metrics = score(arrays, record.task) | {
@@ -75,17 +76,6 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
     return metrics, arrays
 
 
-def _reference(task: TaskScore, record: Record, rows: NDArray[np.int64], tx_pos: FloatArray) -> Observations:
-    blends = []
-    for receiver, observed in zip(record.receivers, record.observation, strict=True):
-        blend = InverseDistance(task.neighbours, softening_m=task.softening_m)
-        try:
-            blends.append(blend.fit(record.tx_pos_m[rows], observed[rows]).predict(tx_pos))
-        except InputError as error:
-            raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-    return np.stack(blends)
-
-
 def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     """The score blocks of ``metrics.json`` from the arrays of ``predictions.npz`` (with a first axis per receiver).
 
@@ -93,20 +83,26 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     number of rows that count, and the block at the top pools all.
     """
     scorer = TASKS[task]
-    own = scorer.score(arrays["prediction"], arrays["truth"])
-    blend = scorer.score(arrays[reference_key(scorer)], arrays["truth"])
+    own = scorer.of_rows(arrays["prediction"], arrays["truth"])
+    held = {key: scorer.of_rows(arrays[reference_key(key)], arrays["truth"]) for key in _stored(scorer, arrays)}
 
-    def blocks(scores: FloatArray, references: FloatArray) -> dict[str, Any]:
-        return {scorer.block: summary(scores), "reference": {scorer.reference: summary(references)}}
+    def blocks(chosen: Any) -> dict[str, Any]:
+        references = {key: summary(scores[chosen]) for key, scores in held.items()}
+        return {scorer.block: summary(own[chosen]), "reference": references}
 
-    metrics: dict[str, Any] = {"task": task, **blocks(own, blend), "n_test": len(arrays["row"])}
+    metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
     if len(own) > 1:
         counts = np.count_nonzero(~np.isnan(own), axis=1)
         metrics["receivers"] = {
-            str(name): {**(blocks(own[r], blend[r]) if counts[r] else {}), "n_test": int(counts[r])}
+            str(name): {**(blocks(r) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
     return metrics
+
+
+def _stored(task: TaskScore, arrays: dict[str, Any]) -> list[str]:
+    """References that the arrays hold."""
+    return [key for key in task.references if reference_key(key) in arrays]
 
 
 def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -117,7 +113,7 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
     blocks, every = zip(*parts, strict=True)
     task = blocks[0]["task"]
     arrays = {key: np.concatenate([a[key] for a in every]) for key in ("row", "tx_pos")}
-    known = ("prediction", "truth", "std", reference_key(TASKS[task]))
+    known = ("prediction", "truth", "std", *(reference_key(key) for key in _stored(TASKS[task], every[0])))
     for key in (key for key in known if key in every[0]):
         arrays[key] = np.concatenate([a[key] for a in every], axis=1)
     arrays["receiver_name"] = every[0]["receiver_name"]
@@ -139,8 +135,9 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. ``prediction`` and, where they are
     known, ``truth`` and ``reference_<name>``: grey in 0..1 [m, H, W] or [n_rx, m, H, W] float32, power in dBm [m] or
-    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k] or [n_rx, m, k] complex64. ``std``, where a
-    method states it, is the predicted standard deviation, of the same shape, real.
+    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k], or of several antennas [m, antennas, k],
+    complex64, in either case with a first axis where there are several receivers. ``std``, where a method states it,
+    is the predicted standard deviation, of the same shape, real.
 
     Returns:
         The arrays as written.

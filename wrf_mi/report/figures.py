@@ -122,6 +122,34 @@ def position_table(
     return figure
 
 
+def row_table(
+    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], row: ArrayLike, label: str
+) -> Figure:
+    """One value over row numbers, for data without positions: a panel for each name, a line for each column.
+
+    Args:
+        rows: a name and one array [m] per column; None leaves the line out, NaN a point.
+        columns: what each line is.
+        row: numbers of the rows [m].
+        label: of the value, with its unit.
+
+    Returns:
+        The figure.
+    """
+    order = np.argsort(np.asarray(row))
+    figure = Figure(figsize=(8, 2.2 * len(rows) + 0.6), layout="constrained")
+    grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, (name, lines) in zip(grid, rows, strict=True):
+        for title, values in zip(columns, lines, strict=True):
+            if values is not None:
+                axes.plot(np.asarray(row)[order], np.asarray(values)[order], linewidth=0.8, label=title)
+        axes.set_ylabel(f"{name}\n{label}", fontsize=7)
+        axes.tick_params(labelsize=6)
+    grid[0].legend(fontsize=7)
+    grid[-1].set_xlabel("row", fontsize=7)
+    return figure
+
+
 def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
     """A spectrum beside the Gaussians that make it, each as the receiver sees it.
 

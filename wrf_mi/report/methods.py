@@ -36,7 +36,7 @@ Predict = Callable[[FloatArray], NDArray[Any]]
 """From transmitter positions [m, 3] in metres to spectra [m, height, width]."""
 
 STEPS = 3000
-"""Of every learned field: a fifth of the default schedule, so that all of them together take minutes."""
+"""Of every learned field: a third of the default schedule, so that all of them together take minutes."""
 
 
 @dataclass(frozen=True)

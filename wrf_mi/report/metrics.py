@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from skimage.metrics import structural_similarity
 
+from wrf_mi.baselines.idw import REFERENCE
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
 
+UPLINK = "uplink"
+"""Key of the reference that copies the uplink."""
 EXACT = np.finfo(float).eps ** 2
 """Smallest relative squared error that float64 can show."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
@@ -110,7 +113,7 @@ class TaskScore:
     """How one task is scored and shown.
 
     Attributes:
-        score: ``score(prediction, truth)``, one value per receiver and row.
+        score: ``score(prediction, truth)``, one value for each observation of ``axes`` axes.
         block: key in ``metrics.json``.
         label: of the score, for tables and axes.
         higher_is_better: whether it is an accuracy or an error.
@@ -118,6 +121,8 @@ class TaskScore:
             (`wrf_mi.baselines.idw.InverseDistance`).
         softening_m: of the same, metres.
         axes: number of axes of one observation, at one receiver and row.
+        more_axes: that it may have beside these (antennas); all of them together are one observation.
+        from_uplink: words for the second reference, of data with an uplink; "" where the task has none.
         heading: of the task.
         quantity: what is drawn over positions, with its unit.
         note: one sentence for readers of a table.
@@ -133,16 +138,39 @@ class TaskScore:
     heading: str
     quantity: str
     note: str
+    more_axes: int = 0
+    from_uplink: str = ""
 
     @property
     def reference(self) -> str:
-        """Key of the reference in ``metrics.json``."""
+        """Key of the blend in ``metrics.json``."""
         return f"idw{self.neighbours}"
 
     @property
-    def reference_name(self) -> str:
-        """The reference in words."""
-        return f"blend of {self.neighbours} nearest"
+    def references(self) -> dict[str, str]:
+        """Words for each reference that the task may have by its key, the first that a run has being its headline."""
+        blend = {self.reference: f"blend of {self.neighbours} nearest"}
+        return {UPLINK: self.from_uplink} | blend if self.from_uplink else blend
+
+    def headline(self, stored: Container[str]) -> str | None:
+        """The reference that stands for all: the first of `references` among those stored; None without any."""
+        return next((key for key in self.references if key in stored), None)
+
+    def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
+        """Score of each receiver and row.
+
+        Args:
+            prediction: [n_rx, m, ...], see `wrf_mi.core.Record`.
+            truth: the same shape.
+
+        Returns:
+            Shape [n_rx, m].
+        """
+        predicted, expected = np.asarray(prediction), np.asarray(truth)
+        if self.more_axes and expected.ndim > 2 + self.axes and predicted.shape == expected.shape:
+            shape = (*expected.shape[:2], -1)
+            predicted, expected = predicted.reshape(shape), expected.reshape(shape)
+        return self.score(predicted, expected)
 
 
 TASKS: Mapping[str, TaskScore] = {
@@ -151,8 +179,8 @@ TASKS: Mapping[str, TaskScore] = {
         block="ssim",
         label="SSIM",
         higher_is_better=True,
-        neighbours=4,
-        softening_m=0,
+        neighbours=REFERENCE["spectrum"][0],
+        softening_m=REFERENCE["spectrum"][1],
         axes=2,
         heading="spatial spectra",
         quantity="grey",
@@ -164,9 +192,8 @@ TASKS: Mapping[str, TaskScore] = {
         block="abs_error_db",
         label="absolute error (dB)",
         higher_is_better=False,
-        neighbours=100,
-        # Of 0 to 1.6 m the best on tenths of flat-ble's training run that were held out in turn, in the order of time.
-        softening_m=0.4,
+        neighbours=REFERENCE["rssi"][0],
+        softening_m=REFERENCE["rssi"][1],
         axes=0,
         heading="received signal strength",
         quantity="RSSI (dBm)",
@@ -178,13 +205,16 @@ TASKS: Mapping[str, TaskScore] = {
         block="cea_db",
         label="CEA (dB)",
         higher_is_better=True,
-        neighbours=4,
-        softening_m=0,
+        neighbours=REFERENCE["csi"][0],
+        softening_m=REFERENCE["csi"][1],
         axes=1,
+        more_axes=1,
+        from_uplink="copy of the uplink",
         heading="channel coefficients",
         quantity="power (dB)",
-        note="CEA is the channel estimation accuracy, -10 log10 of the relative squared error; the blend mixes the "
-        "four nearest training rows by inverse squared distance.",
+        note="CEA is the channel estimation accuracy, -10 log10 of the relative squared error over a sample's antennas "
+        "and subcarriers; the blend mixes the four nearest training rows by inverse squared distance; the copy of the "
+        "uplink takes each antenna's uplink coefficients for the downlink's.",
     ),
 }
 """By the task of a record (`wrf_mi.core.Record`)."""

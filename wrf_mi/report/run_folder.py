@@ -29,9 +29,9 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 """Greys, powers in dBm or channel coefficients, see `wrf_mi.core.Record`."""
 
 
-def reference_key(task: TaskScore) -> str:
-    """Key in ``predictions.npz`` of what the task's reference predicts."""
-    return f"reference_{task.reference}"
+def reference_key(name: str) -> str:
+    """Key in ``predictions.npz`` of what the reference of that name predicts."""
+    return f"reference_{name}"
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,10 @@ class Run:
         receivers: their names.
         row: test rows, shape [m].
         tx_pos_m: transmitter positions [m, 3], metres.
-        prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients.
+        prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients, or
+            [n_rx, m, antennas, subcarriers].
         truth: the same shape; NaN where nothing was received.
-        reference: the blend of the nearest training rows, the same shape.
+        references: by name (`wrf_mi.report.metrics.TaskScore.references`) what needs no model, the same shape.
         validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
     """
 
@@ -65,18 +66,33 @@ class Run:
     tx_pos_m: FloatArray
     prediction: Observations
     truth: Observations
-    reference: Observations
+    references: dict[str, Observations]
     validation: dict[str, list[tuple[float, float]]]
 
     @cached_property
     def score(self) -> FloatArray:
         """The task's metric of each prediction, shape [n_rx, m]; NaN where nothing was received."""
-        return TASKS[self.task].score(self.prediction, self.truth)
+        return TASKS[self.task].of_rows(self.prediction, self.truth)
 
     @cached_property
+    def reference_scores(self) -> dict[str, FloatArray]:
+        """The same of each reference."""
+        return {key: TASKS[self.task].of_rows(values, self.truth) for key, values in self.references.items()}
+
+    @property
+    def reference(self) -> Observations:
+        """The reference that stands for all, the first one."""
+        return next(iter(self.references.values()))
+
+    @property
+    def reference_name(self) -> str:
+        """That one in words."""
+        return TASKS[self.task].references[next(iter(self.references))]
+
+    @property
     def reference_score(self) -> FloatArray:
-        """The same of the blend."""
-        return TASKS[self.task].score(self.reference, self.truth)
+        """Score of that one."""
+        return next(iter(self.reference_scores.values()))
 
 
 def read_run(path: str | Path, name: str | None = None) -> Run:
@@ -94,7 +110,8 @@ def read_run(path: str | Path, name: str | None = None) -> Run:
         raise InputError(f"{folder}: no such folder; give a run folder made by train or trace")
     metrics = _read_metrics(folder / METRICS)
     task = TASKS[metrics["task"]]
-    arrays = _read_predictions(folder / PREDICTIONS, task)
+    references = [key for key in task.references if key in metrics["reference"]]
+    arrays = _read_predictions(folder / PREDICTIONS, task, references)
     parts = [folder, *sorted(p for p in folder.glob("fold*") if p.is_dir())]
     curves = {p.name if p != folder else "": _read_log(p / LOG) for p in parts}
     return Run(
@@ -109,7 +126,7 @@ def read_run(path: str | Path, name: str | None = None) -> Run:
         tx_pos_m=arrays["tx_pos"],
         prediction=arrays["prediction"],
         truth=arrays["truth"],
-        reference=arrays[reference_key(task)],
+        references={key: arrays[reference_key(key)] for key in references},
         validation={fold: points for fold, points in curves.items() if points},
     )
 
@@ -154,15 +171,17 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     if metrics["task"] not in TASKS:
         raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
     task = TASKS[metrics["task"]]
-    blocks = (metrics.get(task.block), (metrics.get("reference") or {}).get(task.reference))
-    if any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        what = f"no {task.block} or no reference {task.reference} with a median"
+    references = metrics.get("reference")
+    held = references if isinstance(references, dict) else {}
+    blocks = [metrics.get(task.block), *(held[key] for key in task.references if key in held)]
+    if len(blocks) == 1 or any(not isinstance(block, dict) or "median" not in block for block in blocks):
+        what = f"no {task.block} or no reference {' or '.join(sorted(task.references))} with a median"
         raise InputError(f"{path}: {what}; run evaluate to write it anew")
     return metrics
 
 
-def _read_predictions(path: Path, task: TaskScore) -> dict[str, Any]:
-    observed = ("prediction", "truth", reference_key(task))
+def _read_predictions(path: Path, task: TaskScore, references: Sequence[str]) -> dict[str, Any]:
+    observed = ("prediction", "truth", *map(reference_key, references))
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in ("row", "tx_pos", *observed)}
@@ -174,11 +193,13 @@ def _read_predictions(path: Path, task: TaskScore) -> dict[str, Any]:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not readable ({error}); run evaluate to write it anew") from None
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
-    if arrays["truth"].ndim == 1 + task.axes:  # one receiver
+    single = arrays["truth"].ndim == 1 + task.axes if names is None else len(names) == 1
+    if single:
         arrays |= {key: arrays[key][None] for key in observed}
     shape, rows = arrays["truth"].shape, len(arrays["row"])
     names = np.arange(shape[0] if shape else 0) if names is None else names
-    fits = len(shape) == 2 + task.axes and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
+    fits = 0 <= len(shape) - 2 - task.axes <= task.more_axes
+    fits = fits and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
     if not fits or any(arrays[key].shape != shape for key in observed):
         raise InputError(f"{path}: shapes do not fit together ({shapes}); run evaluate to write it anew")
     return arrays | {"receiver_name": names}

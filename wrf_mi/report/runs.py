@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..baselines.method import Inputs
+from ..core import InputError, Receiver, Record, Split
 from ..core.types import IntArray
 from ..fit.config import TrainConfig
 from ..fit.folder import (
     RunConfig,
     append_log,
+    check_new,
     load_predictor,
     load_rows,
     read_checkpoint,
@@ -32,6 +34,7 @@ from ..fit.trainer import Progress, Trainer, peak_memory_mb
 from ..measure import make_splits
 from ..parallel import Scheduler, row_parts
 from ..trace import load_record
+from .baseline_run import evaluate_baseline, is_baseline, open_baseline
 from .evaluate import Predict, evaluate, pool, stored_metrics, write_predictions, write_results
 from .hybrid_run import evaluate_hybrid, is_hybrid, open_hybrid, predict_with
 from .run_folder import CONFIG, METRICS
@@ -114,7 +117,7 @@ def train(
     """
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
-    settings, folder = config or TrainConfig(), Path(out)
+    settings, folder = (config or TrainConfig()).scheduled(), Path(out)
     if isinstance(split, Split):
         splits, name = [split], split.name
     else:
@@ -123,8 +126,7 @@ def train(
     if len(splits) == 1:
         _fit(start_run(folder, record, splits[0], run), folder, run, "", listen, stop)
         return Run(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not empty; choose another --out")
+    check_new(folder)
     # What cannot be trained is refused here, before anything is written.
     start_run(folder / "fold0", record, splits[0], replace(run, split=splits[0].name))
     write_config(folder, run)
@@ -224,6 +226,8 @@ def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = 
         return evaluate_traced(path, split)
     if is_hybrid(path):
         return evaluate_hybrid(path, split)
+    if is_baseline(path):
+        return evaluate_baseline(path, split)
     run = read_config(path)
     record = load_record(run.dataset)
     if is_blocked(path):
@@ -267,42 +271,48 @@ def predict_to_file(
     tx_heading_rad: np.ndarray | None = None,
     scheduler: Scheduler | None = None,
     operator: bool = True,
+    uplink: NDArray[Any] | None = None,
 ) -> dict[str, tuple[int, ...]]:
     """What a run's model predicts at new transmitter positions, as an ``.npz`` file.
 
     Args:
         folder: run folder with one field.
-        tx_pos_m: positions [m, 3], metres.
+        tx_pos_m: positions [m, 3], metres; NaN where they are not known.
         out: file to write; keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and of a hybrid
             ``std``.
-        tx_heading_rad: how the transmitter is turned, [m]; only a hybrid for signal strengths uses it.
+        tx_heading_rad: how the transmitter is turned, [m]; only a hybrid and baselines for signal strengths use it.
         scheduler: what computes parts of the positions; None: this process. Its workers must see the run folder, and
             the data set and scene of a traced or hybrid run, under the same names.
         operator: a learned field alone predicts by operator where it can.
+        uplink: uplink channels [m, antennas, subcarriers], for a baseline that predicts from them.
 
     Returns:
         Shape of each array in the file.
 
     Raises:
-        InputError: a run over several blocks, positions that are not finite, or headings for a model without.
+        InputError: a run over several blocks, positions that are not known, or headings or an uplink for a model
+            without.
     """
-    path = Path(folder)
-    if tx_heading_rad is not None and not is_hybrid(path):
-        raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
+    path, asked = Path(folder), Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink)
+    if not is_baseline(path):
+        if tx_heading_rad is not None and not is_hybrid(path):
+            raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
+        if uplink is not None:
+            raise InputError(f"{path}: its model does not predict from the uplink; leave uplink away")
     parts: list[Estimates]
-    if scheduler is None or not len(tx_pos_m):
-        parts = [open_run(path, operator)(tx_pos_m, tx_heading_rad, 0)]
+    if scheduler is None or not len(asked):
+        parts = [open_run(path, operator)(asked, 0)]
     else:
-        rows = row_parts(len(tx_pos_m), scheduler.workers, most=PREDICTED_AT_ONCE)
-        given = [(tx_pos_m[r], None if tx_heading_rad is None else tx_heading_rad[r], r.start) for r in rows]
+        rows = row_parts(len(asked), scheduler.workers, most=PREDICTED_AT_ONCE)
+        given = [(asked.rows(r), r.start) for r in rows]
         sizes = [len(one[0]) for one in given]
         parts = scheduler.map(_predict_part, given, partial(open_run, path, operator), what="predicting", sizes=sizes)
     means, stds, names = zip(*parts, strict=True)
     arrays: dict[str, Any] = {
-        "row": np.arange(len(tx_pos_m)),
+        "row": np.arange(len(asked)),
         "prediction": np.concatenate(means, axis=1),
-        "tx_pos": np.asarray(tx_pos_m, float),
+        "tx_pos": asked.tx_pos_m,
         "receiver_name": np.asarray(names[0]),
     }
     if stds[0] is not None:
@@ -310,28 +320,31 @@ def predict_to_file(
     return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
 
 
-def open_run(folder: Path, operator: bool = True) -> Callable[[np.ndarray, np.ndarray | None, int], Estimates]:
-    """The model of a run: a function of positions [m, 3], headings [m] or None, and the row that the first one is.
+def open_run(folder: Path, operator: bool = True) -> Callable[[Inputs, int], Estimates]:
+    """The model of a run: a function of what is known of rows, and of the row that the first one is.
 
     Raises:
         InputError: not a finished run, or one over several blocks.
     """
     if is_hybrid(folder):
         model = open_hybrid(folder)
-        return lambda tx_pos_m, heading, first: predict_with(model, tx_pos_m, heading)
+        return lambda asked, first: predict_with(model, asked.tx_pos_m, asked.tx_heading_rad)
     if is_traced(folder):
         traced = TracedRun(folder)
-        return lambda tx_pos_m, heading, first: (traced.predict(tx_pos_m, first), None, traced.names)
+        return lambda asked, first: (traced.predict(asked.tx_pos_m, first), None, traced.names)
+    if is_baseline(folder):
+        baseline = open_baseline(folder)
+        return lambda asked, first: _of_receivers(partial(baseline.predict_inputs, asked), baseline.receivers)
     predictor = Run(folder).predictor(operator)
-    names = tuple(receiver.name for receiver in predictor.receivers)
-    return lambda tx_pos_m, heading, first: (
-        np.stack([predictor(tx_pos_m, r) for r in range(len(names))]),
-        None,
-        names,
-    )
+    return lambda asked, first: _of_receivers(partial(predictor, asked.tx_pos_m), predictor.receivers)
 
 
-def _predict_part(model: Callable[..., Estimates], part: tuple[np.ndarray, np.ndarray | None, int]) -> Estimates:
+def _of_receivers(predict: Callable[[int], NDArray[Any]], receivers: Sequence[Receiver]) -> Estimates:
+    every = np.stack([predict(index) for index in range(len(receivers))])
+    return every, None, tuple(receiver.name for receiver in receivers)
+
+
+def _predict_part(model: Callable[[Inputs, int], Estimates], part: tuple[Inputs, int]) -> Estimates:
     return model(*part)
 
 

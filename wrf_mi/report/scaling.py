@@ -21,6 +21,7 @@ from ..core import Receiver, Record  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..field import FIELDS, InitialGaussians, random_gaussians  # noqa: E402
 from ..field.device import to_tensor  # noqa: E402
+from ..field.parts import gaussians_in_parts  # noqa: E402
 from ..fit.config import TrainConfig  # noqa: E402
 from ..fit.predictor import Predictor  # noqa: E402
 from ..fit.step import device_pose  # noqa: E402
@@ -107,7 +108,7 @@ def _networks(count: int) -> Call:
     field = FIELDS["wrf-gs+"]()
     params = {k: to_tensor(v) for k, v in field.init(_start(count), np.random.default_rng(0)).items()}
     tx = to_tensor(transmitter_path(1).T)
-    return lambda: vars(field.gaussians(params, tx))
+    return lambda: vars(gaussians_in_parts(field, params, tx))
 
 
 def _field(transmitters: int) -> Call:
@@ -196,14 +197,15 @@ def _planes(kind: str, triangles: int) -> Call:
     return lambda: len(scene_surfaces(scene).normal)
 
 
-TENS, DIRECTIONS = (10**3, 10**4, 10**5, 10**6), tuple(HEIGHT * WIDTH * k for k in (1, 4, 16))
+TENS, HALF_TENS = (10**3, 10**4, 10**5, 300_000, 10**6), (1000, 3000, 10_000, 30_000, 100_000)
+DIRECTIONS = tuple(HEIGHT * WIDTH * k for k in (1, 4, 9, 16))
 ANTENNAS, TRANSMITTERS = (16, 64, 256, 1024), (1, 16, 256, 4096)
 TRIANGLES = (10**2, 10**3, 10**4, 10**5, 10**6)
 
 AXES: list[Axis] = [
     Axis("gaussians-splat", "splatting", "Gaussians", TENS, _splat),
-    Axis("gaussians-integrator", "Mitsuba integrator, geometry new", "Gaussians", TENS[:3], _integrator),
-    Axis("gaussians-networks", "networks of WRF-GS+", "Gaussians", TENS[:3], _networks),
+    Axis("gaussians-integrator", "Mitsuba integrator, geometry new", "Gaussians", HALF_TENS, _integrator),
+    Axis("gaussians-networks", "networks of WRF-GS+", "Gaussians", HALF_TENS, _networks),
     Axis("directions-splat", "splatting", "directions", DIRECTIONS, _splat_directions),
     Axis("directions-array", "Bartlett spectrum", "directions", DIRECTIONS, _spectrum_of_directions),
     Axis("antennas-gaussians", "Gaussians in closed form", "antennas", ANTENNAS, _antennas_of_gaussians),

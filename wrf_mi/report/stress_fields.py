@@ -5,7 +5,7 @@ Every number of a field is one that float32 holds exactly, so that what differs 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,17 +140,31 @@ def layers(rng: Rng) -> Field:
 def image(field: Field, blending: str, size: tuple[int, int]) -> ComplexArray:
     """By the fast code in float32, [height, width]."""
     plane = perception_plane(*size, mi.Float)
-    re, im = splat(_on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
+    re, im = splat(on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
     return (re.numpy().astype(float) + 1j * im.numpy()).reshape(size)
 
 
-def reference(field: Field, blending: str, size: tuple[int, int]) -> tuple[ComplexArray, NDArray[np.bool_]]:
-    """By `wrf_mi.splat.oracle` in float64, [height, width], and which pixels lie on no edge of a footprint."""
+def reference(
+    field: Field, blending: str, size: tuple[int, int], sphere: bool = False
+) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """By `wrf_mi.splat.oracle` in float64, and which pixels lie on no edge of a footprint.
+
+    Args:
+        field: what is seen.
+        blending: one of `BLENDINGS`.
+        size: rows and columns of a hemisphere.
+        sphere: the lower hemisphere too, below the upper one.
+
+    Returns:
+        Both [height, width], or [2 * height, width].
+    """
     directions = pixel_directions(*size)
+    if sphere:
+        directions = np.concatenate([directions, directions * [1, -1, -1]])
     parts = (field.position_m, field.scale_m, field.rotation)
     own = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
     seen = oracle.project(*parts, RECEIVER)
-    clear = np.ones(size, bool)
+    clear = np.ones(directions.shape[:2], bool)
     for i in seen.order:
         cosine = directions @ seen.direction[i]
         point = directions @ seen.basis[i].T / np.where(cosine > MIN_COSINE, cosine, 1)[..., None]
@@ -160,25 +174,55 @@ def reference(field: Field, blending: str, size: tuple[int, int]) -> tuple[Compl
     return oracle.render(*parts, field.signal, RECEIVER, directions, **own), clear
 
 
-def gradient(field: Field, blending: str, size: tuple[int, int], float_type: Any, seed: int) -> dict[str, FloatArray]:
-    """Derivative of a random linear functional of the image by each group of parameters, [n, k]."""
-    gaussians, parts = _on_device(field, blending, float_type)
+Report = Callable[[Gaussians, Pose], Sequence[Any]]
+"""What is made of a field: real arrays, differentiable."""
+
+
+def gradient(
+    field: Field, blending: str, size: tuple[int, int], float_type: Any, seed: int, report: Report | None = None
+) -> dict[str, FloatArray]:
+    """Derivative of a random linear functional of the image by each group of parameters, [n, k].
+
+    Args:
+        field: what is seen.
+        blending: one of `BLENDINGS`.
+        size: rows and columns of the image.
+        float_type: in which all is computed.
+        seed: of the functional.
+        report: what it is a functional of; None: of the image's real and imaginary part.
+    """
+    gaussians, parts = on_device(field, blending, float_type)
     for array in (a for part in parts.values() for a in part):
         dr.enable_grad(array)
-    re, im = splat(gaussians, _pose(float_type), perception_plane(*size, float_type))
-    weight = np.random.default_rng(seed).normal(size=(2, size[0] * size[1])).astype(np.float32)
-    dr.backward(dr.sum(re * float_type(weight[0]) + im * float_type(weight[1])))
+    if report is None:
+        reported: Sequence[Any] = splat(gaussians, pose(float_type), perception_plane(*size, float_type))
+    else:
+        reported = report(gaussians, pose(float_type))
+    rng = np.random.default_rng(seed)
+    weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in reported]
+    total: Any = 0
+    for part, weight in zip(reported, weights, strict=True):
+        total = total + dr.sum(part * float_type(weight))
+    dr.backward(total)
     return {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], axis=1) for name, part in parts.items()}
 
 
-def _pose(float_type: Any) -> Pose:
+def felt_values(field: Field, blending: str) -> dict[str, FloatArray]:
+    """Parameters by group as derivatives are multiplied with: positions count from the receiver."""
+    values = field.groups(blending)
+    return values | {"position": values["position"] - RECEIVER.position_m}
+
+
+def pose(float_type: Any) -> Pose:
+    """Of `RECEIVER`, in numbers that float32 holds."""
     return Pose(
         [float_type(float(np.float32(x))) for x in RECEIVER.position_m],
         [[float_type(float(np.float32(x))) for x in row] for row in RECEIVER.to_world],
     )
 
 
-def _on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
+def on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
+    """The field's Gaussians, and the arrays that they are made of by group of parameters."""
     parts = {
         name: [float_type(np.ascontiguousarray(column)) for column in values.T]
         for name, values in field.groups(blending).items()

@@ -35,6 +35,7 @@ from ..measure import make_splits
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..trace import TraceOptions, load_record, open_scene
 from ..trace.tracer import instrument_of
+from .baseline_run import check_baseline
 from .evaluate import stored_metrics
 from .metrics import TASKS
 from .run_folder import CONFIG, METRICS
@@ -61,7 +62,7 @@ SCORES = ("median", "mean", "p10", "p90")
 HEADINGS = {
     "score": "score",
     **{key: key for key in SCORES},
-    "reference_median": "blend median",
+    "reference_median": "reference median",
     "n_train": "training rows",
     "n_test": "test rows",
     "train_seconds": "training, s",
@@ -215,6 +216,23 @@ def check_fit(
         raise InputError("--material belongs to a bare mesh; give it with --scene")
 
 
+def check_baseline_run(
+    model: str, dataset: str, split: tuple[str, int, float | None], settings: tuple[str, ...]
+) -> None:
+    """The same for a baseline.
+
+    Args:
+        model: its name.
+        dataset: name or folder.
+        split: name, seed, and number or fraction of training rows.
+        settings: changed ones, ``key=value``.
+
+    Raises:
+        InputError: data, split or settings that cannot be used.
+    """
+    check_baseline(model, _record(dataset), split[0], split[2], split[1], settings)
+
+
 # Runs of a sweep share most of these.
 _record = lru_cache(maxsize=4)(load_record)
 _open_scene = lru_cache(maxsize=4)(lambda scene, carrier_hz, material: open_scene(scene, carrier_hz, material=material))
@@ -292,7 +310,8 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
     if not metrics:
         return row | {"metrics": {}}
     task = TASKS[metrics["task"]]
-    row |= {"score": task.label, "reference_median": metrics["reference"][task.reference]["median"]}
+    held = task.headline(metrics["reference"])
+    row |= {"score": task.label, "reference_median": metrics["reference"][held]["median"]}
     row |= {key: metrics[task.block][key] for key in SCORES}
     row |= {key: metrics[key] for key in HEADINGS if key in metrics}
     return row | {"metrics": metrics}

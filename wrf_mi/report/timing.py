@@ -152,19 +152,29 @@ class Within:
             return self.call()
 
 
-def seconds(call: Call) -> float:
-    """Time of one call, until all its kernels have run."""
+def seconds(call: Call, processor: bool = False) -> float:
+    """Time of one call, until all its kernels have run.
+
+    Args:
+        call: what is timed.
+        processor: the time of all processors of this process instead, which others on the machine do not lengthen.
+    """
     if isinstance(call, Within):
         with call.context():
-            return seconds(call.call)
+            return seconds(call.call, processor)
+    clock = time.process_time if processor else time.perf_counter
     dr.sync_thread()
-    start = time.perf_counter()
+    start = clock()
     settle(call())
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def interleaved(
-    calls: Mapping[str, Call], repeats: int = REPEATS, warm_up: int = WARM_UP, most_s: float = np.inf
+    calls: Mapping[str, Call],
+    repeats: int = REPEATS,
+    warm_up: int = WARM_UP,
+    most_s: float = np.inf,
+    processor: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
     """Times in ms [rounds] of several calls that take turns in this process; every round calls each once.
 
@@ -173,6 +183,7 @@ def interleaved(
         repeats: rounds that are timed.
         warm_up: rounds before them that are not.
         most_s: no further round begins after so many seconds; three are timed in any case.
+        processor: see `seconds`.
     """
     start = time.perf_counter()
     for _ in range(warm_up):
@@ -189,7 +200,7 @@ def interleaved(
             gc.collect(1)  # all of them take longer than many a call
             # Every other round the other way round: what the one leaves in caches helps or harms the other.
             for name in list(calls)[:: 1 if done % 2 == 0 else -1]:
-                times[name].append(1e3 * seconds(calls[name]))
+                times[name].append(1e3 * seconds(calls[name], processor))
     finally:
         if collecting:
             gc.enable()
@@ -309,8 +320,8 @@ def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) 
 
 
 def larger_half(count: int) -> slice:
-    """The larger half of ascending sizes, two at least."""
-    return slice(min(count // 2, count - 2), count)
+    """The larger half of ascending sizes; of four or five the largest three, two at least."""
+    return slice(count - max(count - count // 2, min(3, count - 1), 2), count)
 
 
 def n_log_n(sizes: Sequence[float]) -> float:

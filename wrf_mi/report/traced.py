@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
-from ..core.files import one_line, write_atomically
+from ..core.files import write_atomically
 from ..core.types import IntArray
-from ..fit.folder import CONFIG, SPLIT, load_rows, versions
+from ..fit.folder import CONFIG, SPLIT, check_new, load_rows, part_folders, stated_config, stored_parts, versions
 from ..fit.trainer import peak_memory_mb
 from ..measure import make_splits, save_split
 from ..parallel import Scheduler, row_parts
@@ -44,8 +44,9 @@ MODEL = "ray-tracing"
 PATHS, CALIBRATION, CONVERGENCE = "paths.npz", "calibration.json", "convergence.json"
 TIMED = 3
 """Single samples that are timed: in a furnished scene with transmission one may take seconds."""
-TRACED_AT_LEAST = 16
-"""Positions of one part at least, for a scheduler: candidates of fewer are made no faster."""
+TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
+"""Positions of one part at least, for a scheduler: candidates of fewer are made no faster. Where rays go out from the
+receivers alone, a part of any size costs as much as a few hundred positions, and the parts for a worker may be two."""
 CALIBRATIONS = {"patterns": CalibrationOptions(materials=False), "all": CalibrationOptions()}
 """What can be fitted beside offsets."""
 
@@ -86,15 +87,9 @@ def read_trace_config(folder: Path) -> TraceConfig:
     Raises:
         InputError: missing, not YAML, or not of a traced run.
     """
-    path = folder / CONFIG
-    try:
-        content = yaml.safe_load(path.read_text())
-        names = ("dataset", "scene", "material", "split", "n_train", "seed", "calibration")
+    names = ("dataset", "scene", "material", "split", "n_train", "seed", "calibration")
+    with stated_config(folder, "trace") as content:
         return TraceConfig(**{name: content[name] for name in names}, options=TraceOptions(**content["options"]))
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no {CONFIG}, so not a run folder; give one made by trace") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not readable ({one_line(error)}); restore it") from None
 
 
 def trace_run(
@@ -129,8 +124,9 @@ def trace_run(
         seed: of the split. The rays have theirs in ``options``.
         calibration: what to fit to the training rows by gradients, beside offsets: ``"patterns"`` of the antennas,
             or ``"all"``, materials too (a step takes fifty times as long). Signal strengths alone.
-        target_error_db: error of received power, dB, for which depth, rays and further kinds of path are chosen by
-            convergence on a sample of the transmitters (`wrf_mi.trace.target`); None: ``options`` as they are.
+        target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
+            further kinds of path are chosen by convergence on a sample of the transmitters (`wrf_mi.trace.target`);
+            None: ``options`` as they are.
             ``convergence.json`` states what was tried.
         kinds: that may then be switched on.
         progress: show a progress bar on standard error.
@@ -144,8 +140,7 @@ def trace_run(
         InputError: data, scene, settings or folder that cannot be used.
     """
     folder = Path(out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not empty; choose another --out")
+    check_new(folder)
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
     splits = make_splits(record, split, seed, n_train)
@@ -158,7 +153,8 @@ def trace_run(
     choice = None
     if target_error_db is not None:
         here = record.tx_pos_m, record.receivers
-        choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds)
+        spectra = tracer.instrument.observe if record.task == "spectrum" else None
+        choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds, spectra)
         # The instrument's own needs are the tracer's business: only what was chosen is taken over.
         chosen = {name: getattr(choice.options, name) for name in ("max_depth", "rays", *CHOSEN_KINDS)}
         config = replace(config, options=replace(config.options, **chosen))
@@ -174,7 +170,7 @@ def trace_run(
     if choice is not None:
         write_atomically(folder / CONVERGENCE, json.dumps(choice.plain(), indent=1) + "\n")
     start = time.perf_counter()
-    for part, rows in _parts(folder, splits):
+    for part, rows in part_folders(folder, splits):
         part.mkdir(exist_ok=True)
         save_split(part / SPLIT, rows)
         if calibration is not None:
@@ -194,7 +190,10 @@ def _trace(
     if scheduler is None:
         return tracer.trace(tx_pos_m, progress)
     rays = tracer.rays(tx_pos_m)
-    parts = row_parts(len(tx_pos_m), scheduler.workers, TRACED_AT_LEAST, TARGETS_AT_ONCE)
+    least = TRACED_AT_LEAST
+    if not tracer.options.sampled:
+        least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
+    parts = row_parts(len(tx_pos_m), scheduler.workers, least, TARGETS_AT_ONCE)
     opener = partial(RayTracer, config.scene, tracer.instrument, replace(tracer.options, rays=rays), config.material)
     given = [(tx_pos_m[part], part.start) for part in parts]
     sizes = [len(positions) for positions, _ in given]
@@ -224,8 +223,7 @@ def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
     traced = load_trace(folder / PATHS)
     tracer = _tracer_of(config, traced, instrument_of(record))
     if split is None:
-        names = [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"))
-        splits = [load_rows(part, record) for part in names]
+        splits = [load_rows(part, record) for part in stored_parts(folder)]
     elif config.calibration is not None:
         raise InputError(f"{folder}: calibrated on the training rows of {config.split}; leave --split away")
     else:
@@ -295,13 +293,6 @@ class TracedRun:
 def _tracer_of(config: TraceConfig, traced: TraceResult, instrument: Instrument) -> RayTracer:
     """The tracer of a run, with the number of rays that the run settled on, not one that new positions would."""
     return RayTracer(config.scene, instrument, replace(config.options, rays=traced.rays), config.material)
-
-
-def _parts(folder: Path, splits: list[Split]) -> list[tuple[Path, Split]]:
-    """Where each split is kept."""
-    if len(splits) == 1:
-        return [(folder, splits[0])]
-    return [(folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
 
 
 def _score(

@@ -83,7 +83,7 @@ def _more(seen: list[Any], footprints: list[Any]) -> list[Any]:
 def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
     """How many Gaussians each pixel of a lane sees."""
     index_type = type(lists.index)
-    j, start, end = index_type(0), strip.tile * n, dr.gather(index_type, lists.length, strip.tile)
+    j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
     seen = _more([index_type(0)] * LANE_ROWS, [dr.zeros(type(table))] * LANE_ROWS)
     while j < end:
         seen = _more(seen, _seen(read(table, dr.gather(index_type, lists.index, start + j), 9), strip))
@@ -137,7 +137,7 @@ def _fill(
         out: evaluated arrays.
     """
     float_type, index_type = type(table), type(lists.index)
-    j, start, end = index_type(0), strip.tile * n, dr.gather(index_type, lists.length, strip.tile)
+    j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
     walk = _Walk(place, [float_type(1)] * LANE_ROWS, [float_type(0)] * LANE_ROWS)
     while j < end:
         i = dr.gather(index_type, lists.index, start + j)

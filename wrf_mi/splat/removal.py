@@ -90,6 +90,7 @@ def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> Any:
         pose: of the receiver.
         plane: its perception plane.
     """
+    gaussians = gaussians.spread()
     footprints = project(gaussians, pose)
     order = depth_order(footprints.depth, gaussians.position)
     batch, n = gaussians.batch, gaussians.count

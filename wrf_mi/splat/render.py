@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -9,6 +10,7 @@ import drjit as dr
 from ..field.gaussians import Gaussians
 from ..project.footprint import Pose, depth_order, project
 from .blend import blend
+from .shared import blend_shared
 from .skip import NOTHING, Skip, behind, negligible
 from .tiles import Plane, build_lists
 
@@ -28,6 +30,14 @@ def splat(gaussians: Gaussians, pose: Pose, plane: Plane, skip: Skip = NOTHING) 
     if not gaussians.count:
         dark = type(gaussians.position[0])
         return dr.zeros(dark, gaussians.batch * plane.pixels), dr.zeros(dark, gaussians.batch * plane.pixels)
+    if gaussians.shared and not skip.error:
+        one = replace(gaussians, batch=1)
+        seen_once = project(one, pose)
+        order = depth_order(seen_once.depth, gaussians.position)
+        lists = build_lists(seen_once, order, plane, 1, skip.boxes)
+        own = (gaussians.opacity, gaussians.attenuation)
+        return blend_shared(seen_once, gaussians.signal, lists, plane, gaussians.batch, *own)
+    gaussians = gaussians.spread()
     footprints = project(gaussians, pose)
     order = depth_order(footprints.depth, gaussians.position)
     parts = (gaussians.opacity, gaussians.attenuation)

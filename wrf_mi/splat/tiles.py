@@ -15,12 +15,16 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ..core import InputError
 from ..core.angles import azimuth_rad, elevation_rad
 from ..project.footprint import Footprints
 
 LANE_ROWS = 5
 TILE_ROWS, TILE_COLUMNS = 2 * LANE_ROWS, 8
 LANES = TILE_ROWS * TILE_COLUMNS // LANE_ROWS
+
+RESERVED = 1 << 21
+"""Entries of lists for which there is room without counting, 8 MB: to count fewer takes longer than to list them."""
 
 
 @dataclass
@@ -99,12 +103,18 @@ class TileLists:
     """For each (transmitter, tile) the Gaussians that may reach it, from near to far.
 
     Attributes:
-        index: columns ``b * n + i`` of the Gaussians, [batch * tiles * n]; a list starts at ``n`` times its number.
+        index: columns ``b * n + i`` of the Gaussians, all lists behind each other.
         length: number of entries of each list, [batch * tiles].
+        start: where each list begins, [batch * tiles]; None: list k begins at ``k * n``.
     """
 
     index: dr.ArrayBase
     length: dr.ArrayBase
+    start: dr.ArrayBase | None = None
+
+    def begin(self, number: dr.ArrayBase, n: int) -> dr.ArrayBase:
+        """Where lists of these numbers begin, with ``n`` Gaussians of each transmitter."""
+        return number * n if self.start is None else dr.gather(type(number), self.start, number)
 
 
 def _boxes(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBase, ...]:
@@ -132,11 +142,13 @@ def _whole_plane(footprints: Footprints, height: int, width: int) -> tuple[dr.Ar
     return dr.select(footprints.visible, whole, height + TILE_ROWS), whole + height, whole, whole + width
 
 
-@dr.syntax
 def build_lists(
     footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch: int, by_box: bool = True
 ) -> TileLists:
     """List the Gaussians of each tile in depth order.
+
+    Where room for every Gaussian in every tile takes more than `RESERVED` entries, entries are counted first, and there
+    is room for what is found alone. A function that Dr.Jit records cannot count: there, it is room for all.
 
     Args:
         footprints: of ``batch * n`` columns.
@@ -144,34 +156,123 @@ def build_lists(
         plane: the perception plane.
         batch: number of transmitters.
         by_box: list what may reach the tile alone. False lists all that can be seen: slower, the same image.
+
+    Raises:
+        InputError: more entries than 32 bits count.
     """
-    index_type, float_type = type(order), type(footprints.radius)
-    n, tiles = dr.width(order), plane.tiles
+    index_type: Any = type(order)
+    float_type: Any = type(footprints.radius)
+    n = dr.width(order)
     boxes = (_boxes if by_box else _whole_plane)(footprints, plane.height, plane.width)
     # Every tile reads all boxes from near to far: in that order in memory, a million of them come from the cache.
     entry = dr.arange(index_type, batch * n)
     at = dr.gather(index_type, order, entry % n) + (entry // n) * n
     boxes = tuple(dr.gather(float_type, box, at) for box in boxes)
     dr.eval(boxes, order)
+    entries = batch * plane.tiles * n
+    if entries > RESERVED and not dr.flag(dr.JitFlag.FreezingScope):
+        return _counted(boxes, at, plane, batch)
+    index = dr.empty(index_type, _checked(entries))
+    length = _all_of(boxes, order, plane, batch, index)
+    dr.eval(index, length)
+    return TileLists(index, length)
+
+
+def _checked(entries: int) -> int:
+    if entries >= 2**32:
+        what = f"{entries} entries in the lists of tiles, where 32 bits count"
+        raise InputError(f"splatting: {what}; use fewer Gaussians, or fewer transmitters at once")
+    return entries
+
+
+def _beside(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase, width: dr.ArrayBase) -> Any:
+    """Whether a tile that begins at a column meets columns from ``first`` on, going right around the circle."""
+    ahead = column - first
+    ahead -= width * dr.floor(ahead / width)
+    return (ahead <= span) | (ahead + (TILE_COLUMNS - 1) >= width)
+
+
+@dr.syntax
+def _all_of(
+    boxes: tuple[dr.ArrayBase, ...], order: dr.ArrayBase, plane: Plane, batch: int, index: dr.ArrayBase
+) -> dr.ArrayBase:
+    """Length of each tile's list, [batch * tiles], after a look at all boxes; list k begins at ``k * n``."""
     first_row, last_row, first_column, span = boxes
+    index_type, float_type = type(order), type(span)
+    n, tiles = dr.width(order), plane.tiles
     slot = dr.arange(index_type, batch * tiles)
     tile, column0 = slot % tiles, (slot // tiles) * n
     row = dr.gather(float_type, plane.tile_row, tile)
     column = dr.gather(float_type, plane.tile_column, tile)
     width, start = float_type(plane.width), slot * n
-    index = dr.empty(index_type, batch * tiles * n)
     length, k = dr.zeros(index_type, batch * tiles), index_type(0)
     while k < n:
         i = column0 + k
         hit = (dr.gather(float_type, first_row, i) <= row + (TILE_ROWS - 1)) & (
             dr.gather(float_type, last_row, i) >= row
         )
-        # Columns from the box's start to the tile's, going right around the circle.
-        ahead = column - dr.gather(float_type, first_column, i)
-        ahead -= width * dr.floor(ahead / width)
-        hit &= (ahead <= dr.gather(float_type, span, i)) | (ahead + (TILE_COLUMNS - 1) >= width)
+        hit &= _beside(column, dr.gather(float_type, first_column, i), dr.gather(float_type, span, i), width)
         dr.scatter(index, column0 + dr.gather(index_type, order, k, hit), start + length, hit)
         length = dr.select(hit, length + 1, length)
         k += 1
+    return length
+
+
+def _counted(boxes: tuple[Any, ...], at: Any, plane: Plane, batch: int) -> TileLists:
+    """Lists with as much room as they need: of each row of tiles first, then of its tiles, counted and filled.
+
+    Args:
+        boxes: of all columns, each transmitter's from near to far.
+        at: column ``b * n + i`` of each, [batch * n].
+        plane: the perception plane.
+        batch: number of transmitters.
+    """
+    index_type: Any = type(at)
+    n = dr.width(at) // batch
+    rows, row_of = np.unique(plane.tile_row.numpy(), return_inverse=True)
+    parts, starts, total = [], [], 0
+    for row in rows:
+        hit = (boxes[0] <= float(row) + (TILE_ROWS - 1)) & (boxes[1] >= float(row))
+        parts.append(dr.compress(hit))
+        each = dr.block_sum(dr.select(hit, index_type(1), 0), n).numpy().astype(np.int64)
+        starts.append(total + np.cumsum([0, *each]))
+        total = int(starts[-1][-1])
+    members = dr.concat([index_type(p) for p in parts]) if _checked(total) else dr.zeros(index_type, 1)
+    begin = np.array([s[:-1] for s in starts]).T[:, row_of].ravel()
+    end = np.array([s[1:] for s in starts]).T[:, row_of].ravel()
+    walk = members, index_type(begin.astype(np.uint32)), index_type(end.astype(np.uint32))
+    dr.eval(walk)
+    length = _of_rows(boxes, at, plane, walk, None, None)
+    dr.eval(length)
+    counts = length.numpy().astype(np.int64)
+    start = index_type((np.cumsum(counts) - counts).astype(np.uint32))
+    index = dr.empty(index_type, max(_checked(int(counts.sum())), 1))
+    length = _of_rows(boxes, at, plane, walk, index, start)
     dr.eval(index, length)
-    return TileLists(index, length)
+    return TileLists(index, length, start)
+
+
+@dr.syntax
+def _of_rows(
+    boxes: tuple[dr.ArrayBase, ...],
+    at: dr.ArrayBase,
+    plane: Plane,
+    walk: tuple[dr.ArrayBase, ...],
+    index: dr.ArrayBase | None,
+    start: dr.ArrayBase | None,
+) -> dr.ArrayBase:
+    """Length of each tile's list, [batch * tiles], after a look at those of its row; with ``index`` the lists too."""
+    members, begin, end = walk
+    index_type, float_type = type(at), type(boxes[0])
+    slot = dr.arange(index_type, dr.width(begin))
+    column = dr.gather(float_type, plane.tile_column, slot % plane.tiles)
+    width = float_type(plane.width)
+    length, k, last = dr.zeros(index_type, dr.width(begin)), index_type(begin), index_type(end)
+    while k < last:
+        i = dr.gather(index_type, members, k)
+        hit = _beside(column, dr.gather(float_type, boxes[2], i), dr.gather(float_type, boxes[3], i), width)
+        if dr.hint(index is not None, mode="scalar"):
+            dr.scatter(index, dr.gather(index_type, at, i, hit), start + length, hit)
+        length = dr.select(hit, length + 1, length)
+        k += 1
+    return length

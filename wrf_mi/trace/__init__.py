@@ -16,6 +16,7 @@ from .result import TraceResult, load_trace, recompute, save_trace
 from .scenes import open_scene
 from .solve import trace_paths
 from .spectra import trace_spectra
+from .walked import PLACES, PREFIX, walked_channels
 
 __all__ = [
     "TraceOptions",
@@ -30,13 +31,15 @@ __all__ = [
     "trace_paths",
     "trace_spectra",
     "traced_room",
+    "walked_channels",
 ]
 
 
 def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     """Read any data set as `wrf_mi.measure.load` does, and trace what is made on this machine where it is asked for.
 
-    These are the embedded ``laboratory`` (some seconds) and ``traced-room`` (some minutes).
+    These are the embedded ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
+    ``traced-csi-office`` (a minute or two each).
 
     Args:
         name_or_folder: a folder, or a known data set's name.
@@ -50,4 +53,7 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
             return laboratory_record(progress=progress)
         if name_or_folder == ROOM:
             return traced_room(progress=progress)[0]
+        place = str(name_or_folder).removeprefix(PREFIX)
+        if place in PLACES and place != str(name_or_folder):
+            return walked_channels(place, progress=progress)
     return load(name_or_folder)

@@ -6,8 +6,10 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from trimesh.triangles import closest_point
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -93,8 +95,8 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
     return number
 
 
-def _near(surfaces: Surfaces, points: FloatArray) -> FloatArray:
-    """Which points have a plane's bounds within `NEAREST_M`."""
+def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
+    """Which points have a surface within `NEAREST_M`."""
     close = np.zeros(len(points), bool)
     step = max(1, PAIRS_AT_ONCE // max(len(surfaces.normal), 1))
     for start in range(0, len(points), step):
@@ -102,5 +104,19 @@ def _near(surfaces: Surfaces, points: FloatArray) -> FloatArray:
         point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < NEAREST_M)
         along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
         within = ((along > surfaces.low[plane] - NEAREST_M) & (along < surfaces.high[plane] + NEAREST_M)).all(axis=1)
-        close[start + point[within]] = True
+        for one in np.unique(plane[within]):
+            candidates = start + point[within & (plane == one)]
+            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == one], points[candidates])
     return close
+
+
+def _touches(triangles: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
+    """Which points have one of these triangles within `NEAREST_M`: a plane's bounds hold its doorways too."""
+    nearest = np.full(len(points), np.inf)
+    step = max(1, PAIRS_AT_ONCE // len(triangles))
+    for start in range(0, len(points), step):
+        part = np.repeat(points[start : start + step], len(triangles), axis=0)
+        every = np.tile(triangles, (len(part) // len(triangles), 1, 1))
+        away = np.linalg.norm(closest_point(every, part) - part, axis=1)
+        nearest[start : start + step] = away.reshape(-1, len(triangles)).min(axis=1)
+    return nearest < NEAREST_M

@@ -27,7 +27,6 @@ import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
-from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 from wrf_mi_scenes.build_laboratory import LENGTH, WIDTH
 from wrf_mi_scenes.furnished import furnished_parts, measured_parts, write_scene
@@ -38,6 +37,7 @@ from ..core.arrays import planar_array
 from ..measure import read_spectrum_folder, user_cache, write_spectrum_folder
 from ..receive.array import bartlett_spectrum, minmax_scale
 from ..scene.scan import simulate_scan
+from .array_channels import array_channels
 from .devices import solids, winding_number
 from .laboratory import FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SCANNED_RAYS, SCANNER_M, SPACING_M
 from .options import TraceOptions
@@ -52,10 +52,8 @@ MEASURED = "room"
 """Folder beside the spectra with the measured room's scene: what a model is given."""
 FORMAT = 1
 """To be raised when the same recipe would give other files."""
-SPECULAR_OR_THROUGH = (0, 1, 4)
-"""Kinds of interaction (`wrf_mi.core.Paths`) that leave a spherical wave spherical."""
 SCATTERING, DIFFRACTION = 2, 8
-"""The others."""
+"""Kinds of interaction (`wrf_mi.core.Paths`) from which a spherical wave goes out anew."""
 
 
 @dataclass(frozen=True)
@@ -157,40 +155,8 @@ def transmitters(scene: Any, room: TracedRoom) -> FloatArray:
 
 
 def array_signals(paths: Paths, receiver: Receiver, array_m: FloatArray, frequency_hz: float) -> NDArray[np.complex128]:
-    """Element signals of paths that were traced from an array (as transmitter) to transmitters (as receivers).
-
-    A path reaches the array as a spherical wave from the place of its last scattering or diffraction, mirrored by what
-    reflects it after that; without any, from the transmitter's image. At an edge the wave has another curvature along
-    the edge, which is left out.
-
-    Args:
-        paths: from the array's origin, "transmitter" 0, to n transmitters as "receivers", with gains of antennas that
-            are polarised along the world's z axis.
-        receiver: the array's pose.
-        array_m: its elements [m, 3], metres.
-        frequency_hz: of the carrier.
-
-    Returns:
-        Complex signals [n, m].
-    """
-    wavenumber = 2 * np.pi * frequency_hz / speed_of_light
-    count, depth = paths.interactions.shape
-    here = np.broadcast_to(receiver.position_m, (count, 3))
-    radius, open_ = np.zeros(count), np.ones(count, bool)
-    for level in range(depth):
-        kind, there = paths.interactions[:, level], paths.vertices_m[:, level]
-        open_ &= kind != 0
-        radius[open_] += np.linalg.norm(there - here, axis=1)[open_]
-        here = np.where(open_[:, None], there, here)
-        open_ &= np.isin(kind, SPECULAR_OR_THROUGH)
-    point = (~np.isin(paths.interactions, SPECULAR_OR_THROUGH)).any(axis=1)
-    radius = np.where(point, radius, paths.length_m)
-    signals = np.zeros((paths.n_rx, len(array_m)), complex)
-    elements = array_m @ receiver.to_world.T
-    distance = np.linalg.norm((paths.departure * radius[:, None])[:, None, :] - elements, axis=-1)
-    waves = np.exp(-1j * wavenumber * (paths.length_m - radius)[:, None] - 1j * wavenumber * distance)
-    np.add.at(signals, paths.rx, waves * (paths.gain * radius)[:, None] / distance)
-    return signals
+    """Element signals [n, m] at one frequency of paths from an array to n transmitters; see `array_channels`."""
+    return array_channels(paths, receiver, array_m, frequency_hz)[..., 0]
 
 
 def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:

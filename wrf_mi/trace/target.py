@@ -9,21 +9,24 @@ On a sample of the transmitters, settings grow one after the other and the chang
 3. *diffraction*, then *scattering*: on where they change power by more than the share, and then rays again.
 
 The change is the largest over all sampled pairs, in dB; a pair that has no path on one side only counts as
-infinite. The shares are equal and their sum is the target, so that parts that each stay within their share leave the
-sum within the target. What this does not see: places that are not in the sample, and errors of materials and mesh.
+infinite. Where an array reports spectra, waves interfere and power alone does not tell: there the change is that of
+power or that of the reported spectrum, whichever is larger. A spectrum that changes by a share e of itself (relative L2
+norm of the difference) counts as 20 log10(1 + e) dB: that of a magnitude which is larger by this share. The shares are
+equal and their sum is the target, so that parts that each stay within their share leave the sum within the target. What
+this does not see: places that are not in the sample, and errors of materials and mesh.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver
+from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..receive import rssi_dbm
@@ -31,6 +34,9 @@ from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
 from .solve import FIRST_RAYS, Prepared, trace_paths
 
 logger = logging.getLogger(__name__)
+
+Spectra = Callable[[Paths], NDArray[Any]]
+"""What an instrument reports of paths."""
 
 SAMPLE = 24
 """Transmitters on which convergence is judged."""
@@ -53,14 +59,16 @@ class Trial:
     Attributes:
         part: depth, rays, diffraction or scattering.
         value: of the setting that was tried.
-        change_db: largest change in received power against the setting before; None for the first.
+        change_db: largest change against the setting before, of received power or of a spectrum; None for the first.
         kept: whether the setting was taken.
+        spectrum: largest change of a reported spectrum, relative L2; None for the first, and where none are reported.
     """
 
     part: str
     value: int | bool
     change_db: float | None
     kept: bool
+    spectrum: float | None = None
 
 
 @dataclass(frozen=True)
@@ -70,14 +78,21 @@ class Choice:
     Attributes:
         options: that were chosen.
         target_db: error that was asked for.
-        error_db: estimated error of received power: what is left of each part, added.
+        error_db: estimated error of what is judged by: what is left of each part, added.
         trials: all that was tried, in order.
+        judged_by: power, or power and spectrum.
     """
 
     options: TraceOptions
     target_db: float
     error_db: float
     trials: tuple[Trial, ...]
+    judged_by: tuple[str, ...] = ("power",)
+
+    @property
+    def spectrum_error(self) -> float | None:
+        """The estimated error as a share of a spectrum, relative L2; None where none are reported."""
+        return float(10 ** (self.error_db / 20) - 1) if "spectrum" in self.judged_by else None
 
     @property
     def reached(self) -> bool:
@@ -94,7 +109,7 @@ class Choice:
                 return [finite(one) for one in value]
             return "infinite" if isinstance(value, float) and np.isinf(value) else value
 
-        return finite(asdict(self))
+        return finite(asdict(self) | {"spectrum_error": self.spectrum_error})
 
 
 def remainder(changes: Sequence[float]) -> float:
@@ -108,36 +123,61 @@ def remainder(changes: Sequence[float]) -> float:
     return float(last * q / (1 - q)) if q <= STEEPEST else float("inf")
 
 
-class _Sampled:
-    """Received power of sampled transmitters under several settings."""
+@dataclass(frozen=True)
+class _Change:
+    """Between two settings: the larger of both in dB, and that of spectra as it is, where there are any."""
 
-    def __init__(self, scene: Any, positions: FloatArray, receivers: Sequence[Receiver]) -> None:
-        self.scene, self.receivers = scene, receivers
+    db: float
+    spectrum: float | None
+
+
+class _Sampled:
+    """Received power, and spectra, of sampled transmitters under several settings."""
+
+    def __init__(
+        self, scene: Any, positions: FloatArray, receivers: Sequence[Receiver], spectra: Spectra | None = None
+    ) -> None:
+        self.scene, self.receivers, self._spectra = scene, receivers, spectra
         self._prepared = Prepared(scene)
-        self._known: dict[TraceOptions, FloatArray] = {}
+        self._known: dict[TraceOptions, tuple[FloatArray, FloatArray | None]] = {}
         rows = np.unique(np.linspace(0, len(positions) - 1, min(SAMPLE, len(positions))).round().astype(int))
         self.positions = positions[rows]
 
-    def power(self, options: TraceOptions) -> FloatArray:
-        """Received power [n_rx, n] in dBm, NaN where no path arrives."""
+    def seen(self, options: TraceOptions) -> tuple[FloatArray, FloatArray | None]:
+        """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
         if options not in self._known:
             here = self.positions[self._few()] if options.sampled else self.positions
-            found = trace_paths(self.scene, here, self.receivers, options, prepared=self._prepared)
-            self._known[options] = np.asarray(rssi_dbm(found.paths), float)
+            paths = trace_paths(self.scene, here, self.receivers, options, prepared=self._prepared).paths
+            images = None if self._spectra is None else np.asarray(self._spectra(paths))
+            self._known[options] = np.asarray(rssi_dbm(paths), float), images
         return self._known[options]
 
     def _few(self) -> IntArray:
         last = len(self.positions) - 1
         return np.unique(np.linspace(0, last, min(SAMPLED_KINDS, last + 1)).round().astype(int))
 
-    def change(self, options: TraceOptions, other: TraceOptions) -> float:
-        """Largest change in received power, dB, between two settings, on the positions of the smaller sample."""
-        a, b = self.power(options), self.power(other)
+    def change(self, options: TraceOptions, other: TraceOptions) -> _Change:
+        """Largest change between two settings, on the positions of the smaller sample."""
+        one, two = self.seen(options), self.seen(other)
         if options.sampled != other.sampled:
-            a, b = (p if o.sampled else p[:, self._few()] for p, o in ((a, options), (b, other)))
+            few = self._few()
+            one, two = (
+                s if o.sampled else (s[0][:, few], None if s[1] is None else s[1][:, few])
+                for s, o in ((one, options), (two, other))
+            )
+        (a, before), (b, after) = one, two
+        spectrum = None if before is None or after is None else _relative(before, after)
         if (np.isnan(a) != np.isnan(b)).any():
-            return float("inf")
-        return float(np.nanmax(np.abs(a - b), initial=0.0))
+            return _Change(float("inf"), spectrum)
+        power = float(np.nanmax(np.abs(a - b), initial=0.0))
+        return _Change(max(power, float(20 * np.log10(1 + (spectrum or 0.0)))), spectrum)
+
+
+def _relative(a: FloatArray, b: FloatArray) -> float:
+    """Largest relative L2 difference of images [..., height, width]; 0 of two that are dark, infinite of one."""
+    difference, size = (np.sqrt(np.square(x, dtype=float).sum(axis=(-2, -1))) for x in (a - b, b))
+    share = np.divide(difference, size, out=np.where(difference > 0, np.inf, 0.0), where=size > 0)
+    return float(share.max(initial=0.0))
 
 
 def choose_options(
@@ -147,16 +187,19 @@ def choose_options(
     target_db: float,
     options: TraceOptions,
     kinds: Sequence[str] = CHOSEN_KINDS,
+    spectra: Spectra | None = None,
 ) -> Choice:
-    """Depth, rays and kinds of path for a stated error of received power.
+    """Depth, rays and kinds of path for a stated error of received power, and of spectra where they are reported.
 
     Args:
         scene: from `wrf_mi.trace.open_scene`.
         tx_pos_m: transmitter positions [n, 3], metres; a sample of them is traced.
         receivers: one or several.
-        target_db: error of received power to reach, dB.
+        target_db: error to reach, dB.
         options: what stays as it is: kinds that are on, seed, antennas. Depth and rays are chosen.
         kinds: that may be switched on, of `CHOSEN_KINDS`.
+        spectra: what is reported of paths, [n_rx, n, height, width], as `wrf_mi.trace.tracer.Instrument.observe` does;
+            None: power alone is judged by.
 
     Returns:
         The choice. Where the estimate stays above the target (a warning says so), the largest settings are taken.
@@ -167,7 +210,7 @@ def choose_options(
     if not (np.isfinite(target_db) and target_db > 0):
         raise InputError(f"target-error {target_db}: give a number of dB above 0")
     everyone = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
-    sample = _Sampled(scene, np.atleast_2d(np.asarray(tx_pos_m, float)), everyone)
+    sample = _Sampled(scene, np.atleast_2d(np.asarray(tx_pos_m, float)), everyone, spectra)
     share, trials = target_db / PARTS, list[Trial]()
     now, left = _depth(sample, replace(options, diffraction=False, scattering=False), share, trials)
     now, more = _rays(sample, now, share, trials)
@@ -177,18 +220,20 @@ def choose_options(
         if kind not in kinds or getattr(options, kind):
             continue
         change = sample.change(now, replace(now, **{kind: True}))
-        trials.append(Trial(kind, True, change, change > share))
-        if change > share:
+        trials.append(Trial(kind, True, change.db, change.db > share, change.spectrum))
+        if change.db > share:
             now = replace(now, **{kind: True})
         else:
-            left += change
+            left += change.db
     if now.sampled:
         # Paths that are drawn at random, or along edges, need rays of their own.
         now, more = _rays(sample, now, share, trials, MOST_SAMPLED_RAYS)
         left += more
-    choice = Choice(now, target_db, left, tuple(trials))
+    judged = ("power",) if spectra is None else ("power", "spectrum")
+    choice = Choice(now, target_db, left, tuple(trials), judged)
     if not choice.reached:
-        logger.warning("received power is converged to %.2g dB, not to the %.2g dB asked for", left, target_db)
+        what = "received power is" if spectra is None else "power and spectra are"
+        logger.warning("%s converged to %.2g dB, not to the %.2g dB asked for", what, left, target_db)
     return choice
 
 
@@ -197,8 +242,9 @@ def _depth(sample: _Sampled, options: TraceOptions, share: float, trials: list[T
     trials.append(Trial("depth", 1, None, True))
     while now.max_depth < MAX_DEPTH:
         deeper = replace(now, max_depth=now.max_depth + 1)
-        changes.append(sample.change(now, deeper))
-        trials.append(Trial("depth", deeper.max_depth, changes[-1], True))
+        change = sample.change(now, deeper)
+        changes.append(change.db)
+        trials.append(Trial("depth", deeper.max_depth, change.db, True, change.spectrum))
         now = deeper
         if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:
             break
@@ -213,8 +259,9 @@ def _rays(
     while calm < 2 and now.rays < most:
         twice = 2 * now.rays
         more = replace(now, rays=twice)
-        change = sample.change(now, more)
-        trials.append(Trial("rays", twice, change, True))
+        found = sample.change(now, more)
+        change = found.db
+        trials.append(Trial("rays", twice, change, True, found.spectrum))
         calm = calm + 1 if change <= share else 0
         now = more
         assert isinstance(now.rays, int)

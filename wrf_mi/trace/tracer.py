@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
-from ..receive import bartlett_spectrum, csi, element_signals, minmax_scale, rssi_dbm
+from ..receive import antenna_csi, bartlett_spectrum, csi, element_signals, minmax_scale, rssi_dbm
 from .options import DEFAULTS, TraceOptions
 from .result import TraceResult, device_ends
 from .scenes import open_scene
@@ -26,7 +26,8 @@ class Instrument:
         task: see `wrf_mi.core.Record`.
         receivers: that measure.
         frequencies_hz: of the carrier [1] or the subcarriers [k].
-        array_m: elements of the array behind a spectrum [m, 3], receiver's frame, metres; None otherwise.
+        array_m: elements of the array behind a spectrum, or antennas of a receiver of channel coefficients, [m, 3],
+            receiver's frame, metres; None for receivers with one antenna.
         size: height and width of a spectrum; None otherwise.
     """
 
@@ -46,10 +47,12 @@ class Instrument:
 
         Spectra are Bartlett spectra of the array, each scaled to its own minimum and maximum as the instrument does.
         Signal strengths add the powers of the paths (dBm for 0 dBm sent, NaN where no path arrives). Channel
-        coefficients add the paths' fields.
+        coefficients add the paths' fields, at each antenna where there are several.
         """
         if self.task == "rssi":
             return rssi_dbm(paths)
+        if self.task == "csi" and self.array_m is not None:
+            return antenna_csi(paths, self.receivers, self.array_m, self.frequencies_hz)
         if self.task == "csi":
             return csi(paths, self.frequencies_hz)
         assert self.array_m is not None
@@ -66,12 +69,21 @@ def instrument_of(record: Record) -> Instrument:
     """The instrument behind a record.
 
     Raises:
-        InputError: the data do not tell the carrier frequency or, for spectra, the array.
+        InputError: the data do not tell positions, the carrier frequency or, for spectra and several antennas, the
+            array.
     """
+    places = [record.tx_pos_m, *(receiver.position_m for receiver in record.receivers)]
+    if not all(np.isfinite(place).all() for place in places):
+        raise InputError(f"{record.name}: positions unknown, so there is nothing to trace between; use another method")
     if record.frequencies_hz is None:
-        raise InputError(f"{record.name}: carrier frequency unknown; state frequency_hz in its gateway_info.yml")
-    if record.task != "spectrum":
+        stated = (
+            "frequencies_hz in base-station.yml" if record.task == "csi" else "frequency_hz in its gateway_info.yml"
+        )
+        raise InputError(f"{record.name}: carrier frequency unknown; state {stated}")
+    if record.task == "rssi" or (record.task == "csi" and record.observation.ndim == 3):
         return Instrument(record.task, record.receivers, record.frequencies_hz)
+    if record.task == "csi" and record.array_m is not None:
+        return Instrument(record.task, record.receivers, record.frequencies_hz, record.array_m)
     if record.array_m is None:
         raise InputError(f"{record.name}: antenna array unknown; state array in its gateway_info.yml")
     height, width = record.observation.shape[-2:]

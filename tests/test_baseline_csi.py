@@ -1,0 +1,285 @@
+"""R2F2, OptML and FIRE: exact where theory says so, better than no method elsewhere, clear about bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+
+from wrf_mi.backend import init
+
+init()
+
+from wrf_mi.baselines import fire, optml, r2f2  # noqa: E402
+from wrf_mi.baselines.csi_bands import Bands, bands_of  # noqa: E402
+from wrf_mi.baselines.fire import FireSettings  # noqa: E402
+from wrf_mi.baselines.method import Inputs, inputs_of  # noqa: E402
+from wrf_mi.baselines.optml import OptMLSettings  # noqa: E402
+from wrf_mi.baselines.path_network import Simulation  # noqa: E402
+from wrf_mi.baselines.r2f2 import R2F2Settings  # noqa: E402
+from wrf_mi.baselines.training import Training  # noqa: E402
+from wrf_mi.baselines.uplink_paths import find_paths  # noqa: E402
+from wrf_mi.baselines.uplink_waves import waves_of  # noqa: E402
+from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
+from wrf_mi.core.arrays import planar_array  # noqa: E402
+from wrf_mi.report.metrics import cea_db  # noqa: E402
+
+CARRIER_HZ, SPACING_HZ, HALF = 2.4e9, 312.5e3, 26
+OFFSETS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)]) * SPACING_HZ
+"""The 52 used subcarriers of 802.11 at 20 MHz, without the carrier."""
+HZ = CARRIER_HZ + OFFSETS
+EXACT_DB = 60.0
+"""Coefficients are stored as complex64, whose 140 dB the step to the next band and single antennas in a fade may cost
+some; a wrong path, or one of them missing, gives less than 30."""
+METHODS = {"fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
+SMALL = {
+    "fire": FireSettings(Training(steps=40, batch=32, rounds=2), sample="antenna", width=16, latent=4),
+    "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
+    "optml": OptMLSettings(
+        training=Training(steps=4, batch=4, rounds=1),
+        simulation=Simulation(channels=12, paths=2),
+        width=4,
+        rounds=1,
+        wavefront="plane",
+        max_distance_m=30.0,
+    ),
+}
+
+
+def channels(gains, theta, elements, spherical):
+    """Coefficients [n, antennas, 52] of paths: gains [n, k], distances and cosines [n, k, 3]."""
+    d, along = theta[..., :1], theta[..., 1:] @ elements[:, :2].T
+    s = np.sqrt(d * d - 2 * d * along + np.square(elements).sum(axis=1)) if spherical else d - along
+    amplitude = d / s if spherical else np.ones_like(s)
+    return np.einsum("nk,nka,nkaf->naf", gains, amplitude, np.exp(-2j * np.pi / speed_of_light * s[..., None] * HZ))
+
+
+def record_of(h, elements=None, known=True):
+    """A record of coefficients [n, antennas, 52]."""
+    receiver = Receiver("bs", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    return Record(
+        "made",
+        "csi",
+        np.full((len(h), 3), np.nan),
+        (receiver,),
+        h[None, :, :, HALF:].astype(np.complex64),
+        frequencies_hz=HZ[HALF:] if known else None,
+        uplink_hz=HZ[:HALF] if known else None,
+        uplink=h[:, :, :HALF].astype(np.complex64),
+        array_m=elements,
+    )
+
+
+def split_of(n, test=0):
+    """First rows train, the next fifth validates, the last ``test`` test."""
+    rows = np.arange(n)
+    cut = (n - test) - (n - test) // 5
+    return Split("made", 0, rows[:cut], rows[cut : n - test], rows[n - test :])
+
+
+def noisy(h, snr_db, rng):
+    """With white noise so far below each row's mean power."""
+    deviation = np.sqrt(np.square(np.abs(h)).mean(axis=(1, 2), keepdims=True) * 10 ** (-snr_db / 10) / 2)
+    return h + deviation * (rng.standard_normal((*h.shape, 2)) @ np.array([1, 1j]))
+
+
+def sparse(n, paths, rng, near=10.0, far=60.0):
+    """Gains and parameters of paths whose directions lie in different quarters of the sky."""
+    centres = np.array([[-0.5, -0.4], [0.5, -0.4], [-0.5, 0.4], [0.5, 0.4]])[:paths]
+    cosines = centres + rng.uniform(-0.15, 0.15, (n, paths, 2))
+    theta = np.concatenate([rng.uniform(near, far, (n, paths, 1)), cosines], axis=2)
+    return rng.uniform(0.4, 1, (n, paths)) * np.exp(2j * np.pi * rng.random((n, paths))), theta
+
+
+@pytest.fixture(scope="module")
+def elements():
+    return planar_array(6, 8, speed_of_light / CARRIER_HZ / 2)
+
+
+@pytest.fixture(scope="module")
+def walk(elements):
+    """80 rows of a user who walks past six image sources, noise-free, and the record at 25 dB."""
+    rng = np.random.default_rng(0)
+    gains, theta = sparse(1, 4, rng, 3.0, 25.0)
+    along = np.linspace(0, 1, 80)[:, None]
+    moved = np.repeat(theta, 80, axis=0)
+    moved[..., 0] += along * rng.uniform(-1.5, 1.5, 4)
+    moved[..., 1:] += along[..., None] * rng.uniform(-0.2, 0.2, (4, 2))
+    truth = channels(np.repeat(gains, 80, axis=0), moved, elements, spherical=True)
+    return truth, record_of(noisy(truth, 25, rng), elements)
+
+
+@pytest.mark.parametrize("wavefront", ["plane", "spherical"])
+def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
+    rng = np.random.default_rng(1)
+    h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
+    record = record_of(h, elements)
+    fitted = r2f2.METHOD.fit(
+        record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, lambda what, share: None
+    )
+    assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0), h[:, :, HALF:])
+    assert cea.min() > EXACT_DB
+
+
+def test_r2f2_without_elements_is_exact_where_delays_are_apart():
+    rng = np.random.default_rng(2)
+    delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
+    gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
+    h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
+    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, lambda what, share: None)
+    record = record_of(h)
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0), h[:, :, HALF:])
+    assert fitted.kind == "free"
+    assert cea.min() > EXACT_DB
+
+
+def test_r2f2_finds_which_subcarriers_are_left_out():
+    rng = np.random.default_rng(3)
+    gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
+    waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
+    record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
+    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, lambda what, share: None)
+    assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
+
+
+def test_noise_ends_the_search(elements):
+    rng = np.random.default_rng(4)
+    h = channels(*sparse(8, 3, rng), elements, spherical=False)
+    record = record_of(noisy(h, 25, rng), elements)
+    bands = bands_of(record, SPACING_HZ)
+    waves = waves_of("plane", bands, 100.0)
+    paths = find_paths(waves, record.uplink.astype(complex), 10, 2, 10)
+    assert (paths.present.sum(axis=1) == 3).all(), "no path is missed, none fits noise"
+    cea = cea_db(waves.evaluate(paths.theta, paths.gains, bands.downlink_hz), h[:, :, HALF:])
+    # 15 real numbers from 1,248 noisy coefficients: noise falls by 22 dB, of which the next band costs about 10.
+    assert np.median(cea) > 30
+
+
+@pytest.mark.parametrize("kind", ["plane", "spherical", "free"])
+def test_step_of_least_squares_goes_down_the_gradient(kind, elements):
+    """Variable projection: the slope of the residual's energy with the gains at their best, by finite differences."""
+    rng = np.random.default_rng(5)
+    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), elements[:, :2], True)
+    waves = waves_of(kind, bands, 100.0)
+    h = rng.standard_normal((2, len(elements), HALF, 2)) @ np.array([1, 1j])
+    theta = np.concatenate([rng.uniform(2, 20, (2, 3, 1)), rng.uniform(-0.5, 0.5, (2, 3, 2))], axis=2)
+    theta = theta[..., :1] if kind == "free" else theta
+    present = np.array([[True, True, True], [True, False, True]])
+    right = waves.normal(theta, waves.solve(theta, present, h))[1]
+    step, numbers = 1e-5, theta.shape[1] * theta.shape[2]
+    for number in range(numbers):
+        moved = np.zeros(numbers)
+        moved[number] = step
+        up, down = (waves.solve(theta + s * moved.reshape(theta.shape[1:]), present, h).energy for s in (1, -1))
+        # Curvatures of up to 1e6 times the step, squared, and rounding of energies of 2,500.
+        np.testing.assert_allclose(-2 * right[:, number], (up - down) / (2 * step), rtol=1e-4, atol=1e-2)
+
+
+def test_fire_beats_copying_the_uplink(walk):
+    truth, record = walk
+    split = split_of(80, 16)
+    settings = FireSettings(Training(steps=300, batch=128, rate=2e-3, rounds=3), sample="antenna", width=64, latent=16)
+    fitted = fire.METHOD.fit(record, split, settings, 0, lambda what, share: None)
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
+
+
+def test_optml_starts_close_enough_with_few_steps(elements):
+    rng = np.random.default_rng(6)
+    h = channels(*sparse(20, 3, rng), elements, spherical=False)
+    record, split = record_of(noisy(h, 25, rng), elements), split_of(20, 8)
+    settings = OptMLSettings(
+        training=Training(steps=100, batch=8, rate=5e-3, rounds=1),
+        simulation=Simulation(channels=150, paths=4),
+        width=16,
+        wavefront="plane",
+        rounds=2,
+        max_distance_m=60.0,
+    )
+    fitted = optml.METHOD.fit(record, split, settings, 0, lambda what, share: None)
+    cea = cea_db(fitted.predict(inputs_of(record, split.test), 0), h[split.test][:, :, HALF:])
+    assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_loaded_predicts_the_same(name, walk, tmp_path):
+    _, record = walk
+    split = split_of(80, 16)
+    fitted = METHODS[name].fit(record, split, SMALL[name], 0, lambda what, share: None)
+    arrays = fitted.arrays()
+    assert not any(key.startswith("run/") for key in arrays)
+    np.savez(tmp_path / "a.npz", **arrays)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as stored:
+        again = METHODS[name].load(dict(stored), replace(record, observation=np.zeros_like(record.observation)))
+    inputs = inputs_of(record, split.test[:5])
+    prediction = fitted.predict(inputs, 0)
+    assert prediction.shape == (5, 48, HALF)
+    assert prediction.dtype == np.complex64
+    np.testing.assert_array_equal(again.predict(inputs, 0), prediction)
+
+
+def broken(record, case):
+    """A record with one thing wrong."""
+    nan = record.uplink.copy()
+    nan[3, 2, 1] = complex(np.nan, 0)
+    lost = record.observation.copy()
+    lost[0, 3, 2, 1] = complex(0, np.nan)
+    return {
+        "no uplink": lambda: replace(record, uplink=None),
+        "uplink frequencies": lambda: replace(record, uplink_hz=record.uplink_hz[:-1]),
+        "downlink frequencies": lambda: replace(record, frequencies_hz=record.frequencies_hz[:-1]),
+        "antennas": lambda: replace(record, uplink=record.uplink[:, :-1]),
+        "array": lambda: replace(record, array_m=record.array_m[:-1]),
+        "two receivers": lambda: replace(
+            record, receivers=record.receivers * 2, observation=np.repeat(record.observation, 2, axis=0)
+        ),
+        "NaN uplink": lambda: replace(record, uplink=nan),
+        "NaN downlink": lambda: replace(record, observation=lost),
+    }[case]()
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("case", "text"),
+    [
+        ("no uplink", "has no uplink"),
+        ("uplink frequencies", "26 uplink subcarriers and 25 frequencies"),
+        ("downlink frequencies", "26 subcarriers and 25 frequencies"),
+        ("antennas", "and 48 antennas"),
+        ("array", "47, 3"),
+        ("two receivers", "needs one receiver"),
+        ("NaN uplink", "row 3: uplink, 1 of"),
+        ("NaN downlink", "row 3: 1 of"),
+    ],
+)
+def test_bad_records_are_named(name, case, text, walk):
+    with pytest.raises(InputError, match=text):
+        METHODS[name].fit(broken(walk[1], case), split_of(80), SMALL[name], 0, lambda what, share: None)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_one_row_is_too_few(name, walk):
+    nothing = np.zeros(0, np.int64)
+    split = Split("made", 0, np.array([0]), nothing, nothing)
+    with pytest.raises(InputError, match="1 training row"):
+        METHODS[name].fit(walk[1], split, SMALL[name], 0, lambda what, share: None)
+
+
+def test_bad_inputs_to_a_prediction_are_named(walk):
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, lambda what, share: None)
+    where = np.full((2, 3), np.nan)
+    with pytest.raises(InputError, match="without uplink"):
+        fitted.predict(Inputs(where), 0)
+    with pytest.raises(InputError, match="fitted on"):
+        fitted.predict(Inputs(where, uplink=np.ones((2, 48, 25), np.complex64)), 0)
+    with pytest.raises(InputError, match="not finite"):
+        fitted.predict(Inputs(where, uplink=np.full((2, 48, 26), np.nan, np.complex64)), 0)
+
+
+def test_a_dead_row_is_predicted_as_silence(walk):
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, lambda what, share: None)
+    assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()

@@ -1,0 +1,247 @@
+"""Runs of baselines: what is in their folders, the command, folds, resuming, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from calling import call, refused, stored
+from made_channels import channels
+
+import wrf_mi
+from wrf_mi.core import InputError
+from wrf_mi.measure import load, make_splits, write_nerf2_csi
+from wrf_mi.report.baseline_run import evaluate_baseline, open_baseline, train_baseline
+from wrf_mi.report.compare import compare
+from wrf_mi.report.run_folder import read_run
+
+FILES = {"config.yaml", "split.npz", "fitted.npz", "metrics.json", "predictions.npz"}
+ROUNDING = 1e-4
+"""Powers of tens of dBm are stored in single precision."""
+
+
+@pytest.fixture(scope="module")
+def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_baseline(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri")
+
+
+def contents(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
+    assert contents(run) == FILES
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    known = {"model": "mri", "dataset": str(flat_folder), "split": "official", "n_train": None, "seed": 0}
+    assert known.items() <= config.items()
+    assert config["settings"] == {"shared": False}
+    assert {"wrf-mi", "scipy", "scikit-learn"} <= set(config["versions"])
+    with np.load(run / "fitted.npz", allow_pickle=False) as arrays:
+        assert set(arrays) == {"run/format", "run/train_seconds", "heading", "0/law", "1/law"}
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("mri", "rssi", 24, 6)
+    assert metrics["train_seconds"] > 0
+    assert metrics["peak_memory_mb"] > 10
+    assert set(metrics["receivers"]) == {"anchor1", "anchor2"}
+    assert "inside_90" not in metrics
+    assert set(metrics["reference"]) == {"idw100"}
+
+
+@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+def test_stored_models_predict_what_was_scored(name: str, flat_folder: Path, tmp_path: Path) -> None:
+    """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
+    few = ("trees=20",) if name == "trees" else ()
+    out = train_baseline(flat_folder, tmp_path / "run", name, settings=few)
+    record, arrays, opened = load(flat_folder), stored(out), open_baseline(out)
+    assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
+    heading = record.tx_heading_rad[arrays["row"]]
+    for r in range(2):
+        found = opened.predict(arrays["tx_pos"], r, heading)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, arrays["prediction"][r])
+    if name == "idw":
+        np.testing.assert_array_equal(arrays["prediction"], arrays["reference_idw100"])
+    elif name != "mri":
+        with pytest.raises(InputError, match="give heading_rad, or train with heading=false"):
+            opened.predict(arrays["tx_pos"], 0)
+    with pytest.raises(InputError, match="no receiver 2"):
+        opened.predict(arrays["tx_pos"], 2, heading)
+    with pytest.raises(InputError, match="predicts from positions"):
+        opened.predict(np.full((1, 3), np.nan), 0, heading[:1])
+
+
+def test_command_trains_as_the_function_does(
+    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    status, table, err = call(["train", flat_folder, "--model", "mri", "--out", out], capsys)
+    assert status == 0, err
+    lines = table.splitlines()
+    assert [line.split()[0] for line in lines] == ["absolute", "mri", "blend", "split", "results:"]
+    assert err.splitlines() == ["mri: receivers"]
+    np.testing.assert_array_equal(stored(out)["prediction"], stored(run)["prediction"])
+    chosen = ["--set", "shared=true", "--n-train", "0.5", "--seed", 4, "--split", "random"]
+    given = ["train", flat_folder, "--model", "mri", "--out", tmp_path / "few", "--json", *chosen]
+    status, table, _ = call(given, capsys)
+    metrics = json.loads(table)
+    assert (status, metrics["seed"], metrics["split"], metrics["n_train"]) == (0, 4, "random", 12)
+    with np.load(tmp_path / "few" / "fitted.npz") as arrays:
+        np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
+
+
+def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
+    status, out, err = call(["evaluate", run, "--json"], capsys)
+    assert (status, err) == (0, "")
+    again = json.loads(out)
+    for name in before.keys() - {"ms_per_sample"}:
+        assert again[name] == before[name], name
+    for name, values in stored(run).items():
+        np.testing.assert_array_equal(values, arrays[name])
+    other = evaluate_baseline(run, "random")
+    assert other["split"] == "random (rows unseen by official)"
+    record = load(json.loads((run / "metrics.json").read_text())["dataset"])
+    (drawn,) = make_splits(record, "random")
+    assert 0 < other["n_test"] == np.isin(drawn.test, arrays["row"]).sum() < len(drawn.test)
+    assert json.loads((run / "metrics.json").read_text()) == again
+
+
+def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = train_baseline(folder, tmp_path / "run", "kriging", split="blocked")
+    assert contents(out) == FILES - {"split.npz", "fitted.npz"} | {"fold0", "fold1", "fold2"}
+    whole = read_run(out)
+    assert sorted(whole.row) == list(range(24))
+    for name in ("fitted.npz", "metrics.json", "predictions.npz"):
+        (out / "fold1" / name).unlink()
+    (out / "metrics.json").unlink()
+    kept = (out / "fold0" / "fitted.npz").stat().st_mtime_ns
+    refused(["evaluate", out], "fitted.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    status, _, err = call(["train", "--resume", out], capsys)
+    assert (status, err.splitlines()) == (0, ["fold1: kriging: receivers"])
+    assert (out / "fold0" / "fitted.npz").stat().st_mtime_ns == kept
+    np.testing.assert_array_equal(read_run(out).prediction, whole.prediction)
+    (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
+    asked = ["--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.npz"]
+    refused(["predict", out, *asked], "one model for each block; choose one", capsys)
+    status, _, err = call(["predict", out / "fold0", *asked], capsys)
+    assert status == 0, err
+
+
+def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    held_out = stored(run)
+    rows = [",".join(repr(float(v)) for v in p) for p in held_out["tx_pos"]]
+    (tmp_path / "tx.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
+    np.savez(tmp_path / "tx.npz", tx_pos=held_out["tx_pos"], heading_rad=np.zeros(len(rows)))
+    for given in (["--tx", tmp_path / "tx.csv"], ["--input", tmp_path / "tx.npz"]):
+        status, printed, err = call(["predict", run, *given, "--out", tmp_path / "out.npz", "--json"], capsys)
+        assert (status, err) == (0, "")
+        assert set(json.loads(printed)["arrays"]) == {"row", "prediction", "tx_pos", "receiver_name"}
+        with np.load(tmp_path / "out.npz") as arrays:
+            np.testing.assert_allclose(arrays["prediction"], held_out["prediction"], atol=ROUNDING)
+
+
+def test_comparison_shows_baselines_beside_the_blend(run: Path, flat_folder: Path, tmp_path: Path) -> None:
+    other = train_baseline(flat_folder, tmp_path / "idw", "idw")
+    compare([run, other], tmp_path / "page")
+    with (tmp_path / "page" / "compare.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["model"] for row in rows] == ["mri", "idw", "idw100"]
+    assert rows[1]["median"] == rows[2]["median"] != rows[0]["median"]
+
+
+def test_sweep_of_baselines(flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["sweep", flat_folder, "--vary", "model=mri,idw", "--out", tmp_path / "sweep"]
+    status, out, err = call([*given, "--json"], capsys)
+    assert status == 0, err
+    rows = json.loads(out)
+    assert [(row["model"], row["status"]) for row in rows] == [("mri", "done"), ("idw", "done")]
+    assert rows[1]["median"] == rows[1]["reference_median"]
+    refused(["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"], "vae serves spectrum", capsys)
+    assert not (tmp_path / "no").exists()
+
+
+# What is refused
+
+
+def test_calls_that_are_refused(
+    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unplaced_folder = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
+    out = ["--out", tmp_path / "out"]
+    train = ["train", flat_folder, "--model", "mri", *out]
+    for arguments, message in (
+        (["train", unplaced_folder, "--model", "mri", *out], "unplaced: holds csi; mri serves rssi, so choose another"),
+        (["train", unplaced_folder, "--model", "idw", *out], "positions are not known, from which idw predicts"),
+        (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
+        ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
+        ([*train, "--n-train", 0], "n_train 0; choose 1 to 24"),
+        ([*train, "--split", "nowhere"], "split 'nowhere'"),
+        ([*train, "--set", "steps=3"], "unknown setting steps"),
+        ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
+        (
+            ["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=0"],
+            "k = 0: the blend needs at least one",
+        ),
+        (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
+        (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
+        (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
+        ([*train, "--scene", "x"], "mri on .*flat: takes --split, --n-train, --seed and --set"),
+        ([*train, "--preset", "quick"], "mri on .*flat: takes --split"),
+        (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
+        (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
+        (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
+        (["train", "--resume", run, "--model", "mri"], "leave data set and settings away"),
+        (["compress", run, *out], "not a learned field alone"),
+    ):
+        refused(arguments, message, capsys)
+        assert not (tmp_path / "out").exists(), arguments
+
+
+def test_what_cannot_be_fitted_leaves_nothing_behind(flat_folder: Path, tmp_path: Path) -> None:
+    record = load(flat_folder)
+    still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
+    with pytest.raises(InputError, match="rows at one distance"):
+        train_baseline(still, tmp_path / "run", "mri")
+    assert not (tmp_path / "run").exists()
+
+
+def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = Path(shutil.copytree(run, tmp_path / "run"))
+    model, asked = damaged / "fitted.npz", ["evaluate", damaged]
+    whole = model.read_bytes()
+    with np.load(model) as stored_model:
+        arrays = dict(stored_model)
+    model.write_bytes(whole[: len(whole) // 2])
+    refused(asked, "fitted.npz: not readable .*; train the run anew", capsys)
+    np.savez(model, **{key: value for key, value in arrays.items() if key != "1/law"})
+    refused(asked, "fitted.npz: not readable .*law.*; train the run anew", capsys)
+    np.savez(model, **arrays | {"run/format": np.array(99)})
+    refused(asked, "fitted.npz: format 99, this version reads 1; use the version that wrote it", capsys)
+    model.unlink()
+    split = (damaged / "split.npz").read_bytes()
+    (damaged / "split.npz").write_bytes(b"")
+    refused(["train", "--resume", damaged], "split.npz: not a split file", capsys)
+    assert (damaged / "config.yaml").exists()  # a run that was there is never taken away
+    (damaged / "split.npz").write_bytes(split)
+    config = damaged / "config.yaml"
+    content = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump(content | {"settings": {"shared": 3}}))
+    refused(asked, "setting shared: expected bool, got 3", capsys)
+    config.write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "settings"}))
+    refused(asked, "config.yaml: not readable .*settings.*; restore it", capsys)
+    config.write_text(yaml.safe_dump(content | {"model": "hybrid"}))
+    with pytest.raises(InputError, match="a run of hybrid, not of a baseline"):
+        evaluate_baseline(damaged)
+
+
+def test_public_names() -> None:
+    assert wrf_mi.train_baseline is train_baseline
+    assert wrf_mi.open_baseline is open_baseline

@@ -1,0 +1,139 @@
+"""What fields are told and compared with, for spectra, signal strengths and channels, as NumPy arrays.
+
+With an uplink each antenna of each row is a condition of its own, as in NeRF2's code; else each position is one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .method import Inputs
+
+
+def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
+    """Uplink channels as features, and the complex number that each was divided by.
+
+    Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, so that
+    what the radios add to amplitude and phase, the same in both links, is no part of what must be learned.
+
+    Args:
+        uplink: [m, antennas, subcarriers], complex and finite.
+
+    Returns:
+        Real parts, then imaginary ones, of each row's antennas one after the other, [m * antennas, 2 subcarriers], and
+        the divisors [m, antennas].
+
+    Raises:
+        InputError: an antenna without any signal in some row.
+    """
+    h = np.asarray(uplink, np.complex128)
+    rms = np.sqrt(np.square(np.abs(h)).mean(axis=-1))
+    if not (np.isfinite(rms) & (rms > 0)).all():
+        row, antenna = np.argwhere(~(np.isfinite(rms) & (rms > 0)))[0]
+        raise InputError(f"uplink of row {row}, antenna {antenna} is zero or not finite; leave that row out")
+    mean = h.mean(axis=-1)
+    size = np.abs(mean)
+    turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)
+    divisor = rms * turn
+    flat = (h / divisor[..., None]).reshape(-1, h.shape[-1])
+    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32), divisor
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """How many complex numbers the rays bring, and what they stand for.
+
+    Attributes:
+        by_uplink: the radiance network knows the uplink channel in place of the position.
+        antennas: of the base station; each is a condition of its own with the uplink, else an output.
+        frequencies_hz: of each output, [outputs]; 0 where the data do not tell.
+    """
+
+    by_uplink: bool
+    antennas: int
+    frequencies_hz: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Complex numbers a ray brings."""
+        return len(self.frequencies_hz)
+
+
+def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
+    """Numbers of the conditions of rows: with an uplink those of each antenna."""
+    per_row = outputs.antennas if outputs.by_uplink else 1
+    return np.asarray((rows[:, None] * per_row + np.arange(per_row)).ravel())
+
+
+def outputs_of(record: Record) -> Outputs:
+    """What the record asks for.
+
+    Raises:
+        InputError: an uplink with another number of antennas than the downlink, or of several receivers.
+    """
+    if record.task != "csi":
+        known = record.frequencies_hz
+        return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
+    shape = record.observation.shape
+    antennas, subcarriers = (1, shape[2]) if len(shape) == 3 else (shape[2], shape[3])
+    # Narrow channels may come with their carrier alone.
+    stated = np.zeros(1) if record.frequencies_hz is None else np.asarray(record.frequencies_hz, float)
+    known = np.broadcast_to(stated, (subcarriers,))
+    if record.uplink is None:
+        return Outputs(False, antennas, np.tile(known, antennas))
+    if record.uplink.shape[1] != antennas:
+        raise InputError(
+            f"{record.name}: has an uplink of {record.uplink.shape[1]} antennas and a downlink of {antennas}; "
+            "give both for the same antennas"
+        )
+    if len(record.receivers) != 1:
+        raise InputError(f"{record.name}: has one uplink for {len(record.receivers)} receivers; give one each")
+    return Outputs(True, antennas, known)
+
+
+def uplink_of(inputs: Inputs) -> NDArray[Any]:
+    """The uplink of rows that are predicted.
+
+    Raises:
+        InputError: they have none.
+    """
+    if inputs.uplink is None:
+        raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
+    return inputs.uplink
+
+
+def truth_of(record: Record, outputs: Outputs, receiver: int, rows: IntArray, scale: float) -> NDArray[np.float32]:
+    """What the networks are compared with, one row for each condition.
+
+    Greys [n, pixels]; powers [n, 1] in dBm; channels, real parts and then imaginary ones, [n, 2 outputs] in units of
+    ``scale``, or [n * antennas, 2 outputs] divided as `normalised_uplink` divided the uplink.
+    """
+    seen = record.observation[receiver, rows]
+    if record.task != "csi":
+        return np.asarray(seen, np.float32).reshape(len(rows), -1)
+    if outputs.by_uplink:
+        assert record.uplink is not None
+        divisor = normalised_uplink(record.uplink[rows])[1]
+        channel = seen.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
+    else:
+        channel = seen / scale
+    flat = channel.reshape(-1, outputs.count)
+    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
+
+
+def channels_from(parts: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]) -> NDArray[np.complex64]:
+    """Undo `truth_of`: channels of ``shape`` from [conditions, 2 outputs]."""
+    half = parts.shape[1] // 2
+    channel = np.asarray(parts[:, :half] + 1j * parts[:, half:])
+    if isinstance(divisor, np.ndarray):
+        channel = channel.reshape(*divisor.shape, -1) * divisor[..., None]
+    else:
+        channel = channel * divisor
+    return channel.reshape(shape).astype(np.complex64)

@@ -1,0 +1,363 @@
+"""Convolutional adversarial network that makes spatial spectra from the transmitter's position.
+
+Source: Radford, Metz and Chintala, "Unsupervised representation learning with deep convolutional generative
+adversarial networks" (2016), which the WRF-GS papers name; the condition is Mirza and Osindero's ("Conditional
+generative adversarial nets", 2014). NeRF2, whose figures the papers compare with, says no more than that a DCGAN
+predicts spectra from positions, and has not released it. Chosen here:
+
+- The generator takes noise and the encoded position through one hidden layer to a coarse grid, then three transposed
+  convolutions of stride two, ReLU between; the discriminator three convolutions of stride two, leaky ReLU of slope
+  0.2. Azimuths wrap around (`wrf_mi.baselines.conv`).
+- A sigmoid in place of tanh: greys lie in 0..1.
+- Instance instead of batch normalisation, as of batches of one: what is predicted for one position must not depend on
+  the others. The discriminator judges patches. Both are of Isola et al., "Image-to-image translation with conditional
+  adversarial networks" (2017, pix2pix).
+- An adversary alone asks only for plausible spectra. That the one of this position is wanted comes from pix2pix's
+  second term, the mean absolute difference, with its weight of 100, Adam's momentum of 0.5 and rate of 2e-4 for the
+  adversary.
+- Predictions take no noise, the middle of what was drawn.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Record, Split
+from ..core.types import IntArray
+from ..field.device import to_float, to_tensor
+from ..field.network import Weights, init_layer, linear, relu
+from .conv import Grid, coarser, convolve, finer, instance_norm, resized
+from .coordinates import Coordinates, feature_count
+from .method import Inputs, Listen, Method
+from .tensors import columns
+from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, positions, under, usable_rows
+from .vae import median_dissimilarity
+
+LEVELS = 3
+"""Convolutions of stride two in either network."""
+SLOPE = 0.2
+"""Of the leaky ReLU below zero (Radford et al.)."""
+MOMENTUM = 0.5
+"""Adam's decay of the first moment (Radford et al.)."""
+AT_ONCE = 16
+"""Spectra that are predicted together: bounds the memory."""
+
+
+@dataclass(frozen=True)
+class DcganSettings:
+    """Settings of the adversarial network.
+
+    Attributes:
+        training: how the generator learns.
+        adversary_rate: the discriminator's learning rate.
+        noise: numbers drawn from -1 to 1.
+        hidden: neurons before the coarse grid.
+        channels: of the coarse grid; halved at each finer one.
+        octaves: of the position's encoding.
+        scale_m: metres that make its unit (`wrf_mi.field.encoding`).
+        l1: weight of the mean absolute difference against the adversarial term.
+    """
+
+    training: Training = field(default_factory=lambda: Training(steps=1500, batch=8, rate=2e-3))
+    adversary_rate: float = 2e-4
+    noise: int = 8
+    hidden: int = 64
+    channels: int = 32
+    octaves: int = 4
+    scale_m: float = 1.0
+    l1: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no network.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        if min(self.noise, self.hidden) < 1 or self.channels < 2**LEVELS or self.octaves < 0:
+            raise InputError(
+                f"dcgan: noise {self.noise}, hidden {self.hidden}, channels {self.channels}, octaves {self.octaves}; "
+                f"choose 1 or more (channels: {2**LEVELS} or more, octaves: 0 or more)"
+            )
+        if not (self.scale_m > 0 and self.l1 >= 0 and self.adversary_rate > 0):
+            raise InputError(
+                f"dcgan: scale_m {self.scale_m}, l1 {self.l1}, adversary_rate {self.adversary_rate}; "
+                "choose positive numbers"
+            )
+
+
+def coarse_grid(shape: tuple[int, int], batch: int) -> Grid:
+    """Where the generator begins: an eighth of a spectrum's sides, rounded up."""
+    return Grid(batch, -(-shape[0] // 2**LEVELS), -(-shape[1] // 2**LEVELS))
+
+
+def _layer(name: str, inputs: int, side: int, outputs: int, rng: np.random.Generator, gain: float) -> Weights:
+    return init_layer(name, {"hidden": inputs * side * side}, outputs, rng, gain)
+
+
+def generator_weights(s: DcganSettings, shape: tuple[int, int], rng: np.random.Generator) -> Weights:
+    """Random weights of the generator."""
+    grid, where = coarse_grid(shape, 1), feature_count(s.octaves)
+    weights = init_layer("g.in", {"noise": s.noise, "position": where}, s.hidden, rng)
+    weights |= init_layer("g.grid", {"hidden": s.hidden}, s.channels * grid.pixels, rng)
+    channels = s.channels
+    for level in range(LEVELS):
+        last = level == LEVELS - 1
+        outputs = 1 if last else channels // 2
+        weights |= _norm(f"g.norm{level}", channels)
+        weights |= _layer(f"g.{level}", channels, 3, 4 * outputs, rng, 1.0 if last else float(np.sqrt(2)))
+        channels = outputs
+    return weights
+
+
+def adversary_weights(s: DcganSettings, rng: np.random.Generator) -> Weights:
+    """Random weights of the discriminator."""
+    where, gain = feature_count(s.octaves), float(np.sqrt(2))
+    first = s.channels // 2 ** (LEVELS - 1)
+    weights, channels = {"d.position": init_layer("x", {"p": where}, first, rng)["x.p"]}, 1
+    for level in range(LEVELS):
+        outputs = first * 2**level
+        weights |= _layer(f"d.{level}", 4 * channels, 2, outputs, rng, gain)
+        if level:
+            weights |= _norm(f"d.norm{level}", outputs)
+        channels = outputs
+    return weights | _layer("d.out", channels, 3, 1, rng, 1.0)
+
+
+def _norm(name: str, channels: int) -> Weights:
+    return {f"{name}.scale": np.ones((channels, 1), np.float32), f"{name}.bias": np.zeros((channels, 1), np.float32)}
+
+
+def generate(params: Mapping[str, Any], noise: Any, where: Any, shape: tuple[int, int], channels: int) -> Any:
+    """Spectra [1, batch * height * width] in 0..1, from noise [k, batch] and positions' features [f, batch]."""
+    batch = where.shape[1]
+    grid = coarse_grid(shape, batch)
+    hidden = relu(linear(params, "g.in", noise, "noise") + params["g.in.position"] @ where)
+    x = linear(params, "g.grid", hidden)
+    # [channels, pixels, batch] to image by image.
+    x = dr.moveaxis(dr.reshape(x, (channels, grid.pixels, batch)), 1, 2)
+    x = dr.reshape(x, (channels, grid.columns))
+    for level in range(LEVELS):
+        x = relu(instance_norm(params, f"g.norm{level}", x, grid))
+        x, grid = finer(convolve(params, f"g.{level}", x, grid), grid)
+    x, _ = resized(x, grid, *shape)
+    return dr.rcp(1 + dr.exp(-x))
+
+
+def judge(params: Mapping[str, Any], spectra: Any, where: Any, shape: tuple[int, int]) -> Any:
+    """How real each patch of spectra [1, batch * height * width] at positions' features looks: logits [1, columns]."""
+    batch = where.shape[1]
+    coarse = coarse_grid(shape, batch)
+    x, grid = resized(spectra, Grid(batch, *shape), coarse.height * 2**LEVELS, coarse.width * 2**LEVELS)
+    for level in range(LEVELS):
+        x, grid = coarser(x, grid)
+        x = convolve(params, f"d.{level}", x, grid, 2)
+        if level:
+            x = instance_norm(params, f"d.norm{level}", x, grid)
+        else:
+            # The position as constant channels of the first layer: a bias for each image.
+            own: Any = dr.reshape(params["d.position"] @ where, (x.shape[0], batch, 1))
+            x = dr.reshape(dr.reshape(x, (x.shape[0], batch, grid.pixels)) + own, (x.shape[0], grid.columns))
+        x = dr.maximum(x, SLOPE * x)
+    return convolve(params, "d.out", x, grid)
+
+
+def softplus(x: Any) -> Any:
+    """log(1 + exp(x)), without overflow."""
+    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+
+
+class Duel:
+    """Generator and discriminator that learn in turns; what is kept and predicts is the generator.
+
+    Args:
+        settings: of both.
+        shape: height and width of a spectrum.
+        rng: draws starting weights.
+        start: logit of each pixel that the generator starts near, [1]; a bias of its last layer.
+    """
+
+    def __init__(self, settings: DcganSettings, shape: tuple[int, int], rng: np.random.Generator, start: float) -> None:
+        s = self._settings = settings
+
+        def real_and_where(data: Any, given: Any) -> tuple[Any, Any]:
+            chosen = given["rows"]
+            pixels = shape[0] * shape[1]
+            slot = dr.arange(type(chosen), dr.width(chosen) * pixels)
+            index = dr.gather(type(chosen), chosen, slot // pixels) * pixels + slot % pixels
+            flat = data["truth"]
+            real = type(data["where"])(dr.gather(type(flat), flat, index), (1, dr.width(slot)))
+            return real, columns(data["where"], chosen)
+
+        def made(params: Mapping[str, Any], given: Any, where: Any) -> Any:
+            return generate(params, given["noise"], where, shape, s.channels)
+
+        def adversary_loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
+            real, where = real_and_where(data, given)
+            fake = dr.detach(made(given["other"], given, where))
+            right = dr.mean(softplus(-judge(params, real, where, shape)), axis=None)
+            return (right + dr.mean(softplus(judge(params, fake, where, shape)), axis=None)).array
+
+        def generator_loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
+            real, where = real_and_where(data, given)
+            fake = made(params, given, where)
+            fooled = dr.mean(softplus(-judge(given["other"], fake, where, shape)), axis=None)
+            return (fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
+
+        weights = generator_weights(s, shape, rng)
+        weights[f"g.{LEVELS - 1}.bias"] += np.float32(start)
+        averaging = s.training.averaging
+        self._generator = Descent(weights, generator_loss, averaging, MOMENTUM)
+        self._adversary = Descent(adversary_weights(s, rng), adversary_loss, averaging, MOMENTUM)
+
+    @property
+    def taken(self) -> int:
+        """Steps taken."""
+        return self._generator.taken
+
+    @property
+    def mean(self) -> dict[str, Any]:
+        """The generator's running mean."""
+        return self._generator.mean
+
+    def step(self, data: Any, given: Any, rate: float) -> Any:
+        """One step of each; the generator's loss."""
+        against = rate * self._settings.adversary_rate / self._settings.training.rate
+        self._adversary.step(data, given | {"other": self._generator.params}, against)
+        return self._generator.step(data, given | {"other": self._adversary.params}, rate)
+
+    def require_finite(self) -> None:
+        """Raise `NumericsError` where either was not finite."""
+        self._generator.require_finite()
+        self._adversary.require_finite()
+
+    def arrays(self) -> Weights:
+        """The generator's running mean, as NumPy arrays."""
+        return self._generator.arrays()
+
+    def state(self) -> Any:
+        """Of both, to go back to."""
+        return self._generator.state(), self._adversary.state()
+
+    def restore(self, state: Any) -> None:
+        """Go back."""
+        self._generator.restore(state[0])
+        self._adversary.restore(state[1])
+
+
+class FittedDcgan:
+    """Generators that were fitted, one for each receiver.
+
+    Args:
+        settings: of the networks.
+        coordinates: frame of the positions.
+        networks: weights of each receiver's generator.
+        shape: height and width of a spectrum.
+    """
+
+    def __init__(
+        self, settings: DcganSettings, coordinates: Coordinates, networks: list[Weights], shape: tuple[int, int]
+    ) -> None:
+        self._settings, self._coordinates, self._networks, self._shape = settings, coordinates, networks, shape
+        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in networks]
+
+    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """Spectra [m, height, width], float32."""
+        s, out = self._settings, np.empty((len(inputs), *self._shape), np.float32)
+        for first in range(0, len(inputs), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            where = self._coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
+            flat = generate_silent(self._params[receiver], s, where, self._shape)
+            out[part] = flat.numpy().reshape(-1, *self._shape)
+        return out
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Settings, frame and generators."""
+        own = {"settings": np.asarray(json.dumps(asdict(self._settings))), "shape": np.asarray(self._shape)}
+        own |= keyed("frame", self._coordinates.arrays())
+        for r, weights in enumerate(self._networks):
+            own |= keyed(f"receiver{r}", weights)
+        return own
+
+
+def generate_silent(params: Mapping[str, Any], s: DcganSettings, where: Any, shape: tuple[int, int]) -> Any:
+    """Spectra without noise, a flat array."""
+    with dr.suspend_grad():
+        return generate(params, dr.zeros(type(where), (s.noise, where.shape[1])), where, shape, s.channels).array
+
+
+def fit(record: Record, split: Split, settings: DcganSettings, seed: int, listen: Listen) -> FittedDcgan:
+    """Fit a pair of networks to each receiver.
+
+    Raises:
+        InputError: positions that the data do not tell, or a receiver without training rows.
+    """
+    coordinates = Coordinates.of(positions(record, "dcgan")[split.all_train])
+    networks, count = [], len(record.receivers)
+    for r in range(count):
+
+        def part(what: str, share: float, first: int = r) -> None:
+            listen(what, (first + share) / count)
+
+        networks.append(_fit_receiver(record, split, settings, seed, part, r, coordinates))
+    height, width = (int(side) for side in record.observation.shape[-2:])
+    return FittedDcgan(settings, coordinates, networks, (height, width))
+
+
+def _fit_receiver(
+    record: Record, split: Split, s: DcganSettings, seed: int, listen: Listen, receiver: int, coordinates: Coordinates
+) -> Weights:
+    train, validation = usable_rows(record, split, receiver, "dcgan")
+    known = np.concatenate([train, validation])
+    spectra = np.asarray(record.observation[receiver, known], np.float32)
+    height, width = (int(side) for side in spectra.shape[1:])
+    data = {
+        "where": coordinates.features(record.tx_pos_m[known], s.octaves, s.scale_m),
+        "truth": to_float(spectra),
+    }
+    dr.make_opaque(data)
+    rng = np.random.default_rng([seed, receiver])
+    grey = float(np.clip(spectra[: len(train)].mean(dtype=np.float64), 0.01, 0.99))
+    duel = Duel(s, (height, width), rng, float(np.log(grey / (1 - grey))))
+
+    def draw(everything: bool) -> Iterator[Any]:
+        rows: IntArray = np.arange(len(known) if everything else len(train))
+        for picked in epochs(rows, s.training.batch, rng):
+            yield {"rows": opaque_rows(picked), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, s.training.batch)))}
+
+    score = None
+    if len(validation):
+        asked = coordinates.features(record.tx_pos_m[validation], s.octaves, s.scale_m)
+        truth = to_float(spectra[len(train) :])
+
+        def score(params: Mapping[str, Any]) -> float:
+            predicted = generate_silent(params, s, asked, (height, width))
+            return median_dissimilarity(predicted, truth, len(validation), height, width)
+
+    name = record.receivers[receiver].name
+    return fit_network(duel, data, draw, score, s.training, listen, f"dcgan {name}")[0]
+
+
+def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedDcgan:
+    """What `FittedDcgan.arrays` described."""
+    plain = json.loads(str(arrays["settings"]))
+    settings = DcganSettings(**plain | {"training": Training(**plain["training"])})
+    networks = [under(f"receiver{r}", arrays) for r in range(len(record.receivers))]
+    height, width = (int(side) for side in arrays["shape"])
+    return FittedDcgan(settings, Coordinates.load(under("frame", arrays)), networks, (height, width))
+
+
+METHOD = Method(
+    "dcgan",
+    ("spectrum",),
+    DcganSettings,
+    fit,
+    load,
+    "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
+)

@@ -1,0 +1,205 @@
+"""NeRF2: two networks and a march along rays, for spectra, signal strengths and channels.
+
+Source: Zhao, An, Pan and Yang, "NeRF2: neural radio-frequency radiance fields" (MobiCom 2023), and the authors' code
+(XPengZhao/NeRF2, MIT). The networks and the march are in `wrf_mi.baselines.nerf2_march`. As in that code there is one
+pair of networks for all receivers of a record, whose rays start where each receiver is; ``shared`` says otherwise.
+
+What the authors leave open, and what was chosen:
+
+- Work. They take 8192 rays of 64 samples and 30,000 steps (spectra), 324 rays of 32 samples for signal strengths and
+  channels, hours on a GPU. Here a step draws some transmitters and some rays and pairs each with each, because the
+  attenuation network, most of the work, sees no transmitter: by default 16 spectra x 256 rays x 4 samples. From one
+  receiver the samples of a ray tell nothing about depth, so few are enough. Signal strengths and channels take 64 rays
+  over the full sphere (theirs cover the upper half), of equal solid angle.
+- How far rays go: as far as the farthest training transmitter (theirs: 5 m, 60 m by data set).
+- Encodings: their ten octaves have periods down to 12 mm, and spectra between training positions are then noise. Fewer
+  here, over coordinates and their sines as theirs.
+- Loss: squared error, as theirs, of greys; of powers in dB (they fit the amplitude to 1 + dBm / 100, which is a linear
+  scale of dB too; here the amplitude is physical, and one offset a receiver is fitted with it); of channels.
+- Channels: with an uplink, that takes the transmitter's place, antenna by antenna, the array's centre being where all
+  rays start (theirs start at each antenna, millimetres beside). Each uplink is normalised by its own size and mean
+  phase (theirs: by the largest value of all data, held-out rows included). Without one, the position is the condition
+  and antennas are outputs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Record, Split
+from ..field.device import to_tensor
+from ..field.network import Weights
+from .conditions import channels_from, conditions_of, outputs_of, truth_of
+from .coordinates import Coordinates
+from .method import Inputs, Listen, Method, inputs_of
+from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
+from .nerf2_march import Networks, Seen
+from .tensors import columns
+from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, positions, under, usable_rows
+
+SCORED_RAYS = 512
+"""Pixels of each validation spectrum by which steps are chosen."""
+FAR_M = 10.0
+"""Where rays end if no transmitter's position is known: the size of a large room."""
+
+
+class FittedNerf2:
+    """Fields that were fitted.
+
+    Args:
+        settings: of NeRF2.
+        frame: of the fields.
+        networks: weights of each group of receivers.
+        shape: of one observation.
+    """
+
+    def __init__(self, settings: Nerf2Settings, frame: Frame, networks: list[Weights], shape: tuple[int, ...]) -> None:
+        self._settings, self._frame, self._networks, self._shape = settings, frame, networks, shape
+        self._field = Field(settings, frame)
+        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in networks]
+        self._seen: tuple[int, list[Seen]] | None = None
+
+    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
+
+        Raises:
+            InputError: fitted to uplink channels, and there are none.
+        """
+        group = next(g for g, members in enumerate(self._frame.groups) if receiver in members)
+        params = self._params[group]
+        if self._seen is None or self._seen[0] != receiver:
+            # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
+            self._seen = receiver, self._field.look(params, receiver)
+        condition, divisor = condition_of(self._frame, self._settings, inputs)
+        values = self._field.march(params, self._seen[1], condition, receiver)
+        shape = (len(inputs), *self._shape)
+        if self._frame.task == "csi":
+            return channels_from(values, divisor, shape)
+        return values.reshape(shape)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Settings, frame and weights."""
+        own = {
+            "settings": np.asarray(json.dumps(asdict(self._settings))),
+            "far_m": np.asarray(self._frame.far_m),
+            "scale": np.asarray(self._frame.scale),
+        }
+        own |= keyed("frame", self._frame.coordinates.arrays())
+        for g, weights in enumerate(self._networks):
+            own |= keyed(f"group{g}", weights)
+        return own
+
+
+def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen: Listen) -> FittedNerf2:
+    """Fit the networks.
+
+    Raises:
+        InputError: positions that the data do not tell, a receiver without training rows, or an uplink of others.
+    """
+    known = split.all_train
+    outputs = outputs_of(record)
+    where = record.tx_pos_m[known] if outputs.by_uplink else positions(record, "nerf2")[known]
+    rx = np.stack([receiver.position_m for receiver in record.receivers])
+    if np.isfinite(where).all():
+        farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
+    else:
+        where, farthest = rx, FAR_M
+    seen = record.observation[:, known]
+    scale = float(np.sqrt(np.nanmean(np.square(np.abs(seen))))) if record.task == "csi" else 1.0
+    frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scale or 1.0)
+    field = Field(settings, frame)
+    networks = []
+    for g, members in enumerate(frame.groups):
+
+        def part(what: str, share: float, first: int = g) -> None:
+            listen(what, (first + share) / len(frame.groups))
+
+        networks.append(_fit_group(record, split, field, seed, part, members))
+    return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
+
+
+def _fit_group(
+    record: Record, split: Split, field: Field, seed: int, listen: Listen, members: tuple[int, ...]
+) -> Weights:
+    s, frame, outputs = field.settings, field.frame, field.frame.outputs
+    known = split.all_train
+    # From here on rows count within the training rows.
+    rows = {r: tuple(np.searchsorted(known, part) for part in usable_rows(record, split, r, "nerf2")) for r in members}
+    rng = np.random.default_rng([seed, *members])
+    condition, _ = condition_of(frame, s, inputs_of(record, known))
+    truth = np.concatenate([truth_of(record, outputs, r, known, frame.scale) for r in range(len(record.receivers))])
+    data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
+    dr.make_opaque(data)
+    weights = s.networks.init(condition.shape[0], outputs.count, rng)
+    weights["offset"] = np.zeros(len(record.receivers), np.float32)
+    if frame.task == "rssi":
+        for r in members:
+            weights["offset"][r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
+    n_rays, spectrum = frame.directions.shape[1], frame.task == "spectrum"
+    batch = s.training.batch if spectrum else s.sphere_batch
+    all_rays = opaque_rows(np.arange(n_rays))
+
+    def draw(everyone: bool) -> Iterator[Any]:
+        batches = {
+            r: epochs(conditions_of(np.concatenate(rows[r]) if everyone else rows[r][0], outputs), batch, rng)
+            for r in members
+        }
+        while True:
+            for r in rng.permutation(members):
+                yield {
+                    "rows": opaque_rows(next(batches[r])),
+                    "rays": opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False))
+                    if spectrum
+                    else all_rays,
+                    "receiver": dr.opaque(mi.UInt32, int(r)),
+                }
+
+    def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
+        return step_loss(params, data, given, frame, s)
+
+    scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
+
+    def score(params: Mapping[str, Any]) -> float:
+        errors = []
+        for r in members:
+            validation = conditions_of(rows[r][1], outputs)
+            if len(validation):
+                seen = field.look(params, r, scored if spectrum else None)
+                found = field.march(params, seen, columns(condition, opaque_rows(validation)), r)
+                wanted = truth[r * condition.shape[1] + validation]
+                errors.append(np.square(found - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
+        return float(np.mean(np.concatenate(errors)))
+
+    able = any(len(rows[r][1]) for r in members)
+    what = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
+    descent = Descent(weights, loss, s.training.averaging)
+    return fit_network(descent, data, draw, score if able else None, s.training, listen, what)[0]
+
+
+def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
+    """What `FittedNerf2.arrays` described."""
+    plain = json.loads(str(arrays["settings"]))
+    nested = {"training": Training(**plain["training"]), "networks": Networks(**plain["networks"])}
+    settings = Nerf2Settings(**plain | nested)
+    coordinates = Coordinates.load(under("frame", arrays))
+    frame = frame_of(record, settings, coordinates, float(arrays["far_m"]), float(arrays["scale"]))
+    networks = [under(f"group{g}", arrays) for g in range(len(frame.groups))]
+    return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
+
+
+METHOD = Method(
+    "nerf2",
+    ("spectrum", "rssi", "csi"),
+    Nerf2Settings,
+    fit,
+    load,
+    "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code",
+)

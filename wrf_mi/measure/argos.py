@@ -1,0 +1,243 @@
+"""Captures of many-antenna base stations in HDF5: Argos traces and those of RENEW's sounder.
+
+A base station's antennas receive the pilots of one user after another, frame by frame, as 16-bit I and Q. Two layouts:
+
+- ArgosV2 (Shepard, Ding, Guerra, Zhong, "Understanding real many-antenna MU-MIMO channels", Asilomar 2016; reader:
+  ``samps2csi`` with ``legacy=True`` in RENEWLab's ``PYTHON/IrisUtils/hdf5_lib.py``): ``/Pilot_Samples``
+  [frames, antennas, samples, 2] with the attributes ``num_mob_ant`` (users), ``samples_per_user`` (224) and
+  ``measured_noise`` (1 where a further slot after the users' holds noise). In each slot the pilot begins at sample 15
+  with a guard of 32; its two symbols at 47.
+- RENEW's sounder (https://github.com/renew-wireless/RENEWLab, ``hdf5_lib.py`` and ``channel_analysis.py``):
+  ``/Data/Pilot_Samples`` (or ``/Pilot_Samples``) [frames, cells, users, antennas, 2 x samples], I and Q in turn, with
+  the attributes ``PREFIX_LEN``, ``POSTFIX_LEN``, ``CP_LEN``, ``FFT_SIZE``, ``PILOT_SEQ_TYPE``, ``FREQ`` and ``RATE``;
+  after the prefix, as many pilot symbols as fit, each after its cyclic prefix.
+
+Channels are estimated as both readers do: samples / 2^15, the discrete Fourier transform over each 64-sample symbol,
+zero frequency in the middle, divided by the long training symbol of IEEE 802.11 on its 52 subcarriers -26..-1 and
+1..26, and the mean over the symbols. As in NeRF2, FIRE and WRF-GS+, the first 26 subcarriers are the uplink and the
+last 26 the downlink. Frames by users, in that order, are the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Receiver, Record
+from ..core.files import one_line
+
+SUFFIXES = (".hdf5", ".h5")
+PILOTS = "Pilot_Samples"
+FFT = 64
+HALF = 26
+"""Subcarriers of the long training symbol on each side of zero."""
+SUBCARRIERS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)])
+# IEEE Std 802.11-2020, equation (17-8): the long training symbol at subcarriers -26..-1 and 1..26.
+_SIGNS = "++--++-+-++++++--++-+-++++" + "+--++-+-+-----++--+-+-++++"
+TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
+ARGOS_START, ARGOS_SYMBOLS = 47, 2
+"""Of the first pilot symbol in a user's slot, and how many there are (RENEWLab, ``samps2csi``)."""
+FULL_SCALE = 2.0**15
+AT_ONCE = 1 << 26
+"""Bytes of samples read at once."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the pilots are.
+
+    Attributes:
+        users, antennas: how many.
+        slot: samples of a user in a frame.
+        starts: first sample of each pilot symbol in a slot.
+        carrier_hz: or None.
+        rate_hz: samples per second, or None.
+    """
+
+    users: int
+    antennas: int
+    slot: int
+    starts: tuple[int, ...]
+    carrier_hz: float | None
+    rate_hz: float | None
+
+
+def read_argos(
+    path: str | Path,
+    name: str | None = None,
+    frames: slice | None = None,
+    cell: int | None = None,
+    start: int | None = None,
+) -> Record:
+    """Read and check a capture of a many-antenna base station (see this module's head).
+
+    Args:
+        path: the ``.hdf5`` file, or a folder that holds one.
+        name: the record's name; the file's own without its ending by default.
+        frames: that are read, such as ``slice(0, 4000, 10)``; all by default. A record takes 416 bytes for each
+            frame, user and antenna.
+        cell: base station, from 0, where the capture holds several.
+        start: of the first pilot symbol in a user's slot, in samples, where another than the layout's.
+
+    Returns:
+        A record with ``task="csi"`` and one receiver, whose position is not known: ``observation``
+        [1, n, antennas, 26] of the downlink, ``uplink`` [n, antennas, 26], n = frames x users, positions NaN. Samples
+        in which all antennas are silent, such as frames that were not captured, are NaN.
+
+    Raises:
+        InputError: h5py is not installed, or anything is missing, unreadable or inconsistent, with the file.
+    """
+    file = capture_file(Path(path))
+    try:
+        import h5py
+    except ModuleNotFoundError:
+        raise InputError(f"{file}: reading HDF5 needs h5py; install it: pip install 'wrf-mi[argos]'") from None
+    try:
+        with h5py.File(file, "r") as stored:
+            pilots, attributes = _pilots(file, stored)
+            layout, samples = _open(file, pilots, attributes, frames, cell, start)
+            channel = np.concatenate([_estimate(part, layout) for part in samples])
+    except FileNotFoundError:
+        raise InputError(f"{file}: missing; give a capture in HDF5") from None
+    except (OSError, RuntimeError) as error:  # what h5py raises on a damaged file
+        raise InputError(f"{file}: not readable as HDF5 ({one_line(error)}); fetch it again") from None
+    channel = channel.reshape(-1, layout.antennas, 2 * HALF)
+    silent = (channel == 0).all(axis=(1, 2))
+    if len(channel) - np.count_nonzero(silent) < 2:
+        text = f"{len(channel) - np.count_nonzero(silent)} of {len(channel)} samples hold a signal"
+        raise InputError(f"{file}: {text}; two at least are needed, to train on and to score")
+    channel[silent] = np.nan
+    frequencies = None
+    if layout.carrier_hz is not None and layout.rate_hz is not None:
+        frequencies = layout.carrier_hz + SUBCARRIERS * layout.rate_hz / FFT
+    return Record(
+        name=name or file.stem,
+        task="csi",
+        tx_pos_m=np.full((len(channel), 3), np.nan),
+        receivers=(Receiver("base-station", np.full(3, np.nan), np.array([0.0, 0.0, 0.0, 1.0])),),
+        observation=channel[None, :, :, HALF:],
+        frequencies_hz=None if frequencies is None else frequencies[HALF:],
+        uplink=channel[:, :, :HALF],
+        uplink_hz=None if frequencies is None else frequencies[:HALF],
+        source=str(file),
+    )
+
+
+def capture_file(path: Path) -> Path:
+    """The one HDF5 file of a folder, or the file itself.
+
+    Raises:
+        InputError: none, or several.
+    """
+    if not path.is_dir():
+        return path
+    found = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES)
+    if len(found) != 1:
+        names = ", ".join(one.name for one in found) or "none"
+        raise InputError(f"{path}: one capture in HDF5 is read at a time, found {names}; give the file itself")
+    return found[0]
+
+
+def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
+    for group in (stored, stored.get("Data")):
+        pilots = None if group is None or not hasattr(group, "get") else group.get(PILOTS)
+        if pilots is not None and hasattr(pilots, "shape"):
+            return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
+    raise InputError(f"{file}: neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
+
+
+def _open(
+    file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
+) -> tuple[_Layout, Iterator[NDArray[Any]]]:
+    """The layout and the samples in parts, each [frames, users, antennas, slot, 2]."""
+    shape = tuple(int(size) for size in pilots.shape)
+    if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
+        need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
+        raise InputError(f"{file}: {PILOTS} holds {pilots.dtype} {list(shape)}; whole numbers {need} are read")
+    asked = range(shape[0])[frames or slice(None)]
+    if not len(asked) or asked.step < 0:
+        raise InputError(f"{file}: frames {frames} select none of {shape[0]}; give a slice that ascends")
+    find = _sounder if len(shape) == 5 else _argos
+    layout = find(file, shape, attributes, start)
+    if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
+        text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
+        raise InputError(f"{file}: {text}; give start")
+    which = _cell(file, shape, cell) if len(shape) == 5 else None
+
+    def parts() -> Iterator[NDArray[Any]]:
+        step = max(1, AT_ONCE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
+        for first in range(0, len(asked), step):
+            own = asked[first : first + step]
+            rows = slice(own.start, own[-1] + 1, own.step)
+            if which is None:
+                values = pilots[rows][:, :, : layout.users * layout.slot]
+                values = values.reshape(len(own), layout.antennas, layout.users, layout.slot, 2)
+                yield values.swapaxes(1, 2)
+            else:
+                yield pilots[rows, which].reshape(len(own), layout.users, layout.antennas, layout.slot, 2)
+
+    return layout, parts()
+
+
+def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
+    users, slot = (_whole(file, attributes, key) for key in ("num_mob_ant", "samples_per_user"))
+    if shape[3] != 2 or shape[2] < users * slot:
+        text = f"{PILOTS} has shape {list(shape)}, but {users} users have {slot} samples each"
+        raise InputError(f"{file}: {text}; correct num_mob_ant or samples_per_user")
+    first = ARGOS_START if start is None else start
+    starts = tuple(first + k * FFT for k in range(ARGOS_SYMBOLS))
+    return _Layout(users, shape[1], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
+
+
+def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
+    if shape[4] % 2:
+        raise InputError(f"{file}: {PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
+    slot = shape[4] // 2
+    size, kind = _number(attributes, "FFT_SIZE"), np.ravel(attributes.get("PILOT_SEQ_TYPE", b"lts"))[0]
+    text = kind.decode() if isinstance(kind, bytes) else str(kind)
+    if size not in (None, FFT) or text.lower() != "lts":
+        other = f"pilots {text!r} of {size or FFT:g} samples"
+        raise InputError(f"{file}: {other}; the long training symbol (lts) of {FFT} is read")
+    guard = _whole(file, attributes, "CP_LEN")
+    first = _whole(file, attributes, "PREFIX_LEN") + guard if start is None else start
+    room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
+    starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
+    return _Layout(shape[2], shape[3], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
+
+
+def _cell(file: Path, shape: tuple[int, ...], cell: int | None) -> int:
+    if cell is None and shape[1] > 1:
+        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+    if not 0 <= (cell or 0) < shape[1]:
+        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
+    return cell or 0
+
+
+def _number(attributes: dict[str, Any], key: str) -> float | None:
+    try:
+        value = float(np.ravel(attributes[key])[0])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
+    value = _number(attributes, key)
+    if value is None or value < 0 or value != int(value):
+        found = f"is {attributes[key]!r}" if key in attributes else "is missing"
+        raise InputError(f"{file}: attribute {key} {found}; it must tell how {PILOTS} is laid out")
+    return int(value)
+
+
+def _estimate(samples: NDArray[Any], layout: _Layout) -> NDArray[np.complex64]:
+    """Channel coefficients [frames, users, antennas, 52] of samples [frames, users, antennas, slot, 2]."""
+    symbols = np.stack([samples[..., first : first + FFT, :] for first in layout.starts], axis=-3)
+    # Estimates of the symbols share one known sequence, so their mean is the estimate from the mean symbol.
+    mean = symbols.mean(axis=-3, dtype=np.float32)
+    spectrum = np.fft.fft((mean[..., 0] + 1j * mean[..., 1]) / FULL_SCALE, axis=-1)
+    return (spectrum[..., SUBCARRIERS % FFT] / TRAINING).astype(np.complex64)

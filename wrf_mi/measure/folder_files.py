@@ -1,0 +1,142 @@
+"""Files that several layouts share: positions, index files and YAML, with errors that name the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..core import InputError
+from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.files import one_line, text_lines
+from ..core.types import IntArray
+
+POSITIONS = "tx_pos.csv"
+INDEX_FILES = ("train_index.txt", "test_index.txt")
+
+
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """The mapping of a YAML file; empty where it holds anything else.
+
+    Raises:
+        InputError: missing, not text or not YAML.
+    """
+    try:
+        content = yaml.safe_load("\n".join(text_lines(path)))
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
+    return content if isinstance(content, dict) else {}
+
+
+def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:
+    """A list of ``count`` finite numbers from YAML, shape [count].
+
+    Raises:
+        InputError: it is anything else.
+    """
+    try:
+        values = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise InputError(f"{path}: {what} is {value!r}; give a list of {count} finite numbers")
+    return values
+
+
+def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
+    """An orientation from YAML: a unit quaternion x, y, z, w.
+
+    Raises:
+        InputError: it is none.
+    """
+    orientation = finite_numbers(path, f"{name}: orientation", value, 4)
+    norm = float(np.linalg.norm(orientation))
+    if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
+        raise InputError(f"{path}: {name}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w")
+    return orientation
+
+
+def read_positions(path: Path) -> FloatArray:
+    """Positions [n, 3] in metres of a CSV file with the header ``x,y,z``.
+
+    Raises:
+        InputError: another header, no rows, or a row that is not three finite numbers.
+    """
+    header, *rows = text_lines(path) or [""]
+    if [column.strip().lower() for column in header.split(",")] != ["x", "y", "z"]:
+        raise InputError(f"{path}: line 1: header is {header[:40]!r}; it must be x,y,z")
+    if not rows:
+        raise InputError(f"{path}: no positions in it; give one row x,y,z in metres per sample")
+    positions = np.empty((len(rows), 3))
+    for row, text in enumerate(rows, start=1):
+        try:
+            positions[row - 1] = [float(value) for value in text.split(",", 3)]
+        except ValueError:
+            raise InputError(f"{path}: row {row}: {text[:60]!r}; give three numbers x,y,z in metres") from None
+    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if len(bad):
+        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]]!r} is not finite; correct or remove the row")
+    return positions
+
+
+def whole_number(path: Path, line: int, text: str) -> int:
+    """A whole number from 0 that stands alone on a line.
+
+    Raises:
+        InputError: the line holds anything else.
+    """
+    digits = text.strip()
+    if not (digits.isascii() and digits.isdecimal()):
+        raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
+    return int(digits)
+
+
+def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) -> tuple[IntArray, IntArray] | None:
+    """Training and test rows, from 0, of a folder's index files; None where it has neither.
+
+    Args:
+        folder: that may hold them.
+        rows: of the data.
+        first: number of the first row in these files: 1 where they name images ``00001.png``, 0 where they count.
+        source: the file whose rows are meant, for messages.
+
+    Raises:
+        InputError: one of the two is missing, or a line is no row, out of range, twice, or in both.
+    """
+    train_file, test_file = (folder / name for name in INDEX_FILES)
+    if not train_file.exists() and not test_file.exists():
+        return None
+    train, test = (_read_index(path, rows, first, source) for path in (train_file, test_file))
+    both = np.intersect1d(train, test)
+    if len(both):
+        raise InputError(
+            f"{test_file}: row {both[0] + first} is in {train_file.name} as well; remove it from one of them"
+        )
+    return train, test
+
+
+def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
+    seen: dict[int, int] = {}
+    for line, text in enumerate(text_lines(path), start=1):
+        row = whole_number(path, line, text)
+        if not first <= row < rows + first:
+            known = f"{source} has rows {first} to {rows + first - 1}"
+            raise InputError(f"{path}: line {line}: row {row} is out of range; {known}")
+        if row in seen:
+            raise InputError(f"{path}: line {line}: row {row} stands in line {seen[row]} already; remove one of them")
+        seen[row] = line
+    if not seen:
+        raise InputError(f"{path}: no rows in it; give one row number per line")
+    return np.array(list(seen), np.int64) - first
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Write lines of text, each ended."""
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
+
+
+def write_positions(path: Path, positions_m: FloatArray) -> None:
+    """Write positions [n, 3] as `read_positions` reads them, to the last digit."""
+    write_lines(path, ["x,y,z", *(",".join(repr(float(v)) for v in position) for position in positions_m)])

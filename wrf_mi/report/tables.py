@@ -1,0 +1,250 @@
+"""Every method of the paper in one table for each task, measured by the project's own command.
+
+Each row is a run of ``wrf-mi train`` in a process of its own. It is written down the moment it is done, as a JSON file
+among the results, so an interrupted measurement goes on where it stopped, on another machine too; to have a row
+measured again, delete its file. The rows of `wrf_mi.report.table_plan` are in an order that makes tables whole early.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import InputError
+from ..core.files import write_atomically
+from ..fit.folder import versions
+from ..measure.registry import locate
+from ..parallel import Scheduler, SerialScheduler, run_module
+from ..scene.make import make_scene
+from ..trace.furnished import traced_room
+from .bench import BenchFailed, machine, threads
+from .bench_hybrid_csi import SCANNED, scanned_scene
+from .figures import save, score_cdf
+from .metrics import TASKS, summary
+from .run_folder import CONFIG, METRICS, read_run
+from .table_plan import PARTS, Part, Row, available, plan
+
+FOLDER = "tables"
+"""In the folder of results; ``tables-quick`` for the small version."""
+QUANTILES = 101
+"""Of the scores of a row, equally spaced shares: what a distribution is drawn from."""
+FLAT_HEIGHT_M = 2.7
+"""Ceiling of the flat whose layout has none."""
+SCAN_SEED = 1
+"""Of the noise of simulated scans."""
+KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
+
+
+def scene_of(part: Part, folder: Path) -> list[str]:
+    """Arguments that name the scene of a part, which is made in ``folder`` where nobody has made it.
+
+    Raises:
+        InputError: data that are not on this machine.
+    """
+    if part.scene == "laboratory":
+        return ["--scene", "laboratory"]
+    if part.scene == "room":
+        return ["--scene", str(traced_room()[1])]
+    place = locate(part.dataset)
+    if place is None:
+        raise InputError(f"data set {part.dataset}: not on this machine; see wrf-mi data list")
+    if part.scene == "flat":
+        made = folder / "flat"
+        if not made.exists():
+            make_scene(place / "layout.csv", made, height_m=FLAT_HEIGHT_M)
+        return ["--scene", str(made)]
+    # The room's own mesh is what the data were computed with: a model is given one made from a scan, as on site.
+    scanned = folder / part.dataset
+    if not (scanned / SCANNED).exists():
+        scanned.mkdir(parents=True, exist_ok=True)
+        scanned_scene(place / f"{part.dataset.removeprefix('newrf-')}.npz", scanned, SCAN_SEED)
+    return ["--scene", str(scanned / SCANNED)]
+
+
+def measure(runs: Path, row: Row) -> dict[str, Any]:
+    """One row: the run, unless its folder is there, and its figures.
+
+    Raises:
+        BenchFailed: the command ended with an error.
+    """
+    folder = runs / row.name
+    scene = scene_of(row.part, runs / "scenes") if row.part.scene and "{scene}" in row.entry.arguments else []
+    arguments = row.arguments(scene)
+    wall = None
+    if not (folder / METRICS).exists():
+        resumed = (folder / CONFIG).exists()
+        if folder.exists() and not resumed:
+            shutil.rmtree(folder)  # stopped before it said what it is
+        call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
+        start = time.perf_counter()
+        status, said = run_module("wrf_mi.cli", call)
+        if status != 0:
+            raise BenchFailed(f"tables: `wrf-mi {' '.join(call)}` ended with status {status} {said}".rstrip())
+        wall = None if resumed else time.perf_counter() - start
+    run = read_run(folder)
+    scores = np.sort(run.score[~np.isnan(run.score)])
+    return {
+        "row": row.name,
+        "label": row.entry.label,
+        "share": row.share,
+        "seed": row.seed,
+        "command": "wrf-mi " + " ".join(arguments),
+        "date": time.strftime("%Y-%m-%d"),
+        "machine": machine(),
+        "versions": versions(),
+        "wall_seconds": wall,
+        **threads(),
+        **{key: run.metrics[key] for key in KEPT},
+        "score": summary(scores),
+        "quantiles": [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))],
+    }
+
+
+def tables(
+    out: Path, runs: Path, quick: bool = False, scheduler: Scheduler | None = None, most_s: float | None = None
+) -> list[dict[str, Any]]:
+    """Measure all rows that are not stored yet and write tables and pictures.
+
+    A row whose command fails is reported and left out; the others go on.
+
+    Args:
+        out: folder of results; rows go to ``tables/`` in it, or ``tables-quick/``.
+        runs: folder for run folders.
+        quick: the small version.
+        scheduler: whose workers measure a row each at a time; None: this process.
+        most_s: no row is begun after so many seconds; None: all are.
+
+    Returns:
+        All stored rows.
+
+    Raises:
+        BenchFailed: rows that did not finish, after all others.
+    """
+    place = out / (f"{FOLDER}-quick" if quick else FOLDER)
+    place.mkdir(parents=True, exist_ok=True)
+    rows = plan(quick)
+    missing = sorted({row.part.dataset for row in rows if not available(row.part)})
+    for name in missing:
+        print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
+    left = [row for row in rows if available(row.part) and not (place / f"{row.name}.json").exists()]
+    print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
+    begun = time.perf_counter()
+    failures: list[str] = []
+
+    def each(index: int, result: dict[str, Any] | str) -> None:
+        if isinstance(result, str):
+            if result:
+                failures.append(result)
+                print(result, file=sys.stderr, flush=True)
+            return
+        write_atomically(place / f"{left[index].name}.json", json.dumps(result, indent=1) + "\n")
+        text = f"{result['row']}: median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s"
+        print(text, file=sys.stderr, flush=True)
+        write_tables(place, quick)
+
+    call = partial(_guarded, runs / place.name, None if most_s is None else time.time() + most_s)
+    (scheduler or SerialScheduler()).map(call, left, what="measuring", each=each)
+    write_tables(place, quick)
+    print(f"tables: {place / 'README.md'} after {(time.perf_counter() - begun) / 60:.0f} min", file=sys.stderr)
+    if failures:
+        raise BenchFailed(f"tables: {len(failures)} rows did not finish: {failures[0]}")
+    return read_rows(place)
+
+
+def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:
+    """A row, or why there is none; "" where there was no time for it."""
+    if until is not None and time.time() > until:
+        return ""
+    try:
+        return measure(runs, row)
+    except (BenchFailed, InputError) as error:
+        return str(error)
+
+
+def read_rows(place: Path) -> list[dict[str, Any]]:
+    """All rows stored in a folder."""
+    return [json.loads(path.read_text()) for path in sorted(place.glob("*-seed*.json"))]
+
+
+def write_tables(place: Path, quick: bool = False) -> None:
+    """Tables as Markdown in ``README.md`` and a picture of the distributions of each part, from what is stored."""
+    stored = {row["row"]: row for row in read_rows(place)}
+    text = ["# Every method, task by task", NOTE]
+    for part in PARTS:
+        own = [row for row in plan(quick) if row.part == part and row.name in stored]
+        if not own:
+            continue
+        title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
+        text += [f"## {title}", part_table(part, own, stored)]
+        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
+        picture = f"{part.task}-{part.dataset}-{part.split}.png"
+        figure = score_cdf(
+            {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
+        )
+        save(figure, place / picture)
+        text.append(f"![Distribution of the scores of each method]({picture})")
+    write_atomically(place / "README.md", "\n\n".join(text) + "\n")
+
+
+NOTE = (
+    "Written by `wrf-mi bench tables`; each row's JSON file has its command, machine, versions and date. Scores are "
+    "over test rows: SSIM and channel estimation accuracy (CEA, dB) are better when larger, errors in dB when smaller. "
+    "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets. "
+    "*Paper* is what the WRF-GS+ paper states **on other data**: the full NeRF2 and Argos sets, which are not public "
+    "in that form. Times are of the machine in the JSON files, which others used too: read ratios."
+)
+
+
+def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
+    """Markdown table of one data set under one split: best median first, fewer rows below."""
+    task = TASKS[part.task]
+    sign = -1 if task.higher_is_better else 1
+    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row.share, row.method), []).append(stored[row.name])
+
+    def median(key: tuple[float, str]) -> float:
+        return float(np.mean([one["score"]["median"] for one in groups[key]]))
+
+    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
+    lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
+    digits = 3 if part.task == "spectrum" else 2
+    for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
+        found = groups[share, method]
+        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
+        medians = [one["score"]["median"] for one in found]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
+        cells = [
+            str(found[0]["n_train"]),
+            part.entries[method].label,
+            f"**{each['median']:.{digits}f}**{spread}",
+            *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
+            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
+            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
+            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
+            part.entries[method].published if share == max(row.share for row in rows) else "",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += _reference_rows(part, groups)
+    return "\n".join(lines)
+
+
+def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
+    """What every run is held against where no row of its own measures it."""
+    if "idw" in part.entries:
+        return []
+    digits, share = 2, max(share for share, _ in groups)
+    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
+    words, lines = TASKS[part.task].references, []
+    for key, block in one["reference"].items():
+        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
+        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
+    return lines
