@@ -21,10 +21,10 @@ def same_threads() -> Iterator[None]:
     drjit = sys.modules.get("drjit")
     before = drjit and drjit.thread_count()
     yield
-    if drjit is not None and drjit.thread_count() != before:
-        # Kernels that wait have room for sums of as many threads as there were when they were launched.
-        drjit.sync_thread()
-        drjit.set_thread_count(before)
+    if before:
+        from wrf_mi.backend import set_threads
+
+        set_threads(before)
 
 
 @pytest.fixture(scope="session")

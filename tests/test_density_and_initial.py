@@ -19,6 +19,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_float  # noqa: E402
 from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix  # noqa: E402
 from wrf_mi.field import gaussians_from_points, random_gaussians  # noqa: E402
 from wrf_mi.field.density import SPLIT_SHRINK, DensityChange, adapt, logit, reset_opacity  # noqa: E402
@@ -182,7 +183,7 @@ def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
         dr.backward(sum(dr.sum(dr.square(p.array + 1)) for p in state.adam.values()))
         state.adam.step()
     state.mean = {name: mi.TensorXf(values + 7) for name, values in state.params().items()}
-    state.urge, state.urge_steps = mi.Float(np.arange(n)), 3
+    state.urge, state.urge_steps = to_float(np.arange(n)), 3
     return state, state.params()
 
 

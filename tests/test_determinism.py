@@ -93,7 +93,7 @@ def test_a_gpu_computes_the_same(folder: Path) -> None:
 
 
 def test_deterministic_fits_take_one_thread_of_the_cpu(one_gateway: Record) -> None:
-    dr.set_thread_count(2)
+    backend.set_threads(2)
     Trainer(one_gateway, official(one_gateway), settings("steps=1"))
     assert dr.thread_count() == 2
     Trainer(one_gateway, official(one_gateway), settings("steps=1", "deterministic=true"))

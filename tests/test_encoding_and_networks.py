@@ -18,6 +18,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, Receiver  # noqa: E402
 from wrf_mi.field import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians  # noqa: E402
 from wrf_mi.field.encoding import encode, encoded_size  # noqa: E402
@@ -61,12 +62,12 @@ def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float
 def test_float32_keeps_its_digits_far_out() -> None:
     """At 100 m the tenth octave has 25,600 whole turns: taken off exactly, they cost no digit."""
     points = np.float32(np.random.default_rng(0).uniform(90, 100, (3, 500)))
-    encoded = encode(mi.TensorXf(points), 10, 1.0).numpy()
+    encoded = encode(to_tensor(points), 10, 1.0).numpy()
     np.testing.assert_allclose(encoded, paper_encoding(points.astype(float), 10), atol=FLOAT32_TOLERANCE)
 
 
 def test_encoding_of_zero_octaves_is_empty() -> None:
-    assert encode(mi.TensorXf(np.ones((3, 4), np.float32)), 0, 1.0).shape == (0, 4)
+    assert encode(to_tensor(np.ones((3, 4), np.float32)), 0, 1.0).shape == (0, 4)
 
 
 @pytest.mark.gradcheck
@@ -271,8 +272,8 @@ def test_attenuation_stays_below_one() -> None:
 def test_signals_are_signed(model: str) -> None:
     """Real and imaginary parts of either sign: nothing clamps what is to interfere."""
     weights = start(FIELDS[model](), 100)
-    params = {k: mi.TensorXf(v) for k, v in weights.items()}
-    for part in FIELDS[model]().gaussians(params, mi.TensorXf(np.zeros((3, 1), np.float32))).signal:
+    params = {k: to_tensor(v) for k, v in weights.items()}
+    for part in FIELDS[model]().gaussians(params, to_tensor(np.zeros((3, 1), np.float32))).signal:
         values = part.numpy()
         assert values.min() < 0 < values.max()
 
@@ -281,9 +282,9 @@ def test_signals_are_signed(model: str) -> None:
 def test_no_octaves_for_the_transmitter(model: str) -> None:
     """Zero octaves leave the transmitter out: all its positions see the same field."""
     field = FIELDS[model](encoding=Encoding(tx_octaves=0))
-    params = {k: mi.TensorXf(v) for k, v in start(field, 5).items()}
+    params = {k: to_tensor(v) for k, v in start(field, 5).items()}
     assert not any("transmitter" in name for name in params)
-    g = field.gaussians(params, mi.TensorXf(np.random.default_rng(1).random((3, 2)).astype(np.float32)))
+    g = field.gaussians(params, to_tensor(np.random.default_rng(1).random((3, 2)).astype(np.float32)))
     for part in g.signal:
         np.testing.assert_array_equal(part.numpy()[:5], part.numpy()[5:])
 

@@ -12,6 +12,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.baselines.band_fields import spread  # noqa: E402
 from wrf_mi.baselines.gaussian_evaluation import AT_ONCE, Evaluation, GaussianSettings, frame_of  # noqa: E402
 from wrf_mi.baselines.gaussian_fields import components_of, method_of  # noqa: E402
@@ -19,7 +20,6 @@ from wrf_mi.baselines.method import inputs_of  # noqa: E402
 from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.field import random_gaussians  # noqa: E402
-from wrf_mi.field.device import to_tensor  # noqa: E402
 from wrf_mi.fit.step import device_pose  # noqa: E402
 from wrf_mi.receive.operator import SectorOperator  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hybrid_room import CEILING, FREQUENCY_HZ, HEIGHT, WALLS, receiver, room, transmitters
 
+from wrf_mi.backend.device import to_tensor
 from wrf_mi.hybrid import (
     ArrayReceiver,
     CsiReceiver,
@@ -24,7 +25,6 @@ from wrf_mi.hybrid import (
 
 # isort: split
 import drjit as dr
-import mitsuba as mi
 
 from wrf_mi.core import pixel_directions
 from wrf_mi.core.arrays import planar_array
@@ -131,9 +131,9 @@ def test_the_pose_too(truth: Truth) -> None:
     truth_pose = np.array([0.02, -0.015, 0.01]), np.radians([0.5, -1.0, 2.0])
     view = truth.fit(True, False).views[0]
     assert view.traced is not None
-    parameters = {name: mi.TensorXf(value) for name, value in view.traced.parameters().items()}
+    parameters = {name: to_tensor(value) for name, value in view.traced.parameters().items()}
     names = [f"receiver.array.{what}" for what in ("position", "turn")]
-    moved = {name: mi.TensorXf(value.astype(np.float32)) for name, value in zip(names, truth_pose, strict=True)}
+    moved = {name: to_tensor(value) for name, value in zip(names, truth_pose, strict=True)}
     observed = view.model(view.traced({**parameters, **moved}), None).numpy().reshape(TRAIN, ROWS, COLUMNS)
     rates = {"receiver.*.position": 0.002, "receiver.*.turn": 0.005, "*": 0.0}
     fit = JointFit(truth.positions[:TRAIN], [replace(view, observation=observed)], rates=rates)

@@ -11,6 +11,7 @@ import pytest
 from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 from scipy.constants import speed_of_light
 
+from wrf_mi.backend.device import to_uint
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.hybrid import TracedField, TracedOptions
 
@@ -136,7 +137,7 @@ def test_derivatives_by_materials_are_those_of_sionna_rt(scene: Any) -> None:
     dr.enable_grad(logs)
     names = [f"material.itu_concrete.{quantity}" for quantity in ("permittivity", "conductivity")]
     paths = traced(tensors(traced) | dict(zip(names, logs, strict=True)))
-    place = mi.UInt32(np.flatnonzero(traced.exists).astype(np.uint32))
+    place = to_uint(np.flatnonzero(traced.exists))
     re, im = (dr.gather(Float64, part, place) for part in paths.gain)
     dr.backward(dr.sum(re * Float64(weight[0]) + im * Float64(weight[1])))
     ours = [float(dr.grad(log).array[0]) / scale for log, scale in zip(logs, (4.1, 0.06), strict=True)]

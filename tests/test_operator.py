@@ -16,6 +16,7 @@ import mitsuba as mi  # noqa: E402
 from hypothesis import HealthCheck, given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
+from wrf_mi.backend.device import on_device  # noqa: E402
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors  # noqa: E402
 from wrf_mi.core.arrays import planar_array  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
@@ -69,7 +70,7 @@ def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Ga
     delta = np.sqrt(rng.uniform(0, 1, n)) * 0.99 * np.exp(1j * rng.uniform(-np.pi, np.pi, n))
     opacity = rng.uniform(0.01, 0.99, n)
     return Gaussians(
-        position=[float_type(np.ascontiguousarray(c)) for c in position.T],
+        position=[on_device(c, float_type) for c in position.T],
         scale=[float_type(c) for c in scale],
         rotation=[float_type(c) for c in rotation],
         signal=[float_type(signal.real.copy()), float_type(signal.imag.copy())],

@@ -236,7 +236,7 @@ def test_factorised_needs_to_see_the_transmitter() -> None:
 
 def test_the_factorised_field_is_its_sum() -> None:
     """S = C phi, per transmitter."""
-    from wrf_mi.field.device import to_tensor
+    from wrf_mi.backend.device import to_tensor
 
     field, params = made("factorised")
     tensors = {name: to_tensor(values) for name, values in params.items()}

@@ -15,9 +15,9 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 from made_spectra import RECEIVERS, SIZE, true_field  # noqa: E402
 
+from wrf_mi.backend.device import to_float, to_tensor  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.field import FIELDS, Gaussians, random_gaussians  # noqa: E402
-from wrf_mi.field.device import to_tensor  # noqa: E402
 from wrf_mi.field.parts import gaussians_in_parts  # noqa: E402
 from wrf_mi.fit import step  # noqa: E402
 from wrf_mi.fit.predictor import Predictor  # noqa: E402
@@ -34,11 +34,11 @@ ROUNDING = 1e-5
 def gaussians(batch: int, count: int, size: float) -> Gaussians:
     rng = np.random.default_rng(3)
     return Gaussians(
-        position=[mi.Float(x.astype(np.float32)) for x in rng.normal(0, 2, (3, count))],
+        position=[to_float(x) for x in rng.normal(0, 2, (3, count))],
         scale=[mi.Float(np.full(batch * count, size, np.float32)) for _ in range(3)],
-        rotation=[mi.Float(x.astype(np.float32)) for x in rng.normal(size=(4, batch * count))],
-        signal=[mi.Float(x.astype(np.float32)) for x in rng.normal(size=(2, batch * count))],
-        opacity=mi.Float(rng.uniform(0, 0.9, batch * count).astype(np.float32)),
+        rotation=[to_float(x) for x in rng.normal(size=(4, batch * count))],
+        signal=[to_float(x) for x in rng.normal(size=(2, batch * count))],
+        opacity=to_float(rng.uniform(0, 0.9, batch * count)),
         attenuation=None,
         batch=batch,
     )

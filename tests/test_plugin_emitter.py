@@ -17,6 +17,7 @@ import mitsuba as mi  # noqa: E402
 from wrf_mi_plugins import emitter as plugin  # noqa: E402
 from wrf_mi_plugins.shape import shape_parameters  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import rotation_matrix  # noqa: E402
 from wrf_mi.field.models import GEOMETRY  # noqa: E402
 
@@ -50,8 +51,8 @@ def scene_of(emitter: Any, **entries: Any) -> Any:
 
 def expected_parameters(model: str, tx: tuple, **changed: np.ndarray) -> dict[str, np.ndarray]:
     """What the shape should hold, straight from the field."""
-    params = {name: mi.TensorXf(values) for name, values in (weights_of(model) | changed).items()}
-    gaussians = FIELDS[model].gaussians(params, mi.TensorXf(np.array(tx, np.float32)[:, None]))
+    params = {name: to_tensor(values) for name, values in (weights_of(model) | changed).items()}
+    gaussians = FIELDS[model].gaussians(params, to_tensor(np.array(tx)[:, None]))
     return {name: plain(values) for name, values in shape_parameters(gaussians).items()}
 
 
@@ -77,7 +78,7 @@ def test_shape_follows_transmitter_and_weights(model: str) -> None:
     assert_shape_holds(scene, moved)
     name = "signal.out.bias" if model == "wrf-gs" else "deform.signal.bias"
     other = weights_of(model)[name] + 0.5
-    params[f"transmitter.{name.replace('.', '_')}"] = mi.TensorXf(other)
+    params[f"transmitter.{name.replace('.', '_')}"] = to_tensor(other)
     params.update()
     changed = expected_parameters(model, elsewhere, **{name: other})
     np.testing.assert_allclose(changed["signal"], moved["signal"] + 0.5, atol=1e-4)
@@ -100,7 +101,7 @@ def test_number_of_gaussians_may_change() -> None:
     params = mi.traverse(scene)
     for name, values in weights_of("wrf-gs+").items():
         if name in FIELDS["wrf-gs+"].per_gaussian:
-            params[f"transmitter.{name}"] = mi.TensorXf(np.ascontiguousarray(values[:, :4]))
+            params[f"transmitter.{name}"] = to_tensor(values[:, :4])
     params.update()
     few = expected_parameters("wrf-gs+", TX)
     assert_shape_holds(scene, {name: values.reshape(6, -1)[:4].ravel() for name, values in few.items()})
@@ -116,7 +117,7 @@ def test_number_of_gaussians_may_change() -> None:
 def test_scene_is_traced_anew_where_gaussians_move() -> None:
     scene = scene_of(made("wrf-gs+"))
     params = mi.traverse(scene)
-    params["transmitter.position"] = mi.TensorXf(params["transmitter.position"].numpy() + np.array([[0], [0], [100]]))
+    params["transmitter.position"] = to_tensor(params["transmitter.position"].numpy() + np.array([[0], [0], [100]]))
     params.update()
     centre = plain(params["gaussians.data"]).reshape(-1, 10)[0, :3]
     assert centre[2] > 90

@@ -21,6 +21,7 @@ from wrf_mi_plugins import integrator as integrator_module  # noqa: E402
 from wrf_mi_plugins.sensor import receiver_to_world  # noqa: E402
 from wrf_mi_plugins.shape import gaussian_shape, shape_parameters  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, pixel_directions  # noqa: E402
 from wrf_mi.core.angles import sphere_directions  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
@@ -177,7 +178,7 @@ def test_derivatives_through_render(blending: str) -> None:
     for name in values:
         dr.enable_grad(params[f"gaussians.{name}"])
     params.update()
-    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(weight), axis=None))
+    dr.backward(dr.sum(mi.render(scene, params) * to_tensor(weight), axis=None))
     gradient = {name: params[f"gaussians.{name}"].grad.numpy().astype(float) for name in values}
 
     data = values["data"].reshape(20, 10)

@@ -17,6 +17,7 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 from wrf_mi_plugins.acceleration import traced_lists  # noqa: E402
 
+from wrf_mi.backend.device import on_device  # noqa: E402
 from wrf_mi.core import pixel_directions, rotation_matrix  # noqa: E402
 from wrf_mi.core.angles import sphere_directions  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
@@ -40,7 +41,7 @@ Float64 = dr.float64_array_t(mi.Float)
 
 
 def columns(values: np.ndarray, float_type: Any) -> list[Any]:
-    return [float_type(np.ascontiguousarray(c)) for c in values.reshape(-1, values.shape[-1]).T]
+    return [on_device(c, float_type) for c in values.reshape(-1, values.shape[-1]).T]
 
 
 def gaussians_of(field: dict[str, np.ndarray], blending: str, float_type: Any = Float64) -> Gaussians:

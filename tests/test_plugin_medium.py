@@ -17,6 +17,7 @@ import mitsuba as mi  # noqa: E402
 from wrf_mi_plugins import emitter as emitter_plugin  # noqa: E402
 from wrf_mi_plugins import medium as plugin  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.project.optical_depth import attenuators, optical_depth  # noqa: E402
 
 emitter_plugin.register()
@@ -48,7 +49,7 @@ def arrays(kind: str = "plain", opacity: float | None = None, seed: int = 0) -> 
 
 
 def medium_of(values: dict[str, np.ndarray], **more: Any) -> dict[str, Any]:
-    return {"type": "wrf_gaussian_medium", **{name: mi.TensorXf(v) for name, v in values.items()}, **more}
+    return {"type": "wrf_gaussian_medium", **{name: to_tensor(v) for name, v in values.items()}, **more}
 
 
 def scene_of(medium: Any, **entries: Any) -> Any:
@@ -245,8 +246,8 @@ def test_medium_follows_its_emitter(model: str) -> None:
     ray = ray_of(np.zeros((200, 3)), direction)
 
     def direct(tx: tuple, weights: dict[str, np.ndarray]) -> np.ndarray:
-        tensors = {name: mi.TensorXf(values) for name, values in weights.items()}
-        gaussians = FIELDS[model].gaussians(tensors, mi.TensorXf(np.array(tx, np.float32)[:, None]))
+        tensors = {name: to_tensor(values) for name, values in weights.items()}
+        gaussians = FIELDS[model].gaussians(tensors, to_tensor(np.array(tx)[:, None]))
         zero = [mi.Float(0)] * 3
         depth = optical_depth(attenuators(gaussians), zero, list(ray.d), mi.Float(0), mi.Float(np.inf))
         return plain(depth)
@@ -298,7 +299,7 @@ def test_input_is_checked() -> None:
         r"scales has shape \[5, 3\]; with these centers give \[6, 3\]": {**values, "scales": np.ones((5, 3))},
     }
     for message, entry in wrong.items():
-        tensors = {k: v if isinstance(v, str) else mi.TensorXf(v) for k, v in entry.items()}
+        tensors = {k: v if isinstance(v, str) else to_tensor(v) for k, v in entry.items()}
         with pytest.raises(RuntimeError, match=message):
             mi.load_dict({"type": "wrf_gaussian_medium", **tensors})
     assert "6 Gaussians, extinction below" in str(mi.load_dict(medium_of(values)))

@@ -20,6 +20,7 @@ import mitsuba as mi  # noqa: E402
 import wrf_mi_plugins  # noqa: E402
 from wrf_mi_plugins.shape import shape_parameters  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import Record  # noqa: E402
 from wrf_mi.fit.folder import read_checkpoint, read_config  # noqa: E402
 from wrf_mi.fit.trainer import final_params, make_field  # noqa: E402
@@ -116,9 +117,9 @@ def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.Mo
 def test_run_folder_says_what_the_shape_holds(run: Path) -> None:
     """The mean parameters of the checkpoint, through the model that the configuration names."""
     scene = mi.load_dict(as_dict(str(run)))
-    params = {name: mi.TensorXf(values) for name, values in final_params(read_checkpoint(run)).items()}
+    params = {name: to_tensor(values) for name, values in final_params(read_checkpoint(run)).items()}
     field = make_field(read_config(run).settings)
-    gaussians = field.gaussians(params, mi.TensorXf(np.array(TX, np.float32)[:, None]))
+    gaussians = field.gaussians(params, to_tensor(np.array(TX)[:, None]))
     got = mi.traverse(scene)
     for name, values in shape_parameters(gaussians).items():
         np.testing.assert_allclose(plain(got[f"gaussians.{name}"]), plain(values), rtol=1e-5, atol=1e-6)

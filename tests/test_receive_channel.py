@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.constants import speed_of_light
 
+from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receive import antenna_csi, channel, csi, element_signals, received_power, rssi_dbm
@@ -129,7 +130,7 @@ def test_signal_strength_with_derivatives():
 
     double: Any = dr.float64_array_t(mi.Float)
     paths = made()
-    pair = mi.UInt32((paths.rx * paths.n_tx + paths.tx).astype(np.uint32))
+    pair = to_uint(paths.rx * paths.n_tx + paths.tx)
     weights = double(np.random.default_rng(2).normal(size=12))
 
     def strengths(real: Any) -> Any:

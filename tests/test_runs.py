@@ -13,7 +13,7 @@ import yaml
 from made_spectra import SIZE
 from small_fits import official, settings, stop_after
 
-from wrf_mi.backend import init
+from wrf_mi.backend import init, set_threads
 
 init()
 
@@ -85,7 +85,7 @@ def test_resumed_run_is_the_same_bit_for_bit(folder: Path, tmp_path: Path) -> No
 
 
 def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -> None:
-    dr.set_thread_count(max(2, dr.thread_count()))
+    set_threads(max(2, dr.thread_count()))
     config = settings("steps=40", "checkpoint_every=8")
     train(folder, tmp_path / "whole", config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)

@@ -14,6 +14,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors  # noqa: E402
 from wrf_mi.field import FIELDS, Encoding, Gaussians, random_gaussians  # noqa: E402
 from wrf_mi.project.footprint import Pose  # noqa: E402
@@ -147,7 +148,7 @@ def test_nothing_to_see_is_dark() -> None:
     below = RECEIVER.position_m - RECEIVER.to_world @ np.array([0.0, 0.0, 5.0])
     where = np.tile(below, (5, 1)).T
     where[:, 0] = RECEIVER.position_m + 0.01
-    params["position"] = mi.TensorXf(where)
+    params["position"] = to_tensor(where)
     params["log_scale"] = mi.TensorXf(np.full((3, 5), -2.0))
     re, im = splat(
         field.gaussians(params, mi.TensorXf(np.zeros((3, 1)))),

@@ -19,6 +19,7 @@ wrf_mi.backend.init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_float  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.loss.spectrum import spectrum_loss  # noqa: E402
 from wrf_mi.loss.ssim import ssim  # noqa: E402
@@ -170,7 +171,7 @@ def test_frozen_function_gives_the_same_as_the_plain_one():
         size = shape[1] * shape[2]
         i = dr.arange(mi.UInt32, shape[0] * size)
         truth = dr.gather(mi.Float, stack, choice * size + i)
-        variable = mi.Float(prediction)
+        variable = to_float(prediction)
         dr.enable_grad(variable)
         loss, _ = spectrum_loss(variable, truth, *shape)
         dr.backward(loss)
@@ -178,9 +179,9 @@ def test_frozen_function_gives_the_same_as_the_plain_one():
 
     frozen = dr.freeze(step)
     rng = np.random.default_rng(5)
-    stack = mi.Float(rng.random(4 * 12 * 13).astype(np.float32))
+    stack = to_float(rng.random(4 * 12 * 13))
     for k in range(3):
-        prediction = mi.Float(rng.random(np.prod(shape)).astype(np.float32))
+        prediction = to_float(rng.random(np.prod(shape)))
         choice = dr.opaque(mi.UInt32, k)
         for a, b in zip(frozen(prediction, stack, choice), step(prediction, stack, choice), strict=True):
             assert np.array(a) == pytest.approx(np.array(b), rel=1e-6)

@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 
 from wrf_mi.baselines.models import METHODS
-from wrf_mi.report import tables
+from wrf_mi.report import table_pages, tables
 from wrf_mi.report.bench import BenchFailed
 from wrf_mi.report.table_plan import PARTS, QUICK_PARTS, Row, plan
 
@@ -65,7 +65,8 @@ def test_arguments_are_those_of_a_run_of_that_kind():
 def short_plan(monkeypatch):
     part = next(part for part in PARTS if part.dataset == "traced-csi-flat")
     rows = [Row(part, "fire", 1.0, 0), Row(part, "r2f2", 1.0, 0), Row(part, "fire", 0.1, 0)]
-    monkeypatch.setattr(tables, "plan", lambda quick=False: rows)
+    for module in (tables, table_pages):
+        monkeypatch.setattr(module, "plan", lambda quick=False: rows)
     return rows
 
 
@@ -98,7 +99,7 @@ def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path
     fire, r2f2, few = short_plan
     for row, median in ((fire, 5.0), (r2f2, 6.5), (few, 9.0)):
         (tmp_path / f"{row.name}.json").write_text(json.dumps(made_row(row, median)))
-    tables.write_tables(tmp_path)
+    table_pages.write_tables(tmp_path)
     text = (tmp_path / "README.md").read_text()
     order = [text.index(cell) for cell in ("| R2F2 | **6.50**", "| FIRE | **5.00**", "| FIRE | **9.00**", "**-7.00**")]
     assert order == sorted(order)
@@ -110,3 +111,21 @@ def test_data_that_are_not_here_are_left_out(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tables, "available", lambda part: False)
     assert tables.tables(tmp_path, tmp_path / "runs") == []
     assert "flat-ble is not on this machine" in capsys.readouterr().err
+
+
+def test_an_overview_has_a_line_a_method_and_the_mean_over_seeds(monkeypatch):
+    flat, office = (part for part in PARTS if part.dataset.startswith("traced-csi-"))
+    rows = [
+        Row(flat, "fire", 1.0, 0),
+        Row(flat, "fire", 1.0, 1),
+        Row(flat, "fire", 0.1, 0),
+        Row(office, "fire", 1.0, 0),
+    ]
+    rows += [Row(flat, "r2f2", 1.0, 0)]
+    monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
+    medians = (5.0, 7.0, 100.0, 3.0, 9.5)
+    stored = {row.name: made_row(row, median) for row, median in zip(rows, medians, strict=True)}
+    lines = table_pages.task_overview("csi", stored).splitlines()
+    assert lines[0] == "| CEA (dB) | traced-csi-flat | traced-csi-office | paper, other data |"
+    assert lines[2:] == ["| R2F2 | **9.50** |  | 8.57 |", "| FIRE | 6.00 | **3.00** | 15.29 |"]
+    assert table_pages.task_overview("rssi", stored) == ""

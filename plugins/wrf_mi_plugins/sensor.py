@@ -13,6 +13,7 @@ import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import ArrayLike  # noqa: E402
 
+from wrf_mi.backend.device import to_vectors  # noqa: E402
 from wrf_mi.core import InputError, pixel_directions, rotation_matrix  # noqa: E402
 from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, sphere_directions  # noqa: E402
 from wrf_mi.project.footprint import Pose  # noqa: E402
@@ -75,7 +76,7 @@ class PerceptionPlane(mi.Sensor):
         width, height = (int(s) for s in self.film().size())
         if self._size != (height, width):
             table = DIRECTIONS[self.coverage](height, width).reshape(-1, 3)
-            self._table = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in table.T))
+            self._table = to_vectors(table, mi.Vector3f)
             dr.eval(self._table)
             self._size = height, width
         return self._table

@@ -15,6 +15,7 @@ import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import ArrayLike  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.field.gaussians import Gaussians  # noqa: E402
 from wrf_mi.field.models import GEOMETRY  # noqa: E402
@@ -67,7 +68,7 @@ def source_of(field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike
     position = np.asarray(tx_position_m, float)
     if position.shape != (3,) or not np.isfinite(position).all():
         raise InputError(f"tx_position: expected three finite coordinates in metres, got {tx_position_m!r}")
-    tensors = {name: mi.TensorXf(np.asarray(values, np.float32)) for name, values in params.items()}
+    tensors = {name: to_tensor(values) for name, values in params.items()}
     return FieldSource(field, tensors, mi.Point3f(*position.tolist()))
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import trimesh
 
 from .build_laboratory import Mesh, Span, box, sheet, table, wall
+from .furnished import GENERIC
 
 Point = tuple[float, float]
 Opening = tuple[Span, Span]
@@ -26,13 +28,30 @@ class FloorPlan:
 
     Attributes:
         parts: radio material and mesh of each part by its name, metres.
+        bare: names of the parts that are left of an empty floor: its floor, ceiling, walls and panes.
         station_m: middle of the base station's array, which looks along +x.
         routes: closed polylines of places (x, y) in metres that users walk round, clear of all that is in the way.
     """
 
     parts: Parts
+    bare: tuple[str, ...]
     station_m: tuple[float, float, float]
     routes: tuple[tuple[Point, ...], ...]
+
+
+def measured(plan: FloorPlan, error_m: float, seed: int) -> Parts:
+    """The bare floor with the measurement's error, all of `GENERIC`: what a model is given.
+
+    Args:
+        plan: what was measured.
+        error_m: standard deviation of each part's displacement along x, y and z, metres.
+        seed: of the displacements.
+    """
+    off = np.random.default_rng(seed).normal(0, error_m, (len(plan.bare), 3))
+    moved = {name: plan.parts[name][1].copy() for name in plan.bare}
+    for mesh, by in zip(moved.values(), off, strict=True):
+        mesh.apply_translation(by)
+    return {name: (GENERIC, mesh) for name, mesh in moved.items()}
 
 
 def _joined(*meshes: Mesh) -> Mesh:
@@ -106,7 +125,7 @@ def flat() -> FloorPlan:
     east = ((8.65, 4.2), (8.65, 5.4), (8.4, 7.3), (7.4, 6.4), (8.65, 5.4), (8.65, 4.2), (9.9, 4.2))
     bath = ((5.0, 4.2), (5.0, 6.6), (5.0, 4.2), (0.9, 4.2))
     parts = {name: (materials[name], mesh) for name, mesh in meshes.items()}
-    return FloorPlan(parts, (0.3, 1.8, 2.1), (living, kitchen, west, east, bath))
+    return FloorPlan(parts, (*shell, *inner), (0.3, 1.8, 2.1), (living, kitchen, west, east, bath))
 
 
 def office() -> FloorPlan:
@@ -149,4 +168,6 @@ def office() -> FloorPlan:
     rooms_east = ((12.65, 6.2), (12.65, 7.9), (10.6, 7.7), (12.65, 7.7), (12.65, 6.2), (17.15, 6.2), (17.15, 7.9))
     rooms_east += ((15.0, 7.7), (17.15, 7.7), (17.15, 6.2))
     parts = {name: (materials[name], mesh) for name, mesh in meshes.items()}
-    return FloorPlan(parts, (0.3, 3.0, 2.4), (plan, aisle, corridor, rooms_west, rooms_east))
+    return FloorPlan(
+        parts, (*shell, "fronts", *inner), (0.3, 3.0, 2.4), (plan, aisle, corridor, rooms_west, rooms_east)
+    )

@@ -22,7 +22,17 @@ from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary, find_cuda, fin
 from .probe import VARIANTS, try_cuda, try_llvm
 from .remedy import GOOD_FROM, install_line
 
-__all__ = ["VARIANTS", "Backend", "BackendError", "LlvmLibrary", "choose", "find_cuda", "find_llvm", "init"]
+__all__ = [
+    "VARIANTS",
+    "Backend",
+    "BackendError",
+    "LlvmLibrary",
+    "choose",
+    "find_cuda",
+    "find_llvm",
+    "init",
+    "set_threads",
+]
 
 _TOO_EARLY = "Dr.Jit was imported before wrf_mi.backend.init() and"
 
@@ -68,7 +78,6 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
             _active = _start(backend)
         elif backend not in ("auto", _active.name):
             raise BackendError(f"this process already computes with {_active.name}: start another for {backend}")
-        import drjit as dr
         import mitsuba as mi
 
         before = mi.variant()
@@ -76,11 +85,27 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
             if before is not None:
                 warnings.warn(f"Mitsuba's variant changes from {before} to {_active.variant}", stacklevel=2)
             mi.set_variant(_active.variant)
-        if threads is not None and threads != dr.thread_count():
-            # Kernels that wait have room for sums of as many threads as there were when they were launched.
-            dr.sync_thread()
-            dr.set_thread_count(threads)
+        if threads is not None:
+            set_threads(threads)
         return _active
+
+
+def set_threads(threads: int) -> None:
+    """Change the number of threads that LLVM kernels run on.
+
+    What was traced or launched before has room for the sums of as many threads as there were then, and more would
+    write beyond it (Dr.Jit 1.5, ``scatter_reduce``), so it is computed first. `wrf_mi.field.recorded` sees to functions
+    that are recorded.
+
+    Args:
+        threads: 1 or more.
+    """
+    import drjit as dr
+
+    if threads != dr.thread_count():
+        dr.eval()
+        dr.sync_thread()
+        dr.set_thread_count(threads)
 
 
 def choose(backend: str = "auto", *, fresh: bool = False) -> Backend:

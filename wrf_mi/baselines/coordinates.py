@@ -10,8 +10,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.device import to_tensor
 from ..core.angles import FloatArray
-from ..field.device import to_tensor
 from ..field.encoding import encode, encoded_size
 
 LEAST_M = 1e-3

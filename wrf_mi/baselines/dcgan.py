@@ -29,9 +29,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
-from ..field.device import to_float, to_tensor
 from ..field.network import Weights, init_layer, linear, relu
 from .conv import Grid, coarser, convolve, finer, instance_norm, resized
 from .coordinates import Coordinates, feature_count

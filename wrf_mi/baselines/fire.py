@@ -31,9 +31,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
-from ..field.device import to_tensor
 from ..field.network import Weights, init_layer, linear
 from .cross_band import bands_arrays, bands_from
 from .csi_bands import Bands, bands_of, relative_error, training_rows, uplink_of

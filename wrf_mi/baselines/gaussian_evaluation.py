@@ -15,10 +15,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import Record
 from ..core.angles import solid_angles
 from ..field import Encoding
-from ..field.device import to_tensor
 from ..fit.recorded import Recorded
 from ..hybrid.learned import learned_field
 from ..project.footprint import Pose

@@ -32,10 +32,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import Record, Split
 from ..core.types import IntArray
 from ..field import random_gaussians
-from ..field.device import to_tensor
 from ..field.network import Weights
 from .conditions import channels_from, conditions_of, normalised_uplink, outputs_of, truth_of, uplink_of
 from .gaussian_evaluation import AT_ONCE, Evaluation, Frame, GaussianSettings, frame_of

@@ -34,8 +34,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import Record, Split
-from ..field.device import to_tensor
 from ..field.network import Weights
 from .conditions import channels_from, conditions_of, outputs_of, truth_of
 from .coordinates import Coordinates

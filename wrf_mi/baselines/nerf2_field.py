@@ -14,10 +14,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import InputError, Record
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
-from ..field.device import to_tensor
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
 from .conditions import Outputs, normalised_uplink, outputs_of, uplink_of

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..field.device import to_tensor
 from ..field.network import Weights, init_layer, linear
 from .csi_bands import Bands
 from .method import Listen

@@ -20,9 +20,9 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
-from ..field.device import to_tensor
 from ..field.network import Weights
 from ..fit.recorded import Recorded
 from ..fit.step import watched

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
+from ..backend.device import on_device
 from .gaussians import Gaussians
 
 AT_ONCE = 1 << 14
@@ -57,7 +58,7 @@ def gaussians_in_parts(field: _Field, params: Mapping[str, Any], tx_pos: Any, at
         place = np.concatenate(
             [batch * a + np.arange(batch * n).reshape(batch, n) for a, n in zip(begin, sizes, strict=True)], axis=1
         )
-        order = index_type(place.ravel().astype(np.uint32))
+        order = on_device(place, index_type)
 
         def joined(*arrays: Any) -> Any:
             whole = dr.concat(list(arrays))

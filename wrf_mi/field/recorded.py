@@ -15,6 +15,9 @@ class Recorded:
     Python's garbage collector waits meanwhile: an array that it frees while Dr.Jit records, one that wraps
     NumPy's memory for instance, ends the process.
 
+    What was recorded has room for the sums of as many threads as there were then, and more threads write beyond it
+    (Dr.Jit 1.5): where there are more now, it is recorded anew.
+
     Args:
         function: what is recorded.
         state: arrays that the function reads beside its arguments, asked for before each call; None: it reads none.
@@ -22,12 +25,15 @@ class Recorded:
 
     def __init__(self, function: Callable[..., Any], state: Callable[[], Any] | None = None) -> None:
         self._frozen: Any = dr.freeze(function, state_fn=None if state is None else lambda *_: state())
+        self._threads = 0
+        self._dropped = 0
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
         collecting = gc.isenabled()
         gc.disable()
         try:
+            self._fit_threads()
             return self._frozen(*arguments)
         finally:
             if collecting:
@@ -36,4 +42,13 @@ class Recorded:
     @property
     def n_recordings(self) -> int:
         """How often the function was recorded."""
-        return self._frozen.n_recordings
+        recordings: int = self._dropped + self._frozen.n_recordings
+        return recordings
+
+    def _fit_threads(self) -> None:
+        """Drop what fewer threads have recorded."""
+        threads = dr.thread_count()
+        if threads > self._threads:
+            self._dropped += self._frozen.n_recordings
+            self._frozen.clear()
+            self._threads = threads

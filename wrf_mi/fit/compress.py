@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..field import InitialGaussians
-from ..field.device import to_tensor
 from ..splat.removal import removal
 from ..splat.tiles import perception_plane
 from .config import NetworkConfig, TrainConfig

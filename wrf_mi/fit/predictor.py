@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.device import to_tensor
 from ..core import InputError, Receiver
-from ..field.device import to_tensor
 from ..field.gaussians import Gaussians
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane

@@ -11,8 +11,8 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import NDArray
 
+from ..backend.device import to_float, to_tensor
 from ..field.density import DensityChange
-from ..field.device import to_float, to_tensor
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from .. import __version__
+from ..backend.device import to_tensor
 from ..core import Receiver
 from ..core.files import write_arrays
-from ..field.device import to_tensor
 from ..field.host import ComplexArray, Signals, host_signals
 from ..project.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..splat.operator import Images, PixelOperator, pixel_weights

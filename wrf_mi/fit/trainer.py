@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import init
+from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
-from ..field.device import to_float, to_tensor
 from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
 from ..splat.tiles import perception_plane

@@ -28,8 +28,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
 
+from ..backend.device import on_device
 from ..core.angles import FloatArray, pixel_directions, solid_angles
-from ..field.device import on_device
 from .follow import Complex
 from .traced import Float64, TracedPaths
 

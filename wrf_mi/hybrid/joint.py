@@ -13,10 +13,10 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.device import on_device, to_tensor
 from ..core import Receiver
 from ..core.angles import FloatArray
 from ..field import InitialGaussians
-from ..field.device import on_device, to_tensor
 from ..field.recorded import Recorded
 from ..splat.tiles import perception_plane
 from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver

@@ -62,13 +62,15 @@ def opened(things: Things) -> tuple[Any, Surfaces]:
     import drjit as dr
     import mitsuba as mi
 
+    from ..backend.device import to_float, to_uint
+
     keys = [f"thing{index}" for index in range(len(things.names))]
     parts: dict[str, Any] = {"type": "scene"}
     for key, corners in zip(keys, things.corners, strict=True):
         mesh = mi.Mesh(key, 3 * len(corners), len(corners))
         parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(np.ravel(corners).astype(np.float32))
-        parameters["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
+        parameters["vertex_positions"] = to_float(corners)
+        parameters["faces"] = to_uint(np.arange(3 * len(corners)))
         parameters.update()
         parts[key] = mesh
     scene: Any = mi.load_dict(parts)
@@ -286,14 +288,17 @@ class ChainTable:
         import drjit as dr
         import mitsuba as mi
 
+        from ..backend.device import on_device, to_float, to_vectors
+
         lanes = max(LEAST_LANES, 1 << (len(far_m) - 1).bit_length())
 
         def padded(values: FloatArray) -> FloatArray:
             more = np.zeros((lanes - len(values), *values.shape[1:]))
-            return np.ascontiguousarray(np.concatenate([values, more]).T, np.float32)
+            return np.concatenate([values, more])
 
-        d, origin, far = mi.Vector3f(padded(direction)), mi.Point3f(padded(start_m)), mi.Float(padded(far_m))
-        active: Any = mi.Bool(np.arange(lanes) < len(far_m))
+        d, origin = to_vectors(padded(direction), mi.Vector3f), to_vectors(padded(start_m), mi.Point3f)
+        far = to_float(padded(far_m))
+        active: Any = on_device(np.arange(lanes) < len(far_m), mi.Bool)
         begin: Any = mi.Float(NEAR_M)
         found = []
         # One more than may be passed: the end of the leg itself.

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
+from ..backend.device import on_device
 from ..core import InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..field.device import on_device
 from ..project.footprint import Pose
 from ..trace import TraceOptions, TraceResult, trace_paths
 from ..trace.buffer import SPECULAR, TRANSMISSION

@@ -16,8 +16,8 @@ from typing import Any
 
 import drjit as dr
 
+from wrf_mi.backend.device import quads
 from wrf_mi.core import InputError
-from wrf_mi.field.device import quads
 
 WINDOW = 7
 """Side of the window in pixels, scikit-image's default."""

@@ -140,7 +140,8 @@ KNOWN = (
             task="csi",
             licence="MIT",
             origin=f"traced on this machine by Sionna RT in a made-up {place} (wrf_mi.trace.load_record)",
-            note="uplink and downlink are noisy at 25 dB; scores are held against the downlink without noise.",
+            note="uplink and downlink are noisy at 25 dB; scores are held against the downlink without noise. "
+            "floor/ in it is the scene that a model may be given: bare walls, some centimetres off, of one material.",
         )
         for place in ("flat", "office")
     ),

@@ -161,7 +161,7 @@ class LagMatrix:
         return (products[0] @ real + products[1] @ imaginary).array
 
     def _matrices(self, float_type: Any) -> tuple[Any, Any, Any]:
-        from ..field.device import on_device
+        from ..backend.device import on_device
 
         if float_type not in self._device:
             parts = (self.lags.basis.T, *self.lags.pairs)

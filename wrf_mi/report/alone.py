@@ -170,7 +170,7 @@ def _step(job: Job, work: Path) -> Arrays:
     import drjit as dr
     import mitsuba as mi
 
-    from ..field.device import to_float, to_tensor
+    from ..backend.device import to_float, to_tensor
     from ..fit.config import TrainConfig, with_settings
     from ..fit.step import TrainingData, device_pose, grey
     from ..fit.trainer import Trainer

@@ -16,10 +16,10 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from ..backend.device import to_tensor  # noqa: E402
 from ..core import Receiver  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..field import Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians  # noqa: E402
-from ..field.device import to_tensor  # noqa: E402
 from ..field.host import FactorisedSignals  # noqa: E402
 from ..fit.predictor import Predictor  # noqa: E402
 from ..fit.recorded import Recorded  # noqa: E402

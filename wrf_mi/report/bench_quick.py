@@ -26,10 +26,10 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 
+from ..backend.device import to_float, to_tensor  # noqa: E402
 from ..core import InputError, Record  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..core.files import one_line, write_atomically  # noqa: E402
-from ..field.device import to_tensor  # noqa: E402
 from ..fit.config import TrainConfig, with_settings  # noqa: E402
 from ..fit.folder import versions  # noqa: E402
 from ..fit.step import Prediction, device_pose  # noqa: E402
@@ -81,7 +81,7 @@ def _integrator() -> tuple[Call, Call]:
     stock = _stock(gaussians, receiver)
 
     def ours() -> Any:
-        params["gaussians.data"] = mi.Float(data)
+        params["gaussians.data"] = to_float(data)
         params.update()
         return mi.render(scene)
 

@@ -18,6 +18,7 @@ import wrf_mi_plugins  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from skimage.metrics import structural_similarity  # noqa: E402
 
+from ..backend.device import to_float  # noqa: E402
 from ..core import Receiver, unit_vectors  # noqa: E402
 from ..field.gaussians import Gaussians  # noqa: E402
 from ..project.footprint import Pose  # noqa: E402
@@ -61,7 +62,7 @@ def random_field(
     delta = rng.uniform(0, 0.95, count) * np.exp(1j * rng.uniform(0, 2 * np.pi, count))
 
     def columns(values: Any) -> list[Any]:
-        return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in np.transpose(values)]
+        return [to_float(column) for column in np.transpose(values)]
 
     product = blending == "product"
     return Gaussians(
@@ -169,7 +170,7 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
     stock.load(data.reshape(count, -1), opacity.numpy(), colour)
     for _ in range(repeats + 1):
         for name, key, values in (("traced_ms", "data", data), ("again_ms", "signal", signal)):
-            params[f"gaussians.{key}"] = mi.Float(values)
+            params[f"gaussians.{key}"] = to_float(values)
             params.update()
             times[name].append(1e3 * seconds(lambda: mi.render(scene)))
         times["stock_ms"].append(1e3 * seconds(Within(stock.render, rgb_variant)))

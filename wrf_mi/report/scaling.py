@@ -17,10 +17,10 @@ import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 from wrf_mi_scenes.divided import cluttered_room, divided_room  # noqa: E402
 
+from ..backend.device import to_float, to_tensor  # noqa: E402
 from ..core import Receiver, Record  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..field import FIELDS, InitialGaussians, random_gaussians  # noqa: E402
-from ..field.device import to_tensor  # noqa: E402
 from ..field.parts import gaussians_in_parts  # noqa: E402
 from ..fit.config import TrainConfig  # noqa: E402
 from ..fit.predictor import Predictor  # noqa: E402
@@ -92,7 +92,7 @@ def _integrator(count: int) -> Call:
     data = params["gaussians.data"].numpy().copy()
 
     def call() -> Any:
-        params["gaussians.data"] = mi.Float(data)
+        params["gaussians.data"] = to_float(data)
         params.update()
         return mi.render(scene)
 

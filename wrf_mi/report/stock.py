@@ -24,6 +24,7 @@ import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+from ..backend.device import to_float, to_vectors  # noqa: E402
 from ..core import Receiver, pixel_directions  # noqa: E402
 from ..field.gaussians import Gaussians  # noqa: E402
 
@@ -107,7 +108,7 @@ class StockRenderer:
     def _build(self, data: Floats, opacity: Floats, colour: Floats) -> Any:
         height, width = self.height, self.width
         table = pixel_directions(height, width).reshape(-1, 3) @ self.receiver.to_world.T
-        direction = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in table.T))
+        direction = to_vectors(table, mi.Vector3f)
         origin = mi.Point3f(*self.receiver.position_m.tolist())
 
         class Rays(mi.Sensor):
@@ -133,9 +134,9 @@ class StockRenderer:
                 },
                 "gaussians": {
                     "type": "ellipsoids",
-                    "data": mi.TensorXf(np.ascontiguousarray(data, np.float32).ravel(), (count, 10)),
-                    "opacities": mi.TensorXf(np.ascontiguousarray(opacity, np.float32).ravel(), (count, 1)),
-                    "sh_coeffs": mi.TensorXf(np.ascontiguousarray(colour, np.float32).ravel(), (count, 3)),
+                    "data": mi.TensorXf(to_float(data), (count, 10)),
+                    "opacities": mi.TensorXf(to_float(opacity), (count, 1)),
+                    "sh_coeffs": mi.TensorXf(to_float(colour), (count, 3)),
                 },
             }
         )

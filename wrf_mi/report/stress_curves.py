@@ -12,6 +12,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 from skimage.metrics import structural_similarity
 
+from ..backend.device import to_float
 from ..core.angles import FloatArray
 from ..loss.ssim import ssim as similarity
 from .stress_fields import BLENDINGS, RECEIVER, Field, gradient, image, made, placed, reference
@@ -103,7 +104,7 @@ def _similarity(contrast: float) -> float:
         rng = np.random.default_rng(seed)
         one, other = (((1 - contrast) * 0.7 + contrast * rng.uniform(size=SIZE)).astype(np.float32) for _ in range(2))
         truth = structural_similarity(one.astype(float), other.astype(float), data_range=1)
-        errors.append(abs(float(similarity(mi.Float(one.ravel()), mi.Float(other.ravel()), 1, *SIZE)[0]) - truth))
+        errors.append(abs(float(similarity(to_float(one), to_float(other), 1, *SIZE)[0]) - truth))
     return float(np.median(errors))
 
 

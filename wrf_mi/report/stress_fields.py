@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import on_device as to_device
 from ..core import Receiver, pixel_directions, unit_vectors
 from ..core.angles import FloatArray
 from ..field import Gaussians
@@ -202,7 +203,7 @@ def gradient(
     weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in reported]
     total: Any = 0
     for part, weight in zip(reported, weights, strict=True):
-        total = total + dr.sum(part * float_type(weight))
+        total = total + dr.sum(part * to_device(weight, float_type))
     dr.backward(total)
     return {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], axis=1) for name, part in parts.items()}
 
@@ -224,8 +225,7 @@ def pose(float_type: Any) -> Pose:
 def on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
     """The field's Gaussians, and the arrays that they are made of by group of parameters."""
     parts = {
-        name: [float_type(np.ascontiguousarray(column)) for column in values.T]
-        for name, values in field.groups(blending).items()
+        name: [to_device(column, float_type) for column in values.T] for name, values in field.groups(blending).items()
     }
     return (
         Gaussians(

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from ..backend.device import on_device, to_float
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..hybrid.joint import absolute_error
@@ -80,9 +81,9 @@ def losses(count: int) -> list[Row]:
 
 def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[float, float, dict[str, FloatArray]]:
     """Loss, similarity and derivative of the loss."""
-    prediction = kind(one.ravel())
+    prediction = on_device(one, kind)
     dr.enable_grad(prediction)
-    value, structure = spectrum_loss(prediction, kind(other.ravel()), 1, *SIZE, eta=eta)
+    value, structure = spectrum_loss(prediction, on_device(other, kind), 1, *SIZE, eta=eta)
     dr.backward(value)
     slope = {"prediction": dr.grad(prediction).numpy().astype(float)}
     return float(dr.detach(value)[0]), float(dr.detach(structure)[0]), slope
@@ -91,9 +92,9 @@ def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[fl
 def _absolute(one: FloatArray, other: FloatArray, rng: Rng) -> float:
     """Error of the loss of the hybrid's joint fit and of its derivatives, with a third of the rows not received."""
     known = rng.random(one.size) > 1 / 3
-    prediction = mi.Float(one.ravel())
+    prediction = to_float(one)
     dr.enable_grad(prediction)
-    value = absolute_error(prediction, mi.Float(np.where(known, other.ravel(), np.nan)), 1)
+    value = absolute_error(prediction, to_float(np.where(known, other.ravel(), np.nan)), 1)
     dr.backward(value)
     truth = np.abs(one - other).ravel()[known].mean()
     slope = np.where(known, np.sign(one - other).ravel(), 0) / known.sum()

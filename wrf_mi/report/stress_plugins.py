@@ -19,6 +19,8 @@ import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+from ..backend.device import on_device as to_device  # noqa: E402
+from ..backend.device import to_float, to_tensor  # noqa: E402
 from ..core import pixel_directions, rotation_matrix  # noqa: E402
 from ..core.angles import FloatArray  # noqa: E402
 from ..field.gaussians import Gaussians  # noqa: E402
@@ -144,7 +146,7 @@ def _summed(gaussians: Gaussians, pose: Pose) -> list[Any]:
     """Every ray meets every Gaussian: no lists that could lack one."""
     kind: Any = type(gaussians.position[0])
     directions = pixel_directions(*SIZE).reshape(-1, 3)
-    bundles = ray_bundles([kind(np.ascontiguousarray(c)) for c in directions.T], *SIZE)
+    bundles = ray_bundles([to_device(column, kind) for column in directions.T], *SIZE)
     footprints = ray_footprints(gaussians, pose)
     lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
     parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.opacity, gaussians.attenuation)
@@ -163,7 +165,7 @@ def _through_render(field: Field, blending: str, seed: int) -> tuple[dict[str, F
     params = mi.traverse(scene)
     rng = np.random.default_rng(seed)
     weight = [rng.normal(size=SIZE).astype(np.float32) for _ in range(2)]
-    weights = mi.TensorXf(np.ascontiguousarray(np.stack(weight, axis=-1)))
+    weights = to_tensor(np.stack(weight, axis=-1))
 
     def render() -> Any:
         for name, values in shape_parameters(gaussians).items():
@@ -181,7 +183,7 @@ def _through_render(field: Field, blending: str, seed: int) -> tuple[dict[str, F
         dr.clear_grad(array)
         # Each parameter by a share of itself: sizes of 1e-6 and 1e3 cannot take one step.
         own = np.abs(dr.detach(array).numpy().astype(float))
-        dr.set_grad(array, mi.Float(own * rng.normal(size=own.shape)))
+        dr.set_grad(array, to_float(own * rng.normal(size=own.shape)))
     steps = {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], 1) for name, part in parts.items()}
     tangent = np.asarray(dr.forward_to(render(), flags=dr.ADFlag.ClearEdges).numpy(), float)
     terms = [float((slopes[name] * steps[name]).sum()) for name in slopes]

@@ -18,10 +18,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import on_device as to_device
 from ..core import pixel_directions
 from ..core.angles import solid_angles
 from ..core.arrays import planar_array
-from ..field.device import on_device as to_device
 from ..field.gaussians import Gaussians
 from ..hybrid import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from ..hybrid.combine import DARK, LEAST_POWER

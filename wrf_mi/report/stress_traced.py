@@ -17,10 +17,10 @@ from scipy.constants import speed_of_light
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.furnished import write_scene
 
+from ..backend.device import on_device, to_float, to_tensor
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.types import Receiver
-from ..field.device import on_device, to_tensor
 from ..hybrid import ArrayReceiver, CsiReceiver, PowerReceiver, TracedField, TracedOptions
 from ..receive.graph import path_power
 from ..trace import TraceOptions, TraceResult, open_scene, trace_paths
@@ -154,7 +154,7 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
     buffer = to_buffer(traced.legs(surfaces), surfaces, valid=True)
     names = sorted({known[scene.objects[name].radio_material.name].name for name in traced.paths.object_names})
     power = np.bincount(traced.paths.tx, np.abs(traced.paths.gain) ** 2)
-    scale = mi.Float((1 / power[traced.paths.tx]).astype(np.float32))
+    scale = to_float(1 / power[traced.paths.tx])
     values = {}
     for name in names:
         values[f"permittivity {name}"] = np.log(np.ravel(known[name].relative_permittivity.numpy()) - 1)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
 
+from ..backend.device import on_device, to_uint
 from ..core import Paths, Receiver, unit_vectors
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
@@ -56,12 +57,12 @@ def _compare(function: Function, inputs: Inputs, seed: int, kind: str, value: Wo
     held = {name: np.asarray(v, np.float32).astype(float) for name, v in inputs.items()}
     found, slopes = {}, {}
     for float_type in (mi.Float, DOUBLE):
-        arrays = {name: float_type(np.ascontiguousarray(v.ravel())) for name, v in held.items()}
+        arrays = {name: on_device(v, float_type) for name, v in held.items()}
         dr.enable_grad(arrays)
         parts = function(arrays)
         rng, total = np.random.default_rng(seed), float_type(0)
         for part in parts:
-            total = total + dr.sum(part * float_type(rng.normal(size=dr.width(part)).astype(np.float32)))
+            total = total + dr.sum(part * on_device(rng.normal(size=dr.width(part)).astype(np.float32), float_type))
         dr.backward(total)
         found[float_type] = np.concatenate([dr.detach(part).numpy().astype(float) for part in parts])
         slopes[float_type] = {name: dr.grad(a).numpy().astype(float) for name, a in arrays.items()}
@@ -101,7 +102,7 @@ def _footprints(given: Mapping[str, Any]) -> Sequence[Any]:
     direction, signal = _parts(given["direction"], 3), _parts(given["signal"], 2)
     flat = _parts(given["axes"], 9)
     kind: Any = type(given["signal"])
-    elements = [kind(np.ascontiguousarray(column)) for column in ELEMENTS_M.T]
+    elements = [on_device(column, kind) for column in ELEMENTS_M.T]
     # A unit vector that is one in float32 alone would be another footprint in float64.
     norm = dr.rsqrt(sum((c * c for c in direction[1:]), direction[0] * direction[0]))
     direction = [c * norm for c in direction]
@@ -127,7 +128,7 @@ def _lags(given: Mapping[str, Any]) -> Sequence[Any]:
 
 
 def _shared(count: int, pairs: int) -> Any:
-    return mi.UInt32((np.arange(count) % pairs).astype(np.uint32))
+    return to_uint(np.arange(count) % pairs)
 
 
 POWERS: Mapping[str, Callable[[np.random.Generator], Inputs]] = {

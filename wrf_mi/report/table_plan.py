@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..measure.registry import locate
 
@@ -44,6 +44,8 @@ IN_A_FLAT = (
     *("--calibrate", "patterns"),
 )
 """Walls are two surfaces each and let waves through; strengths are not calibrated."""
+ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
+"""As the channels were traced, but for what the rough surfaces scatter, which no mesh tells."""
 FEWER = _set("training.steps=200", "training.rounds=2")
 """Of every network in the small version."""
 SPECTRUM: Mapping[str, Entry] = {
@@ -86,6 +88,7 @@ UPLINK: Mapping[str, Entry] = {
     "fire": Entry("FIRE", _model("fire"), FEWER, (0,), "15.29"),
     "r2f2": Entry("R2F2", _model("r2f2"), published="8.57"),
     "optml": Entry("OptML", _model("optml"), FEWER, (0,), "8.47"),
+    "ray-tracing": Entry("ray tracing, from positions", _model("ray-tracing", "--scene", "{scene}", *ON_A_FLOOR)),
 }
 FEW = ("wrf-gs+", "hybrid", "nerf2", "kriging", "idw", "ray-tracing")
 """Measured with fewer rows too."""
@@ -107,7 +110,7 @@ class Part:
     task: str
     dataset: str
     split: str
-    entries: Mapping[str, Entry]
+    entries: Mapping[str, Entry] = field(hash=False)
     few: bool = False
     scene: str = ""
 
@@ -117,10 +120,10 @@ PARTS = (
     Part("spectrum", "rfid-lab", "blocked", SPECTRUM, scene="laboratory"),
     Part("spectrum", "traced-room", "official", SPECTRUM, scene="room"),
     Part("rssi", "flat-ble", "official", RSSI, True, "flat"),
-    Part("csi", "newrf-conference", "official", POSITION, scene="scan"),
+    Part("csi", "newrf-conference", "official", POSITION, True, "scan"),
     Part("csi", "newrf-office", "official", POSITION, scene="scan"),
-    Part("csi", "traced-csi-flat", "official", UPLINK, True),
-    Part("csi", "traced-csi-office", "official", UPLINK),
+    Part("csi", "traced-csi-flat", "official", UPLINK, True, "floor"),
+    Part("csi", "traced-csi-office", "official", UPLINK, scene="floor"),
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
 BLOCKED_SETTINGS: Mapping[str, tuple[str, ...]] = {

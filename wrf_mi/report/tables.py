@@ -11,7 +11,6 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,15 @@ from ..fit.folder import versions
 from ..measure.registry import locate
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..scene.make import make_scene
+from ..trace import load_record
 from ..trace.furnished import traced_room
+from ..trace.walked import MEASURED
 from .bench import BenchFailed, machine, threads
 from .bench_hybrid_csi import SCANNED, scanned_scene
-from .figures import save, score_cdf
-from .metrics import TASKS, summary
+from .metrics import summary
 from .run_folder import CONFIG, METRICS, read_run
-from .table_plan import PARTS, Part, Row, available, plan
+from .table_pages import read_rows, write_tables
+from .table_plan import Part, Row, available, plan
 
 FOLDER = "tables"
 """In the folder of results; ``tables-quick`` for the small version."""
@@ -53,9 +54,13 @@ def scene_of(part: Part, folder: Path) -> list[str]:
         return ["--scene", "laboratory"]
     if part.scene == "room":
         return ["--scene", str(traced_room()[1])]
+    if part.scene == "floor":
+        load_record(part.dataset)  # makes it where nobody has
     place = locate(part.dataset)
     if place is None:
         raise InputError(f"data set {part.dataset}: not on this machine; see wrf-mi data list")
+    if part.scene == "floor":
+        return ["--scene", str(place / MEASURED)]
     if part.scene == "flat":
         made = folder / "flat"
         if not made.exists():
@@ -167,84 +172,3 @@ def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:
         return measure(runs, row)
     except (BenchFailed, InputError) as error:
         return str(error)
-
-
-def read_rows(place: Path) -> list[dict[str, Any]]:
-    """All rows stored in a folder."""
-    return [json.loads(path.read_text()) for path in sorted(place.glob("*-seed*.json"))]
-
-
-def write_tables(place: Path, quick: bool = False) -> None:
-    """Tables as Markdown in ``README.md`` and a picture of the distributions of each part, from what is stored."""
-    stored = {row["row"]: row for row in read_rows(place)}
-    text = ["# Every method, task by task", NOTE]
-    for part in PARTS:
-        own = [row for row in plan(quick) if row.part == part and row.name in stored]
-        if not own:
-            continue
-        title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, own, stored)]
-        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
-        picture = f"{part.task}-{part.dataset}-{part.split}.png"
-        figure = score_cdf(
-            {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
-        )
-        save(figure, place / picture)
-        text.append(f"![Distribution of the scores of each method]({picture})")
-    write_atomically(place / "README.md", "\n\n".join(text) + "\n")
-
-
-NOTE = (
-    "Written by `wrf-mi bench tables`; each row's JSON file has its command, machine, versions and date. Scores are "
-    "over test rows: SSIM and channel estimation accuracy (CEA, dB) are better when larger, errors in dB when smaller. "
-    "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets. "
-    "*Paper* is what the WRF-GS+ paper states **on other data**: the full NeRF2 and Argos sets, which are not public "
-    "in that form. Times are of the machine in the JSON files, which others used too: read ratios."
-)
-
-
-def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown table of one data set under one split: best median first, fewer rows below."""
-    task = TASKS[part.task]
-    sign = -1 if task.higher_is_better else 1
-    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row.share, row.method), []).append(stored[row.name])
-
-    def median(key: tuple[float, str]) -> float:
-        return float(np.mean([one["score"]["median"] for one in groups[key]]))
-
-    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
-    lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
-    digits = 3 if part.task == "spectrum" else 2
-    for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
-        found = groups[share, method]
-        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
-        medians = [one["score"]["median"] for one in found]
-        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
-        cells = [
-            str(found[0]["n_train"]),
-            part.entries[method].label,
-            f"**{each['median']:.{digits}f}**{spread}",
-            *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
-            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
-            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
-            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
-            part.entries[method].published if share == max(row.share for row in rows) else "",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += _reference_rows(part, groups)
-    return "\n".join(lines)
-
-
-def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
-    """What every run is held against where no row of its own measures it."""
-    if "idw" in part.entries:
-        return []
-    digits, share = 2, max(share for share, _ in groups)
-    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
-    words, lines = TASKS[part.task].references, []
-    for key, block in one["reference"].items():
-        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
-        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
-    return lines

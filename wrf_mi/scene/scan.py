@@ -50,13 +50,15 @@ def simulate_scan(
     backend.init()
     import mitsuba as mi
 
+    from ..backend.device import to_vectors
+
     if isinstance(scene, str | Path):
         scene = mi.load_file(str(scene))
     rng = np.random.default_rng(seed)
     parts = []
     for pose in np.asarray(poses_m, float).reshape(-1, 3):
         directions = _sphere(rays_per_pose, rng)
-        ray = mi.Ray3f(mi.Point3f(*pose.tolist()), mi.Vector3f(directions.T.astype(np.float32)))
+        ray = mi.Ray3f(mi.Point3f(*pose.tolist()), to_vectors(directions, mi.Vector3f))
         distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
         seen = np.isfinite(distance)
         distance = distance[seen] + rng.normal(0, range_noise_m, np.count_nonzero(seen))

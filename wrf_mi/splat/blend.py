@@ -21,7 +21,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..field.device import quads
+from ..backend.device import quads
 from ..project.footprint import Footprints
 from ..project.footprint_constants import CUTOFF, MIN_COSINE
 from .tiles import LANE_ROWS, Plane, TileLists

@@ -13,6 +13,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import on_device
+
 
 @dataclass
 class Bundles:
@@ -90,7 +92,7 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
     for tile in TILES:
         members, lanes, inside = _tiling(height, width, tile)
         size = members.shape[1]
-        index = index_type(members.ravel())
+        index = on_device(members, index_type)
         own = [dr.gather(float_type, c, index) for c in direction]
         axis = [dr.block_sum(c, size) for c in own]
         norm = dr.rsqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
@@ -102,13 +104,13 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
         margin = float(2 * np.arcsin(min(np.sqrt(chord[0]) / 2, 1.0)))
         if margin <= WIDEST_RAD:
             break
-    ray = [index_type(r) for r in lanes]
+    ray = [on_device(r, index_type) for r in lanes]
     result = Bundles(
         count=height * width,
         direction=[[dr.gather(float_type, c, r) for c in direction] for r in ray],
         ray=ray,
-        active=[mask_type(i) for i in inside],
-        place=index_type(np.flatnonzero(inside)[np.argsort(lanes[inside])].astype(np.uint32)),
+        active=[on_device(i, mask_type) for i in inside],
+        place=on_device(np.flatnonzero(inside)[np.argsort(lanes[inside])], index_type),
         bundle=dr.arange(index_type, lanes.shape[1]) // (size // tile[2]),
         axis=axis,
         # A single ray is its own axis; else float32 directions are good to 1e-7.

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 from threadpoolctl import ThreadpoolController
 
+from ..backend.device import on_device
 from ..core import InputError
 from ..field.gaussians import Gaussians
 from ..project.footprint import Footprints, Pose, depth_order, project
@@ -193,7 +194,7 @@ def _weights(
     total = int(start[-1])
     if total > MOST_IN_STRIP:
         raise InputError(f"operator: {total} weights in one row of tiles; use fewer or smaller Gaussians")
-    begin = index_type(start[:-1].astype(np.uint32))
+    begin = on_device(start[:-1], index_type)
     place = [dr.gather(index_type, begin, p - first) for p in strip.pixel]
     # Nothing to see still gives a matrix: with one entry that is left out.
     room = max(total, 1)

@@ -14,7 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..field.device import quads
+from ..backend.device import quads
 from ..project.footprint import Footprints
 from .blend import (
     MOST_COPIED,

@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ..backend.device import on_device
 from ..core import InputError
 from ..core.angles import azimuth_rad, elevation_rad
 from ..project.footprint import Footprints
@@ -86,13 +87,13 @@ def perception_plane(height: int, width: int, float_type: type) -> Plane:
     result = Plane(
         height,
         width,
-        tile=index_type(tile.astype(np.uint32)),
-        azimuth=[float_type(np.cos(azimuth)), float_type(np.sin(azimuth))],
-        elevation=[[float_type(np.cos(elevation)[r]), float_type(np.sin(elevation)[r])] for r in rows],
-        pixel=[index_type((row * width + column).astype(np.uint32)) for row in rows],
-        active=[mask_type(i) for i in inside],
-        tile_row=float_type((number // across * TILE_ROWS).astype(float)),
-        tile_column=float_type((number % across * TILE_COLUMNS).astype(float)),
+        tile=on_device(tile, index_type),
+        azimuth=[on_device(np.cos(azimuth), float_type), on_device(np.sin(azimuth), float_type)],
+        elevation=[[on_device(f(elevation)[r], float_type) for f in (np.cos, np.sin)] for r in rows],
+        pixel=[on_device(row * width + column, index_type) for row in rows],
+        active=[on_device(i, mask_type) for i in inside],
+        tile_row=on_device(number // across * TILE_ROWS, float_type),
+        tile_column=on_device(number % across * TILE_COLUMNS, float_type),
     )
     dr.eval(result)
     return result
@@ -240,12 +241,12 @@ def _counted(boxes: tuple[Any, ...], at: Any, plane: Plane, batch: int) -> TileL
     members = dr.concat([index_type(p) for p in parts]) if _checked(total) else dr.zeros(index_type, 1)
     begin = np.array([s[:-1] for s in starts]).T[:, row_of].ravel()
     end = np.array([s[1:] for s in starts]).T[:, row_of].ravel()
-    walk = members, index_type(begin.astype(np.uint32)), index_type(end.astype(np.uint32))
+    walk = members, on_device(begin, index_type), on_device(end, index_type)
     dr.eval(walk)
     length = _of_rows(boxes, at, plane, walk, None, None)
     dr.eval(length)
     counts = length.numpy().astype(np.int64)
-    start = index_type((np.cumsum(counts) - counts).astype(np.uint32))
+    start = on_device(np.cumsum(counts) - counts, index_type)
     index = dr.empty(index_type, max(_checked(int(counts.sum())), 1))
     length = _of_rows(boxes, at, plane, walk, index, start)
     dr.eval(index, length)

@@ -89,6 +89,8 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     import mitsuba as mi
     from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
+    from ..backend.device import on_device, to_tensor, to_uint, to_vectors
+
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
@@ -98,21 +100,23 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     shape[used] = surfaces.shape_ids[thing[used]]
     primitive[used] = (face - surfaces.first_face[thing])[used]
     buffer._valid = dr.full(mi.Bool, valid, count)
-    buffer._src_indices = mi.UInt32(legs.source.astype(np.uint32))
-    buffer._tgt_indices = mi.UInt32(legs.target.astype(np.uint32))
+    buffer._src_indices = to_uint(legs.source)
+    buffer._tgt_indices = to_uint(legs.target)
     integers: Any = mi.TensorXu
-    buffer._interaction_types = integers(legs.interactions.astype(np.uint32))
-    buffer._shapes, buffer._primitives = integers(shape), integers(primitive)
-    buffer._probs = mi.TensorXf(legs.probability.astype(np.float32))
+    numbers = (legs.interactions, shape, primitive)
+    found = (integers(to_uint(values), values.shape) for values in numbers)
+    buffer._interaction_types, buffer._shapes, buffer._primitives = found
+    buffer._probs = to_tensor(legs.probability)
     vertices = np.nan_to_num(legs.vertices_m, nan=0.0).astype(np.float32)
     for level in range(1, depth):  # beyond the last interaction Sionna RT reads the last point, and adds its distance
         vertices[:, level] = np.where(used[:, level, None], vertices[:, level], vertices[:, level - 1])
     for axis, name in enumerate(("_vertices_x", "_vertices_y", "_vertices_z")):
-        setattr(buffer, name, mi.TensorXf(np.ascontiguousarray(vertices[..., axis])))
+        setattr(buffer, name, to_tensor(vertices[..., axis]))
     if legs.wedge:
         for name in WEDGE:
             kind: Any = type(getattr(buffer._diffracting_wedges, name))
-            setattr(buffer._diffracting_wedges, name, kind(np.ascontiguousarray(legs.wedge[name].T)))
+            own = to_vectors if dr.depth_v(kind) > 1 else on_device
+            setattr(buffer._diffracting_wedges, name, own(legs.wedge[name], kind))
     buffer._paths_counter = mi.UInt32(count)
     return buffer
 

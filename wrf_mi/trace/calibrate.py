@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -217,21 +218,21 @@ class _Fit:
         known: NDArray[np.bool_],
         heading: FloatArray,
     ) -> _Batch:
-        import mitsuba as mi
+        from ..backend.device import to_float, to_uint
 
         paths, options = trace.paths, self.options
         place = np.searchsorted(rows, paths.tx)
         leaving = harmonics(in_body(paths.departure, heading[paths.tx]), options.tx_degree)
         return _Batch(
             buffer=to_buffer(trace.legs(surfaces), surfaces, valid=True),
-            power=mi.Float((np.abs(paths.gain) ** 2).astype(np.float32)),
-            pair=mi.UInt32((paths.rx * len(rows) + place).astype(np.uint32)),
-            rx=mi.UInt32(paths.rx.astype(np.uint32)),
-            tx_harmonics=[mi.Float(values) for values in leaving],
-            rx_harmonics=[mi.Float(values) for values in harmonics(paths.arrival, options.rx_degree)],
-            measured=mi.Float(np.where(known, observed, 0)[:, rows].ravel().astype(np.float32)),
-            counts=mi.Float(known[:, rows].ravel().astype(np.float32)),
-            pair_rx=mi.UInt32(np.repeat(np.arange(self.n_rx), len(rows)).astype(np.uint32)),
+            power=to_float(np.abs(paths.gain) ** 2),
+            pair=to_uint(paths.rx * len(rows) + place),
+            rx=to_uint(paths.rx),
+            tx_harmonics=[to_float(values) for values in leaving],
+            rx_harmonics=[to_float(values) for values in harmonics(paths.arrival, options.rx_degree)],
+            measured=to_float(np.where(known, observed, 0)[:, rows]),
+            counts=to_float(known[:, rows]),
+            pair_rx=to_uint(np.repeat(np.arange(self.n_rx), len(rows))),
         )
 
     def run(self, progress: bool) -> Calibration:
@@ -240,9 +241,11 @@ class _Fit:
         import mitsuba as mi
         from drjit.opt import Adam
 
+        from ..backend.device import to_float
+
         options = self.options
         adam = Adam(lr=options.learning_rate)
-        adam["offset"] = mi.Float(self.first_offset.astype(np.float32))
+        adam["offset"] = to_float(self.first_offset)
         if options.tx_degree:
             adam["tx"] = dr.zeros(mi.Float, (options.tx_degree + 1) ** 2 - 1)
         if options.rx_degree:
@@ -250,9 +253,9 @@ class _Fit:
         for name in self.materials:
             material = self.scene.radio_materials[name]
             susceptibility = float(np.ravel(material.relative_permittivity)[0]) - 1
-            adam[f"permittivity {name}"] = mi.Float(np.log(max(susceptibility, LEAST_SUSCEPTIBILITY)))
+            adam[f"permittivity {name}"] = mi.Float(math.log(max(susceptibility, LEAST_SUSCEPTIBILITY)))
             conductivity = float(np.ravel(material.conductivity)[0])
-            adam[f"conductivity {name}"] = mi.Float(np.log(max(conductivity, LEAST_CONDUCTIVITY)))
+            adam[f"conductivity {name}"] = mi.Float(math.log(max(conductivity, LEAST_CONDUCTIVITY)))
         adam.set_learning_rate(
             {name: options.learning_rate * DECIBELS for name in ("offset", "tx", "rx") if name in adam}
         )

@@ -53,9 +53,11 @@ def harmonics(directions: FloatArray, degree: int) -> NDArray[np.float32]:
     import drjit as dr
     import mitsuba as mi
 
+    from ..backend.device import to_vectors
+
     if degree == 0 or not len(directions):
         return np.zeros(((degree + 1) ** 2 - 1, len(directions)), np.float32)
-    values: Any = dr.sh_eval(mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)), degree)
+    values: Any = dr.sh_eval(to_vectors(directions, mi.Vector3f), degree)
     return np.stack([np.broadcast_to(np.asarray(value), len(directions)) for value in values[1:]])
 
 

@@ -48,7 +48,9 @@ def point_array(points: FloatArray) -> Any:
     """Mitsuba's points of rows [n, 3]."""
     import mitsuba as mi
 
-    return mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+    from ..backend.device import to_vectors
+
+    return to_vectors(points, mi.Point3f)
 
 
 def field_of(

@@ -111,10 +111,12 @@ def _shoot(
     import drjit as dr
     import mitsuba as mi
 
-    ray = mi.Ray3f(_columns(mi.Point3f, source_m[None]), mi.Vector3f(np.ascontiguousarray(directions, np.float32)))
+    from ..backend.device import on_device, to_uint, to_vectors
+
+    ray = mi.Ray3f(to_vectors(source_m[None], mi.Point3f), to_vectors(directions.T, mi.Vector3f))
     lookup = np.zeros(int(surfaces.shape_ids.max()) + 1, np.uint32)
     lookup[surfaces.shape_ids] = surfaces.first_face[:-1]
-    first, plane = mi.UInt32(lookup), mi.Int32(surfaces.plane.astype(np.int32))
+    first, plane = to_uint(lookup), on_device(surfaces.plane, mi.Int32)
     # As data, not as code: one kernel serves every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
@@ -186,15 +188,17 @@ def possible(
     import drjit as dr
     import mitsuba as mi
 
+    from ..backend.device import to_float, to_uint, to_vectors
+
     length, count = chains.length, len(targets_m)
-    targets = _columns(mi.Point3f, targets_m)
+    targets = to_vectors(targets_m, mi.Point3f)
     planes: tuple[Any, ...] = (
-        _columns(mi.Vector3f, surfaces.normal),
-        mi.Float(surfaces.offset.astype(np.float32)),
-        _columns(mi.Vector3f, surfaces.axes[:, 0]),
-        _columns(mi.Vector3f, surfaces.axes[:, 1]),
-        _columns(mi.Point2f, surfaces.low - margin_m),
-        _columns(mi.Point2f, surfaces.high + margin_m),
+        to_vectors(surfaces.normal, mi.Vector3f),
+        to_float(surfaces.offset),
+        to_vectors(surfaces.axes[:, 0], mi.Vector3f),
+        to_vectors(surfaces.axes[:, 1], mi.Vector3f),
+        to_vectors(surfaces.low - margin_m, mi.Point2f),
+        to_vectors(surfaces.high + margin_m, mi.Point2f),
     )
     step = max(1, PAIRS_AT_ONCE // count)
     for reflections in range(1, chains.plane.shape[1] + 1):
@@ -206,8 +210,8 @@ def possible(
             place: Any = dr.gather(mi.Point3f, targets, lane - row * count)
             valid: Any = dr.full(mi.Bool, True, len(part) * count)
             for level in reversed(range(reflections)):
-                plane = dr.gather(mi.UInt32, mi.UInt32(chains.plane[part, level].astype(np.uint32)), row)
-                image: Any = dr.gather(mi.Point3f, _columns(mi.Point3f, chains.image[part, level]), row)
+                plane = dr.gather(mi.UInt32, to_uint(chains.plane[part, level]), row)
+                image: Any = dr.gather(mi.Point3f, to_vectors(chains.image[part, level], mi.Point3f), row)
                 n, d, u, v, low, high = (dr.gather(type(values), values, plane) for values in planes)
                 here, there = dr.dot(n, place) - d, dr.dot(n, image) - d
                 valid &= here * there < 0
@@ -216,11 +220,6 @@ def possible(
                 valid &= dr.all(along >= low) & dr.all(along <= high)
             kept = np.asarray(dr.compress(valid), np.int64)
             yield part[kept // count], kept % count
-
-
-def _columns(kind: Any, rows: FloatArray) -> Any:
-    """Dr.Jit vectors of rows [n, 2 or 3]."""
-    return kind(np.ascontiguousarray(rows.T, np.float32))
 
 
 def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
@@ -235,9 +234,11 @@ def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: in
     import drjit as dr
     import mitsuba as mi
 
+    from ..backend.device import to_vectors
+
     if not len(start_m) or not scene.objects:
         return np.zeros(len(start_m), np.int64)
-    start, end = _columns(mi.Point3f, start_m), _columns(mi.Point3f, end_m)
+    start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
     way = end - start
     length = dr.norm(way)
     direction = way / length

@@ -3,7 +3,8 @@
 The base station has 104 antennas, 8 rows of 13 half a wavelength apart, and one vertical antenna stands for a user.
 Carrier and subcarriers are those of the ArgosV2 traces on which NeRF2, FIRE and WRF-GS+ were tried: 2.437 GHz, IEEE
 802.11's 52 subcarriers 312.5 kHz apart at -26..-1 (the uplink) and 1..26 (the downlink). By reciprocity the base
-station is the record's receiver in both.
+station is the record's receiver in both. Beside the channels lies the floor's mesh that a model may be given: without
+furniture, each wall off by some centimetres, all of one generic material.
 
 Paths: transmission through walls, up to three reflections, and diffuse reflection by every surface
 (`wrf_mi_scenes.floor_plans`). Uplink and downlink are measured with noise; the downlink without it is `Record.truth`,
@@ -48,7 +49,9 @@ logger = logging.getLogger(__name__)
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
 PREFIX = "traced-csi-"
 """Of the data sets' names."""
-FORMAT = 1
+MEASURED = "floor"
+"""Folder beside the channels with the measured floor's scene: what a model is given."""
+FORMAT = 2
 """To be raised when the same recipe would give other files."""
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.437e9, 312.5e3, 26
@@ -79,7 +82,8 @@ class Walk:
         scattered_depth: interactions of a scattered path at most.
         scattering: share of the reflected amplitude that every surface scatters.
         snr_db: of each row's uplink and of its downlink, mean over antennas and subcarriers.
-        seed: of ways, noise, rays and split.
+        mesh_error_m: standard deviation of the measured walls' places along each axis, metres.
+        seed: of ways, noise, rays, split and the measured floor's errors.
     """
 
     rows: int = 8
@@ -96,6 +100,7 @@ class Walk:
     scattered_depth: int = 2
     scattering: float = 0.3
     snr_db: float = 25.0
+    mesh_error_m: float = 0.02
     seed: int = 1
 
 
@@ -134,10 +139,14 @@ def walked_channels(
     with tempfile.TemporaryDirectory() as work:
         write_scene(Path(work), plan.parts, f"{place.capitalize()} of several rooms", "wrf_mi_scenes.floor_plans")
         recipe = _recipe(place, plan, content_sha256(Path(work), "scene.xml"), walk)
-        if not (folder / RECIPE).is_file() or (folder / RECIPE).read_text(encoding="utf-8") != recipe:
+        made = (folder / RECIPE).is_file() and (folder / MEASURED / "scene.yml").is_file()
+        if not made or (folder / RECIPE).read_text(encoding="utf-8") != recipe:
             logger.info("tracing channels in the %s into %s", place, folder)
             record = _trace(Path(work), name, plan, walk, progress)
             write_nerf2_csi(folder, record, replace=True, extra={RECIPE: recipe})
+            bare = floor_plans.measured(plan, walk.mesh_error_m, walk.seed)
+            title = f"{place.capitalize()}: bare walls as measured, one material"
+            write_scene(folder / MEASURED, bare, title, "wrf_mi_scenes.floor_plans")
     return read_nerf2_csi(folder, name)
 
 

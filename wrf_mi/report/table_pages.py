@@ -1,0 +1,138 @@
+"""Pages and pictures of the tables of all methods, from the rows that are stored."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.files import write_atomically
+from .figures import save, score_cdf
+from .metrics import TASKS
+from .table_plan import PARTS, SHARES, Part, Row, plan
+
+
+def read_rows(place: Path) -> list[dict[str, Any]]:
+    """All rows stored in a folder."""
+    return [json.loads(path.read_text()) for path in sorted(place.glob("*-seed*.json"))]
+
+
+def write_tables(place: Path, quick: bool = False) -> None:
+    """Tables as Markdown in ``README.md`` and a picture of the distributions of each part, from what is stored."""
+    stored = {row["row"]: row for row in read_rows(place)}
+    text = ["# Every method, task by task", NOTE]
+    for task in dict.fromkeys(part.task for part in PARTS):
+        if overview := task_overview(task, stored, quick):
+            text += [f"## {TASKS[task].heading.capitalize()}: medians", overview]
+    for part in PARTS:
+        own = [row for row in plan(quick) if row.part == part and row.name in stored]
+        if not own:
+            continue
+        title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
+        text += [f"## {title}", part_table(part, own, stored)]
+        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
+        picture = f"{part.task}-{part.dataset}-{part.split}.png"
+        figure = score_cdf(
+            {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
+        )
+        save(figure, place / picture)
+        text.append(f"![Distribution of the scores of each method]({picture})")
+    write_atomically(place / "README.md", "\n\n".join(text) + "\n")
+
+
+NOTE = (
+    "Written by `wrf-mi bench tables`; each row's JSON file has its command, machine, versions and date. Scores are "
+    "over test rows: SSIM and channel estimation accuracy (CEA, dB) are better when larger, errors in dB when smaller. "
+    "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets. "
+    "*Paper* is what the WRF-GS+ paper states **on other data**: the full NeRF2 and Argos sets, which are not public "
+    "in that form. Times are of the machine in the JSON files, which others used too: read ratios."
+)
+
+
+def task_overview(task: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> str:
+    """Markdown table of the medians of one task, most rows of each data set: a line a method, a column a data set.
+
+    With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
+
+    Args:
+        task: name.
+        stored: rows by name.
+        quick: of the small version.
+    """
+    found: dict[Part, dict[str, list[float]]] = {}
+    for row in plan(quick):
+        if row.part.task == task and row.name in stored and (quick or row.share == SHARES[0]):
+            found.setdefault(row.part, {}).setdefault(row.method, []).append(stored[row.name]["score"]["median"])
+    if not found:
+        return ""
+    columns = {part: {name: float(np.mean(each)) for name, each in methods.items()} for part, methods in found.items()}
+    sign = -1 if TASKS[task].higher_is_better else 1
+    ranks: dict[str, list[float]] = {}
+    for medians in columns.values():
+        ordered = sorted(medians, key=lambda method: sign * medians[method])
+        for place, method in enumerate(ordered):
+            ranks.setdefault(method, []).append(place / max(len(ordered) - 1, 1))
+    labels = {method: entry for part in columns for method, entry in part.entries.items()}
+    heads = [TASKS[task].label, *(_title(part) for part in columns), "paper, other data"]
+    lines = ["| " + " | ".join(heads) + " |", "| " + " | ".join(["---"] * len(heads)) + " |"]
+    digits = 3 if task == "spectrum" else 2
+    for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
+        cells = [f"{medians[method]:.{digits}f}" if method in medians else "" for medians in columns.values()]
+        best = [method == min(medians, key=lambda name: sign * medians[name]) for medians in columns.values()]
+        cells = [f"**{cell}**" if first else cell for cell, first in zip(cells, best, strict=True)]
+        lines.append("| " + " | ".join([labels[method].label, *cells, labels[method].published]) + " |")
+    return "\n".join(lines)
+
+
+def _title(part: Part) -> str:
+    return part.dataset if part.split == "official" else f"{part.dataset}, {part.split}"
+
+
+def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
+    """Markdown table of one data set under one split: best median first, fewer rows below."""
+    task = TASKS[part.task]
+    sign = -1 if task.higher_is_better else 1
+    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row.share, row.method), []).append(stored[row.name])
+
+    def median(key: tuple[float, str]) -> float:
+        return float(np.mean([one["score"]["median"] for one in groups[key]]))
+
+    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
+    lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
+    digits = 3 if part.task == "spectrum" else 2
+    for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
+        found = groups[share, method]
+        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
+        medians = [one["score"]["median"] for one in found]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
+        cells = [
+            str(found[0]["n_train"]),
+            part.entries[method].label,
+            f"**{each['median']:.{digits}f}**{spread}",
+            *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
+            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
+            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
+            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
+            part.entries[method].published if share == max(row.share for row in rows) else "",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += _reference_rows(part, groups)
+    return "\n".join(lines)
+
+
+def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
+    """What every run is held against where no row of its own measures it."""
+    if "idw" in part.entries:
+        return []
+    digits, share = 2, max(share for share, _ in groups)
+    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
+    words, lines = TASKS[part.task].references, []
+    for key, block in one["reference"].items():
+        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
+        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
+    return lines
