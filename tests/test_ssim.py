@@ -171,7 +171,7 @@ def test_frozen_function_gives_the_same_as_the_plain_one():
         size = shape[1] * shape[2]
         i = dr.arange(mi.UInt32, shape[0] * size)
         truth = dr.gather(mi.Float, stack, choice * size + i)
-        variable = to_float(prediction)
+        variable = mi.Float(prediction)
         dr.enable_grad(variable)
         loss, _ = spectrum_loss(variable, truth, *shape)
         dr.backward(loss)
