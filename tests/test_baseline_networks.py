@@ -15,7 +15,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from wrf_mi.backend.device import on_device  # noqa: E402
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.baselines.conditions import channels_from, normalised_uplink  # noqa: E402
 from wrf_mi.baselines.conv import (  # noqa: E402
     NORM_FLOOR,
@@ -48,8 +48,7 @@ SLOPES_AGREE = 1e-7
 
 def doubles(values: np.ndarray) -> Any:
     """A float64 tensor."""
-    kind = dr.float64_array_t(mi.Float)
-    return dr.tensor_t(kind)(on_device(values, kind), np.shape(values))
+    return to_tensor(values, mi.Float64)
 
 
 def assert_slopes(function: Callable[[list[Any]], Any], arrays: list[np.ndarray], rng: np.random.Generator) -> None:

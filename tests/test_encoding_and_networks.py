@@ -36,7 +36,11 @@ SPREAD_TOLERANCE = 0.05
 RECEIVER = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0.0, 0.8]))
 
 Float64 = dr.float64_array_t(mi.Float)
-Tensor64 = dr.tensor_t(Float64)
+
+
+def doubles(values: np.ndarray) -> Any:
+    """A float64 tensor."""
+    return to_tensor(values, Float64)
 
 
 def paper_encoding(t: np.ndarray, octaves: int) -> np.ndarray:
@@ -52,7 +56,7 @@ def paper_encoding(t: np.ndarray, octaves: int) -> np.ndarray:
     scale_m=st.floats(0.1, 20),
 )
 def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float) -> None:
-    encoded = encode(Tensor64(points), octaves, scale_m).numpy()
+    encoded = encode(doubles(points), octaves, scale_m).numpy()
     assert encoded.shape == (encoded_size(octaves), points.shape[1])
     # The tolerance grows with the number of turns, whose rounding NumPy's sine sees.
     expected = paper_encoding(points / scale_m, octaves)
@@ -74,7 +78,7 @@ def test_encoding_of_zero_octaves_is_empty() -> None:
 def test_encodings_slope() -> None:
     """Removing whole turns leaves the derivative as it is: d sin(2^k pi x / s) / dx = 2^k pi / s cos."""
     x = np.random.default_rng(1).uniform(-5, 5, (3, 7))
-    points = Tensor64(x)
+    points = doubles(x)
     dr.enable_grad(points)
     dr.backward(dr.sum(encode(points, 4, 2.0).array))
     expected = sum(
@@ -84,7 +88,7 @@ def test_encodings_slope() -> None:
 
 
 def test_position_encoding_does_not_move_gaussians() -> None:
-    points = Tensor64(np.ones((3, 2)))
+    points = doubles(np.ones((3, 2)))
     dr.enable_grad(points)
     assert not dr.grad_enabled(Encoding().position(points))
     assert dr.grad_enabled(Encoding().transmitter(points))
@@ -95,7 +99,7 @@ def draw_layer(name: str, inputs: dict[str, int], outputs: int) -> tuple[dict[st
     weights = init_layer(name, inputs, outputs, rng)
     weights[f"{name}.bias"] = rng.standard_normal((outputs, 1)).astype(np.float32)
     weights = {key: value.astype(float) for key, value in weights.items()}
-    return weights, {key: Tensor64(value) for key, value in weights.items()}
+    return weights, {key: doubles(value) for key, value in weights.items()}
 
 
 @pytest.mark.parametrize("with_hidden", [False, True])
@@ -105,8 +109,8 @@ def test_layer_in_parts_is_the_product_with_the_concatenation(with_hidden: bool)
     rng = np.random.default_rng(6)
     n, batch = 5, 3
     x, y, h = rng.random((60, n)), rng.random((60, batch)), rng.random((23, batch * n))
-    hidden = Tensor64(h) if with_hidden else None
-    out = dense_of_pairs(params, "layer", {"position": Tensor64(x)}, {"transmitter": Tensor64(y)}, hidden).numpy()
+    hidden = doubles(h) if with_hidden else None
+    out = dense_of_pairs(params, "layer", {"position": doubles(x)}, {"transmitter": doubles(y)}, hidden).numpy()
     assert out.shape == (11, batch * n)
     matrix = np.concatenate([weights[f"layer.{part}"] for part in sizes], axis=1)
     for b in range(batch):
@@ -119,10 +123,10 @@ def test_layer_in_parts_is_the_product_with_the_concatenation(with_hidden: bool)
 def test_linear_and_relu() -> None:
     weights, params = draw_layer("layer", {"hidden": 9}, 4)
     x = np.random.default_rng(7).standard_normal((9, 6))
-    out = linear(params, "layer", Tensor64(x)).numpy()
+    out = linear(params, "layer", doubles(x)).numpy()
     np.testing.assert_allclose(out, weights["layer.hidden"] @ x + weights["layer.bias"], rtol=PRODUCT_TOLERANCE)
-    np.testing.assert_array_equal(relu(Tensor64(out)).numpy(), np.maximum(out, 0))
-    np.testing.assert_array_equal(dense(params, "layer", Tensor64(x)).numpy(), np.maximum(out, 0))
+    np.testing.assert_array_equal(relu(doubles(out)).numpy(), np.maximum(out, 0))
+    np.testing.assert_array_equal(dense(params, "layer", doubles(x)).numpy(), np.maximum(out, 0))
 
 
 @pytest.mark.gradcheck
@@ -132,9 +136,9 @@ def test_slope_of_a_hidden_layer_is_that_of_its_parts(batch: int, with_hidden: b
     """The derivative that sums rows against the one of Dr.Jit, of the same sum written out."""
     n, rng = 5, np.random.default_rng(11)
     _, params = draw_layer("layer", {"position": 4, "transmitter": 3} | ({"hidden": 2} if with_hidden else {}), 7)
-    x, y, h = (Tensor64(rng.standard_normal(shape)) for shape in ((4, n), (3, batch), (2, batch * n)))
+    x, y, h = (doubles(rng.standard_normal(shape)) for shape in ((4, n), (3, batch), (2, batch * n)))
     inputs = {**params, "x": x, "y": y} | ({"h": h} if with_hidden else {})
-    weight = Tensor64(rng.standard_normal((7, batch * n)))
+    weight = doubles(rng.standard_normal((7, batch * n)))
 
     def slopes(layer: Callable[[], Any]) -> list[np.ndarray]:
         dr.enable_grad(inputs)
@@ -203,9 +207,9 @@ def test_every_weight_has_a_bias_and_takes_part(model: str) -> None:
     field, weights = FIELDS[model](), start(FIELDS[model](), seed=3)
     layers = {name.rsplit(".", 1)[0] for name in weights if "." in name}
     assert {f"{layer}.bias" for layer in layers} <= set(weights)
-    params = {name: Tensor64(values.astype(float)) for name, values in weights.items()}
+    params = {name: doubles(values.astype(float)) for name, values in weights.items()}
     dr.enable_grad(params)
-    g = field.gaussians(params, Tensor64(np.random.default_rng(4).standard_normal((3, 2))))
+    g = field.gaussians(params, doubles(np.random.default_rng(4).standard_normal((3, 2))))
     outputs = [*g.position, *g.scale, *g.rotation, *g.signal, *(g.attenuation or [g.opacity])]
     rng = np.random.default_rng(2)
     dr.backward(sum(dr.sum(a * Float64(rng.standard_normal(dr.width(a)))) for a in outputs))
@@ -232,7 +236,7 @@ def test_wrf_gs_plus_adds_offsets_of_its_network() -> None:
     field, n, batch = WrfGsPlus(width=40), 3, 2
     weights = {name: values.astype(float) for name, values in start(field, n).items()}
     tx = np.random.default_rng(9).standard_normal((3, batch))
-    g = field.gaussians({k: Tensor64(v) for k, v in weights.items()}, Tensor64(tx))
+    g = field.gaussians({k: doubles(v) for k, v in weights.items()}, doubles(tx))
     got = {"signal": g.signal, "rotation": g.rotation, "scale": [dr.log(s) for s in g.scale]}
     static = {"signal": "signal", "rotation": "rotation", "scale": "log_scale"}
     for b in range(batch):
@@ -252,7 +256,7 @@ def test_attenuation_stays_below_one() -> None:
     """Complex delta, |delta| < 1 whatever the network says, nearly transparent at the start, free in phase."""
     field, weights = WrfGs(), start(WrfGs(), 200)
 
-    def delta(head_gain: float, tensor: Any = Tensor64) -> np.ndarray:
+    def delta(head_gain: float, tensor: Any = doubles) -> np.ndarray:
         own = weights | {"attenuation.delta.hidden": weights["attenuation.delta.hidden"] * np.float32(head_gain)}
         params = {k: tensor(v.astype(float)) for k, v in own.items()}
         re, im = field.gaussians(params, tensor(np.zeros((3, 1)))).attenuation

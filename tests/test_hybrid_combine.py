@@ -9,6 +9,7 @@ import pytest
 from hybrid_room import FREQUENCY_HZ
 from scipy.constants import speed_of_light
 
+from wrf_mi.backend.device import on_device
 from wrf_mi.hybrid import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver, TracedPaths, learned_field
 
 # isort: split
@@ -63,7 +64,7 @@ def signals(found: dict[str, np.ndarray], elements: np.ndarray, k: float = K) ->
 
 def learned(batch: int, count: int, float_type: Any = Float64, seed: int = 3) -> tuple[Any, np.ndarray]:
     values = np.random.default_rng(seed).standard_normal((2, batch, count)) * 0.3
-    return tuple(float_type(part.ravel()) for part in values), values[0] + 1j * values[1]
+    return tuple(on_device(part, float_type) for part in values), values[0] + 1j * values[1]
 
 
 def image(h: np.ndarray) -> np.ndarray:

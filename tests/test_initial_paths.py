@@ -16,9 +16,9 @@ from wrf_mi.backend import init
 
 init()
 
-import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, Paths, Record  # noqa: E402
 from wrf_mi.field import WrfGsPlus  # noqa: E402
 from wrf_mi.field.initial_paths import gaussians_from_mesh, gaussians_from_paths  # noqa: E402
@@ -60,15 +60,15 @@ def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndar
     assert np.allclose(image, tx * [-1, 1, 1], atol=1e-4)  # float32 corners of the wall at x = 0
 
 
-@pytest.mark.parametrize("kind", [mi.TensorXf, dr.tensor_t(dr.float64_array_t(mi.Float))])
+@pytest.mark.parametrize("kind", [mi.Float, mi.Float64])
 def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarray], kind: Any) -> None:
     paths, tx = traced
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
     plain = WrfGsPlus(layers=2, width=8, skip=1)
     turning = replace(plain, phase_hz=FREQUENCY_HZ)
     weights = turning.init(start, np.random.default_rng(0))
-    params = {name: kind(np.asarray(value, float)) for name, value in weights.items()}
-    there = kind(np.ascontiguousarray(tx[:3].T.astype(np.float32).astype(float)))
+    params = {name: to_tensor(value, kind) for name, value in weights.items()}
+    there = to_tensor(tx[:3].T.astype(np.float32), kind)
     signals = []
     for field in (plain, turning):
         re, im = field.gaussians(params, there).signal
@@ -77,7 +77,7 @@ def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarra
     affine = weights["image"].T.reshape(20, 3, 4).astype(float)
     image = np.einsum("nij,bj->bni", affine, np.column_stack([x, np.ones(3)]))
     phase = -2 * np.pi * FREQUENCY_HZ / speed_of_light * np.linalg.norm(image - place, axis=2)
-    single = kind is mi.TensorXf
+    single = kind is mi.Float
     # Distances of 10 m in float32: 1e-6 m, 5e-5 rad at this wavelength, in some operations.
     np.testing.assert_allclose(signals[1], signals[0] * np.exp(1j * phase), atol=3e-4 if single else 1e-9)
     assert np.abs(signals[1] - signals[0]).max() > 0.1

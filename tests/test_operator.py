@@ -71,11 +71,11 @@ def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Ga
     opacity = rng.uniform(0.01, 0.99, n)
     return Gaussians(
         position=[on_device(c, float_type) for c in position.T],
-        scale=[float_type(c) for c in scale],
-        rotation=[float_type(c) for c in rotation],
-        signal=[float_type(signal.real.copy()), float_type(signal.imag.copy())],
-        opacity=None if product else float_type(opacity),
-        attenuation=[float_type(delta.real.copy()), float_type(delta.imag.copy())] if product else None,
+        scale=[on_device(c, float_type) for c in scale],
+        rotation=[on_device(c, float_type) for c in rotation],
+        signal=[on_device(signal.real, float_type), on_device(signal.imag, float_type)],
+        opacity=None if product else on_device(opacity, float_type),
+        attenuation=[on_device(delta.real, float_type), on_device(delta.imag, float_type)] if product else None,
         batch=1,
     ), signal
 

@@ -17,6 +17,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from wrf_mi.backend.device import on_device  # noqa: E402
 from wrf_mi.core import rotation_matrix  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
 from wrf_mi.project.extinction_cells import MARGIN, TIGHT, largest_extinction, make_cells, to_device  # noqa: E402
@@ -55,18 +56,18 @@ def random_values(n: int, rng: np.random.Generator, scale_m: tuple[float, float]
 def gaussians(values: dict[str, Any], float_type: Any = Float64) -> Gaussians:
     delta = values.get("attenuation")
     return Gaussians(
-        position=[float_type(x) for x in values["position"]],
-        scale=[float_type(x) for x in values["scale"]],
-        rotation=[float_type(x) for x in values["rotation"]],
+        position=[on_device(x, float_type) for x in values["position"]],
+        scale=[on_device(x, float_type) for x in values["scale"]],
+        rotation=[on_device(x, float_type) for x in values["rotation"]],
         signal=[float_type(0), float_type(0)],
-        opacity=float_type(values["opacity"]) if delta is None else None,
-        attenuation=None if delta is None else [float_type(delta.real), float_type(delta.imag)],
+        opacity=on_device(values["opacity"], float_type) if delta is None else None,
+        attenuation=None if delta is None else [on_device(delta.real, float_type), on_device(delta.imag, float_type)],
         batch=1,
     )
 
 
 def vectors(v: np.ndarray, float_type: Any = Float64) -> list[Any]:
-    return [float_type(x) for x in np.atleast_2d(v).T]
+    return [on_device(x, float_type) for x in np.atleast_2d(v).T]
 
 
 def units(n: int, rng: np.random.Generator) -> np.ndarray:

@@ -211,7 +211,7 @@ def test_derivative_by_the_receivers_place() -> None:
     """Moving the receiver one way is moving all Gaussians the other way."""
     scene = scene_of(gaussians_of(any_field(20, seed=3, size=0.2), "alpha", mi.Float))
     params = mi.traverse(scene)
-    weight = mi.TensorXf(np.random.default_rng(0).standard_normal((12, 40, 2)))
+    weight = to_tensor(np.random.default_rng(0).standard_normal((12, 40, 2)))
     place = dr.opaque(mi.Point3f, 0.0)
     dr.enable_grad(place, params["gaussians.data"])
     pose = mi.AffineTransform4f(params["sensor.to_world"].matrix)

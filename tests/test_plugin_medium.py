@@ -257,7 +257,7 @@ def test_medium_follows_its_emitter(model: str) -> None:
     params["transmitter.tx_position"] = mi.Point3f(-2.0, 0.0, 1.0)
     moved = weights_of(model)
     moved["position"] = moved["position"] + np.float32([[0.5], [0.0], [3.0]])
-    params["transmitter.position"] = mi.TensorXf(moved["position"])
+    params["transmitter.position"] = to_tensor(moved["position"])
     params.update()
     after = plain(air.optical_depth(ray))
     np.testing.assert_allclose(after, direct((-2.0, 0.0, 1.0), moved), atol=FLOAT32_TOLERANCE)

@@ -149,9 +149,9 @@ def test_nothing_to_see_is_dark() -> None:
     where = np.tile(below, (5, 1)).T
     where[:, 0] = RECEIVER.position_m + 0.01
     params["position"] = to_tensor(where)
-    params["log_scale"] = mi.TensorXf(np.full((3, 5), -2.0))
+    params["log_scale"] = to_tensor(np.full((3, 5), -2.0))
     re, im = splat(
-        field.gaussians(params, mi.TensorXf(np.zeros((3, 1)))),
+        field.gaussians(params, to_tensor(np.zeros((3, 1)))),
         device_pose(RECEIVER, mi.Float),
         perception_plane(90, 360, mi.Float),
     )

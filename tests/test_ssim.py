@@ -19,7 +19,7 @@ wrf_mi.backend.init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from wrf_mi.backend.device import to_float  # noqa: E402
+from wrf_mi.backend.device import on_device, to_float  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.loss.spectrum import spectrum_loss  # noqa: E402
 from wrf_mi.loss.ssim import ssim  # noqa: E402
@@ -40,7 +40,7 @@ def reference(prediction, truth):
 
 def ours(prediction, truth, float_type=None):
     float_type = float_type or mi.Float
-    return np.array(ssim(float_type(prediction.ravel()), float_type(truth.ravel()), *prediction.shape))
+    return np.array(ssim(on_device(prediction, float_type), on_device(truth, float_type), *prediction.shape))
 
 
 def smooth(rng, shape):
@@ -146,9 +146,9 @@ def test_float32_gradient_stays_close_on_flat_images():
     prediction, truth = pairs(shape)["bright flat"]
     gradients = []
     for float_type in (mi.Float, Float64):
-        variable = float_type(prediction.ravel())
+        variable = on_device(prediction, float_type)
         dr.enable_grad(variable)
-        dr.backward(dr.sum(ssim(variable, float_type(truth.ravel()), *shape)))
+        dr.backward(dr.sum(ssim(variable, on_device(truth, float_type), *shape)))
         gradients.append(np.array(dr.grad(variable)))
     # Inputs near one differ by 6e-8 between the types, 6e-5 of the contrast.
     assert gradients[0] == pytest.approx(gradients[1], abs=1e-3 * np.abs(gradients[1]).max())

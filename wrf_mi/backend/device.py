@@ -58,9 +58,11 @@ def to_uint(values: ArrayLike) -> Any:
     return on_device(values, mi.UInt32)
 
 
-def to_tensor(values: ArrayLike) -> Any:
-    """A Dr.Jit float32 tensor of the same shape."""
-    return mi.TensorXf(to_float(values), np.shape(values))
+def to_tensor(values: ArrayLike, kind: Any = None) -> Any:
+    """A Dr.Jit tensor of the same shape, float32 or of another type of arrays ``kind``."""
+    own = mi.Float if kind is None else kind
+    tensor: Any = dr.tensor_t(own)
+    return tensor(on_device(values, own), np.shape(values))
 
 
 def to_vectors(rows: ArrayLike, kind: Any) -> Any:
