@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from wrf_mi.report import table_pages, tables
 from wrf_mi.report.bench import BenchFailed
 from wrf_mi.report.table_plan import PARTS, QUICK_PARTS, Row, plan
 
+CHECKOUT = Path(__file__).parents[1]
 PAPER = {
     "spectrum": {"wrf-gs+", "wrf-gs", "nerf2", "vae", "dcgan", "ray-tracing"},
     "rssi": {"wrf-gs+", "wrf-gs", "nerf2", "mri"},
@@ -24,6 +26,7 @@ def made_row(row: Row, median: float) -> dict:
         "label": row.entry.label,
         "share": row.share,
         "seed": row.seed,
+        "planned": row.planned,
         "n_train": 10,
         "n_test": 5,
         "train_seconds": 3.0,
@@ -80,7 +83,7 @@ def test_a_row_is_stored_when_it_is_done_and_never_measured_twice(short_plan, mo
         return made_row(row, 5.0 if row.share == 1 else 4.0)
 
     monkeypatch.setattr(tables, "measure", measure)
-    with pytest.raises(BenchFailed, match="1 rows did not finish: r2f2 stumbled"):
+    with pytest.raises(BenchFailed, match=r"1 rows did not finish: .*: r2f2 stumbled"):
         tables.tables(tmp_path, tmp_path / "runs")
     stored = {path.stem for path in (tmp_path / "tables").glob("*.json")}
     assert stored == {row.name for row in short_plan if row.method == "fire"}
@@ -88,6 +91,17 @@ def test_a_row_is_stored_when_it_is_done_and_never_measured_twice(short_plan, mo
     assert asked == [row.name for row in short_plan] + [short_plan[1].name]
     assert len(tables.tables(tmp_path, tmp_path / "runs")) == 3
     assert len(asked) == 4
+
+
+def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "measure", lambda runs, row: made_row(row, 5.0))
+    tables.tables(tmp_path, tmp_path / "runs")
+    asked = []
+    monkeypatch.setattr(tables, "measure", lambda runs, row: asked.append(row.name) or made_row(row, 6.0))
+    path = tmp_path / "tables" / f"{short_plan[0].name}.json"
+    path.write_text(path.read_text().replace("--model fire", "--model fire --set training.steps=1"))
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert asked == [short_plan[0].name]
 
 
 def test_no_row_is_begun_after_the_time_is_up(short_plan, monkeypatch, tmp_path):
@@ -125,7 +139,15 @@ def test_an_overview_has_a_line_a_method_and_the_mean_over_seeds(monkeypatch):
     monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
     medians = (5.0, 7.0, 100.0, 3.0, 9.5)
     stored = {row.name: made_row(row, median) for row, median in zip(rows, medians, strict=True)}
-    lines = table_pages.task_overview("csi", stored).splitlines()
+    lines = table_pages.overview("uplink", stored).splitlines()
     assert lines[0] == "| CEA (dB) | traced-csi-flat | traced-csi-office | paper, other data |"
     assert lines[2:] == ["| R2F2 | **9.50** |  | 8.57 |", "| FIRE | 6.00 | **3.00** | 15.29 |"]
-    assert table_pages.task_overview("rssi", stored) == ""
+    assert table_pages.overview("rssi", stored) == ""
+
+
+@pytest.mark.parametrize("name", table_pages.OVERVIEWS)
+def test_readme_shows_what_is_stored(name):
+    stored = table_pages.read_rows(CHECKOUT / "benchmarks" / "results" / "tables")
+    shown = (CHECKOUT / "README.md").read_text(encoding="utf-8").split(f"<!-- {name} -->")[1]
+    overview = table_pages.overview(name, {row["row"]: row for row in stored})
+    assert shown.split(f"<!-- /{name} -->")[0].strip() == overview

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from ..measure.registry import locate
 
 SEEDS = (0, 1, 2)
+ONE = SEEDS[:1]
 SHARES = (1.0, 0.3, 0.1)
 """Of the training rows; less than all for the methods of `FEW` alone, on the official split."""
 
@@ -20,14 +21,16 @@ class Entry:
         label: for the table.
         arguments: of ``wrf-mi train`` beside data set, split, rows and seed.
         quick: the same of a small version that takes half a minute.
-        seeds: more than one where a run takes less than three minutes and something is drawn.
+        seeds: more than one where a run takes less than three minutes on two cores and something is drawn.
+        few_seeds: the same with fewer rows, which are drawn themselves.
         published: median (and what else is known) that the paper states, on other data; "" for none.
     """
 
     label: str
     arguments: tuple[str, ...]
     quick: tuple[str, ...] = ()
-    seeds: Sequence[int] = SEEDS[:1]
+    seeds: Sequence[int] = ONE
+    few_seeds: Sequence[int] = SEEDS
     published: str = ""
 
 
@@ -39,6 +42,8 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
     return ("--model", name, *more)
 
 
+NAMED = "{scene}"
+"""In arguments: in whose place a scene's come."""
 IN_A_FLAT = (
     *("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2"),
     *("--calibrate", "patterns"),
@@ -46,50 +51,73 @@ IN_A_FLAT = (
 """Walls are two surfaces each and let waves through; strengths are not calibrated."""
 ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
 """As the channels were traced, but for what the rough surfaces scatter, which no mesh tells."""
-FEWER = _set("training.steps=200", "training.rounds=2")
-"""Of every network in the small version."""
+FEWER, SIXTY = (_set(f"training.steps={steps}", "training.rounds=2") for steps in (200, 60))
+"""Of every network in the small version; of those with long steps."""
+FOR_ALL = _set("shared=true", "gaussians=360", "training.batch=96")
+"""As many Gaussians and samples a step as six receivers have that are fitted one by one."""
 SPECTRUM: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), _set("steps=400", "validate_every=400"), SEEDS, "0.90, p90 0.95"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), _set("steps=400", "validate_every=400"), SEEDS, "0.82, p90 0.88"),
+    "wrf-gs+": Entry(
+        "WRF-GS+", _model("wrf-gs+"), _set("steps=400", "validate_every=400"), SEEDS, published="0.90, p90 0.95"
+    ),
+    "wrf-gs": Entry(
+        "WRF-GS", _model("wrf-gs"), _set("steps=400", "validate_every=400"), SEEDS, published="0.82, p90 0.88"
+    ),
     "hybrid": Entry("hybrid", _model("hybrid"), (), SEEDS),
-    "nerf2": Entry("NeRF2", _model("nerf2"), _set("training.steps=60", "training.rounds=2"), (0,), "0.78, p90 0.86"),
-    "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, "0.70, p90 0.82"),
-    "dcgan": Entry("DCGAN", _model("dcgan"), _set("training.steps=60", "training.rounds=2"), (0,), "0.56, p90 0.69"),
-    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", "{scene}"), (), (0,), "0.38, p90 0.61"),
+    "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, few_seeds=ONE, published="0.78, p90 0.86"),
+    "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
+    "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
+    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
 }
+UNSEEN = {
+    **SPECTRUM,
+    "ray-tracing": Entry(
+        "ray tracing, line of sight alone",
+        _model("ray-tracing", "--scene", NAMED),
+        few_seeds=ONE,
+        published="0.38, p90 0.61",
+    ),
+}
+"""Where nobody has a mesh: all that can be traced is the direct path."""
 RSSI: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+, one a receiver", _model("wrf-gs+"), FEWER, SEEDS, "2.4, p10 1.1, p90 4.6"),
-    "wrf-gs": Entry("WRF-GS, one a receiver", _model("wrf-gs"), FEWER, SEEDS, "2.9"),
-    "wrf-gs+-shared": Entry("WRF-GS+, one for all", _model("wrf-gs+", *_set("shared=true")), FEWER, SEEDS),
-    "wrf-gs-shared": Entry("WRF-GS, one for all", _model("wrf-gs", *_set("shared=true")), FEWER, SEEDS),
-    "hybrid": Entry("hybrid", _model("hybrid", "--scene", "{scene}"), (), (0,)),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, (0,), "3.1"),
-    "ray-tracing": Entry("ray tracing, calibrated", _model("ray-tracing", "--scene", "{scene}", *IN_A_FLAT)),
-    "trees": Entry("randomised trees", _model("trees"), (), SEEDS),
-    "kriging": Entry("kriging", _model("kriging")),
+    "wrf-gs+": Entry("WRF-GS+, one a receiver", _model("wrf-gs+"), FEWER, SEEDS, published="2.4, p10 1.1, p90 4.6"),
+    "wrf-gs": Entry("WRF-GS, one a receiver", _model("wrf-gs"), FEWER, SEEDS, published="2.9"),
+    "wrf-gs+-shared": Entry("WRF-GS+, one for all", _model("wrf-gs+", *FOR_ALL), FEWER, SEEDS),
+    "wrf-gs-shared": Entry("WRF-GS, one for all", _model("wrf-gs", *FOR_ALL), FEWER, SEEDS),
+    "hybrid": Entry("hybrid, knows the heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
+    "ray-tracing": Entry(
+        "ray tracing, calibrated, knows the heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+    ),
+    "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
+    "kriging": Entry("kriging, knows the heading", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
     "mri": Entry("MRI", _model("mri"), published="8.3"),
 }
 POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, SEEDS),
-    "hybrid": Entry("hybrid", _model("hybrid", "--scene", "{scene}"), (), (0,)),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, (0,)),
-    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", "{scene}")),
+    "hybrid": Entry("hybrid", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE),
+    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, (0,), "23.91, p10 20.85, p90 25.52"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, (0,), "22.98, p10 20.82, p90 24.33"),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, (0,), "20.55"),
-    "fire": Entry("FIRE", _model("fire"), FEWER, (0,), "15.29"),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, few_seeds=ONE, published="23.91, p10 20.85, p90 25.52"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, few_seeds=ONE, published="22.98, p10 20.82, p90 24.33"),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
+    "fire": Entry("FIRE", _model("fire"), FEWER, few_seeds=ONE, published="15.29"),
     "r2f2": Entry("R2F2", _model("r2f2"), published="8.57"),
-    "optml": Entry("OptML", _model("optml"), FEWER, (0,), "8.47"),
-    "ray-tracing": Entry("ray tracing, from positions", _model("ray-tracing", "--scene", "{scene}", *ON_A_FLOOR)),
+    "optml": Entry("OptML", _model("optml"), FEWER, few_seeds=ONE, published="8.47"),
+    "kriging": Entry("kriging, from positions", _model("kriging")),
+    "ray-tracing": Entry(
+        "ray tracing, from positions", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
+    ),
 }
+CHEAP = ("hybrid", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
+"""Measured first: seconds to a minute each."""
 FEW = ("wrf-gs+", "hybrid", "nerf2", "kriging", "idw", "ray-tracing")
 """Measured with fewer rows too."""
 
@@ -99,7 +127,8 @@ class Part:
     """One data set under one split.
 
     Attributes:
-        task: which table it belongs to.
+        task: of the data set.
+        table: which overview it belongs to: the task, or what channels are predicted from.
         dataset: name.
         split: name.
         entries: methods.
@@ -108,6 +137,7 @@ class Part:
     """
 
     task: str
+    table: str
     dataset: str
     split: str
     entries: Mapping[str, Entry] = field(hash=False)
@@ -116,14 +146,14 @@ class Part:
 
 
 PARTS = (
-    Part("spectrum", "rfid-lab", "official", SPECTRUM, True, "laboratory"),
-    Part("spectrum", "rfid-lab", "blocked", SPECTRUM, scene="laboratory"),
-    Part("spectrum", "traced-room", "official", SPECTRUM, scene="room"),
-    Part("rssi", "flat-ble", "official", RSSI, True, "flat"),
-    Part("csi", "newrf-conference", "official", POSITION, True, "scan"),
-    Part("csi", "newrf-office", "official", POSITION, scene="scan"),
-    Part("csi", "traced-csi-flat", "official", UPLINK, True, "floor"),
-    Part("csi", "traced-csi-office", "official", UPLINK, scene="floor"),
+    Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open"),
+    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open"),
+    Part("spectrum", "spectrum", "traced-room", "official", SPECTRUM, scene="room"),
+    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat"),
+    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan"),
+    Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
+    Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
+    Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor"),
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
 BLOCKED_SETTINGS: Mapping[str, tuple[str, ...]] = {
@@ -162,6 +192,11 @@ class Row:
         p = self.part
         return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
 
+    @property
+    def planned(self) -> str:
+        """Its arguments in one line, whatever the scene's place: a row that was measured by others is an old one."""
+        return " ".join(self.arguments(["--scene", f"{{{self.part.scene}}}"]))
+
     def arguments(self, scene: Sequence[str]) -> list[str]:
         """Of ``wrf-mi``, without ``--out``.
 
@@ -170,7 +205,7 @@ class Row:
         """
         words: list[str] = []
         for word in self.entry.arguments:
-            if word == "{scene}":
+            if word == NAMED:
                 words[-1:] = scene
             else:
                 words.append(word)
@@ -183,13 +218,14 @@ class Row:
 
 
 def plan(quick: bool = False) -> list[Row]:
-    """All rows: first one seed of every method at all rows, part by part, then fewer rows, then other seeds.
+    """All rows: first one seed of every method at all rows, cheap ones first, then fewer rows, then other seeds.
 
     So tables are whole early, and what an interruption leaves out is what is least needed.
     """
     if quick:
         return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
     first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
+    first.sort(key=lambda row: row.method not in CHEAP)
     few = [
         Row(part, name, share, 0)
         for part in PARTS
@@ -198,8 +234,10 @@ def plan(quick: bool = False) -> list[Row]:
         for name in part.entries
         if name in FEW
     ]
-    seeds = [Row(row.part, row.method, row.share, seed) for row in (*first, *few) for seed in row.entry.seeds[1:]]
-    return [*first, *few, *seeds]
+    few.sort(key=lambda row: row.method not in CHEAP)
+    again = [Row(row.part, row.method, row.share, seed) for row in first for seed in row.entry.seeds[1:]]
+    again += [Row(row.part, row.method, row.share, seed) for row in few for seed in row.entry.few_seeds[1:]]
+    return [*first, *few, *again]
 
 
 def available(part: Part) -> bool:

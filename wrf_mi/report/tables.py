@@ -1,8 +1,9 @@
 """Every method of the paper in one table for each task, measured by the project's own command.
 
 Each row is a run of ``wrf-mi train`` in a process of its own. It is written down the moment it is done, as a JSON file
-among the results, so an interrupted measurement goes on where it stopped, on another machine too; to have a row
-measured again, delete its file. The rows of `wrf_mi.report.table_plan` are in an order that makes tables whole early.
+among the results, so an interrupted measurement goes on where it stopped, on another machine too. A row is measured
+again where the plan has other arguments for it by now, or where its file and the folder of its run are deleted. The
+rows of `wrf_mi.report.table_plan` are in an order that makes tables whole early.
 """
 
 from __future__ import annotations
@@ -11,14 +12,19 @@ import json
 import shutil
 import sys
 import time
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from wrf_mi_scenes.build_laboratory import sheet
+from wrf_mi_scenes.furnished import write_scene
 
 from ..core import InputError
-from ..core.files import write_atomically
+from ..core.files import atomic_folder, one_line, write_atomically
 from ..fit.folder import versions
 from ..measure.registry import locate
 from ..parallel import Scheduler, SerialScheduler, run_module
@@ -31,7 +37,7 @@ from .bench_hybrid_csi import SCANNED, scanned_scene
 from .metrics import summary
 from .run_folder import CONFIG, METRICS, read_run
 from .table_pages import read_rows, write_tables
-from .table_plan import Part, Row, available, plan
+from .table_plan import NAMED, Part, Row, available, plan
 
 FOLDER = "tables"
 """In the folder of results; ``tables-quick`` for the small version."""
@@ -39,6 +45,8 @@ QUANTILES = 101
 """Of the scores of a row, equally spaced shares: what a distribution is drawn from."""
 FLAT_HEIGHT_M = 2.7
 """Ceiling of the flat whose layout has none."""
+FAR_M, PLATE_M = 100.0, 0.01
+"""Where a scene's only surface is, and its edge: Sionna RT opens none without any."""
 SCAN_SEED = 1
 """Of the noise of simulated scans."""
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
@@ -50,8 +58,8 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     Raises:
         InputError: data that are not on this machine.
     """
-    if part.scene == "laboratory":
-        return ["--scene", "laboratory"]
+    if part.scene == "open":
+        return ["--scene", str(_once(folder / "open", _open_scene))]
     if part.scene == "room":
         return ["--scene", str(traced_room()[1])]
     if part.scene == "floor":
@@ -62,16 +70,29 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     if part.scene == "floor":
         return ["--scene", str(place / MEASURED)]
     if part.scene == "flat":
-        made = folder / "flat"
-        if not made.exists():
-            make_scene(place / "layout.csv", made, height_m=FLAT_HEIGHT_M)
-        return ["--scene", str(made)]
+        make = partial(make_scene, place / "layout.csv", height_m=FLAT_HEIGHT_M)
+        return ["--scene", str(_once(folder / "flat", make))]
     # The room's own mesh is what the data were computed with: a model is given one made from a scan, as on site.
-    scanned = folder / part.dataset
-    if not (scanned / SCANNED).exists():
-        scanned.mkdir(parents=True, exist_ok=True)
-        scanned_scene(place / f"{part.dataset.removeprefix('newrf-')}.npz", scanned, SCAN_SEED)
+    paths = place / f"{part.dataset.removeprefix('newrf-')}.npz"
+    scanned = _once(folder / part.dataset, lambda made: scanned_scene(paths, made, SCAN_SEED))
     return ["--scene", str(scanned / SCANNED)]
+
+
+def _once(place: Path, make: Callable[[Path], object]) -> Path:
+    """A folder that is made where there is none: whole, or not at all."""
+    if not place.exists():
+        with atomic_folder(place, False) as part:
+            make(part)
+    return place
+
+
+def _open_scene(folder: Path) -> None:
+    plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
+    write_scene(folder, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
+
+
+def _scene(part: Part, runs: Path) -> list[str]:
+    return scene_of(part, runs / "scenes") if part.scene else []
 
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
@@ -80,19 +101,20 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
     Raises:
         BenchFailed: the command ended with an error.
     """
-    folder = runs / row.name
-    scene = scene_of(row.part, runs / "scenes") if row.part.scene and "{scene}" in row.entry.arguments else []
-    arguments = row.arguments(scene)
+    # A run that other arguments made is another run.
+    folder = runs / f"{row.name}-{zlib.crc32(row.planned.encode()):08x}"
+    arguments = row.arguments(_scene(row.part, runs) if NAMED in row.entry.arguments else [])
     wall = None
     if not (folder / METRICS).exists():
-        resumed = (folder / CONFIG).exists()
+        # Tracing takes seconds and has nothing to go on from.
+        resumed = (folder / CONFIG).exists() and row.method != "ray-tracing"
         if folder.exists() and not resumed:
             shutil.rmtree(folder)  # stopped before it said what it is
         call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
         start = time.perf_counter()
         status, said = run_module("wrf_mi.cli", call)
         if status != 0:
-            raise BenchFailed(f"tables: `wrf-mi {' '.join(call)}` ended with status {status} {said}".rstrip())
+            raise BenchFailed(f"`wrf-mi {' '.join(call)}` ended with status {status} {said}".rstrip())
         wall = None if resumed else time.perf_counter() - start
     run = read_run(folder)
     scores = np.sort(run.score[~np.isnan(run.score)])
@@ -102,6 +124,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         "share": row.share,
         "seed": row.seed,
         "command": "wrf-mi " + " ".join(arguments),
+        "planned": row.planned,
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine(),
         "versions": versions(),
@@ -139,7 +162,8 @@ def tables(
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:
         print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
-    left = [row for row in rows if available(row.part) and not (place / f"{row.name}.json").exists()]
+    stored = {one["row"]: one["planned"] for one in read_rows(place)}
+    left = [row for row in rows if available(row.part) and stored.get(row.name) != row.planned]
     print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
     begun = time.perf_counter()
     failures: list[str] = []
@@ -148,13 +172,17 @@ def tables(
         if isinstance(result, str):
             if result:
                 failures.append(result)
-                print(result, file=sys.stderr, flush=True)
+                print(f"tables: {result}", file=sys.stderr, flush=True)
             return
         write_atomically(place / f"{left[index].name}.json", json.dumps(result, indent=1) + "\n")
         text = f"{result['row']}: median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s"
         print(text, file=sys.stderr, flush=True)
         write_tables(place, quick)
 
+    for part in dict.fromkeys(row.part for row in left if NAMED in row.entry.arguments):
+        # Before workers ask for them at the same time; what cannot be made is told row by row.
+        with suppress(InputError):
+            _scene(part, runs / place.name)
     call = partial(_guarded, runs / place.name, None if most_s is None else time.time() + most_s)
     (scheduler or SerialScheduler()).map(call, left, what="measuring", each=each)
     write_tables(place, quick)
@@ -170,5 +198,5 @@ def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:
         return ""
     try:
         return measure(runs, row)
-    except (BenchFailed, InputError) as error:
-        return str(error)
+    except (InputError, OSError, RuntimeError) as error:
+        return f"{row.name}: {one_line(error)}"
