@@ -159,6 +159,7 @@ QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat
 BLOCKED_SETTINGS: Mapping[str, tuple[str, ...]] = {
     **{name: _set("steps=3000", "hold_out=0") for name in ("wrf-gs", "wrf-gs+")},
     "dcgan": _set("training.steps=600"),
+    "nerf2": _set("training.steps=2000"),
 }
 """Of the five folds of a blocked split, which are fitted in turn: ten minutes for all of them."""
 
