@@ -56,7 +56,7 @@ NOTE = (
     "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets; with "
     "fewer rows the seed draws the rows too. Errors of signal strength are pooled over receivers and rows; fields "
     "have one offset a receiver. *Paper* is what the WRF-GS+ paper states **on other data**, NeRF2's and Argos's, "
-    "for signal strength as means over twelve receivers: compare orders, not figures. Networks of the blocked split are "
+    "for signal strength as means over twelve receivers: compare orders, not figures. Networks of blocked splits are "
     "fitted in five folds, all but the VAE with a fifth to a half of their steps; in the traced room they take the "
     "steps of the ten times smaller laboratory. Each run had one thread of a machine that others used "
     "too: read ratios of times."

@@ -70,6 +70,7 @@ SPECTRUM: Mapping[str, Entry] = {
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
 }
+FURNISHED = {**SPECTRUM, "hybrid": Entry("hybrid, knows the bare walls", _model("hybrid", "--scene", NAMED), (), SEEDS)}
 UNSEEN = {
     **SPECTRUM,
     "ray-tracing": Entry(
@@ -148,7 +149,7 @@ class Part:
 PARTS = (
     Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open"),
     Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open"),
-    Part("spectrum", "spectrum", "traced-room", "official", SPECTRUM, scene="room"),
+    Part("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room"),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat"),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan"),
     Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
