@@ -1,4 +1,4 @@
-"""R2F2, OptML and FIRE: exact where theory says so, better than no method elsewhere, clear about bad input."""
+"""Methods from the uplink: exact where theory says so, better than no method elsewhere, clear about bad input."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from wrf_mi.backend import init
 
 init()
 
-from wrf_mi.baselines import fire, optml, r2f2  # noqa: E402
+from wrf_mi.baselines import fire, linear, nerf2, optml, r2f2  # noqa: E402
 from wrf_mi.baselines.csi_bands import Bands, bands_of  # noqa: E402
 from wrf_mi.baselines.fire import FireSettings  # noqa: E402
+from wrf_mi.baselines.gaussian_evaluation import GaussianSettings  # noqa: E402
+from wrf_mi.baselines.gaussian_fields import method_of  # noqa: E402
+from wrf_mi.baselines.linear import LinearSettings  # noqa: E402
 from wrf_mi.baselines.method import Inputs, inputs_of  # noqa: E402
+from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
+from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.optml import OptMLSettings  # noqa: E402
 from wrf_mi.baselines.path_network import Simulation  # noqa: E402
 from wrf_mi.baselines.r2f2 import R2F2Settings  # noqa: E402
@@ -33,8 +38,12 @@ HZ = CARRIER_HZ + OFFSETS
 EXACT_DB = 60.0
 """Coefficients are stored as complex64, whose 140 dB the step to the next band and single antennas in a fade may cost
 some; a wrong path, or one of them missing, gives less than 30."""
-METHODS = {"fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
+METHODS = {"linear": linear.METHOD, "fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
+"""That need the uplink alone."""
+FIELDS = {"wrf-gs": method_of("wrf-gs"), "wrf-gs+": method_of("wrf-gs+"), "nerf2": nerf2.METHOD}
+QUICK = Training(steps=10, batch=8, rounds=2)
 SMALL = {
+    "linear": LinearSettings(),
     "fire": FireSettings(Training(steps=40, batch=32, rounds=2), sample="antenna", width=16, latent=4),
     "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
     "optml": OptMLSettings(
@@ -45,6 +54,10 @@ SMALL = {
         wavefront="plane",
         max_distance_m=30.0,
     ),
+    **dict.fromkeys(
+        ("wrf-gs", "wrf-gs+"), GaussianSettings(QUICK, gaussians=8, layers=2, width=8, height=4, columns=8)
+    ),
+    "nerf2": Nerf2Settings(QUICK, Networks(layers=2, width=8), sphere_rays=8, samples=2),
 }
 
 
@@ -188,6 +201,38 @@ def test_fire_beats_copying_the_uplink(walk):
     assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
 
 
+def test_a_linear_map_beats_copying_the_uplink(walk):
+    truth, record = walk
+    split = split_of(80, 16)
+    fitted = linear.METHOD.fit(record, split, LinearSettings(), 0, lambda what, share: None)
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    assert mine > copied + 10, "its phase alone, put right, gives 2 dB"
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    # Methods other than fields look at no pose.
+    [(name, "nothing") for name in METHODS]
+    + [(name, known) for name in FIELDS for known in ("nothing", "its position", "its orientation")],
+)
+def test_captures_without_a_pose_are_learned_from(name, known, walk):
+    """As Argos' captures are: the base station's place is not known, nor its elements and frequencies."""
+    truth, _ = walk
+    place = np.array([1.0, 2.0, 3.0]) if known == "its position" else np.full(3, np.nan)
+    turned = np.array([0.5, 0.5, 0.5, 0.5]) if known == "its orientation" else np.full(4, np.nan)
+    record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
+    settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
+    method, split = (METHODS | FIELDS)[name], split_of(30, 5)
+    fitted = method.fit(record, split, settings, 0, lambda what, share: None)
+    inputs = inputs_of(record, split.test)
+    found = fitted.predict(inputs, 0)
+    assert found.shape == (5, 6, HALF)
+    assert np.isfinite(found).all()
+    assert np.abs(found).min() > 0
+    np.testing.assert_array_equal(method.load(fitted.arrays(), record).predict(inputs, 0), found)
+
+
 def test_optml_starts_close_enough_with_few_steps(elements):
     rng = np.random.default_rng(6)
     h = channels(*sparse(20, 3, rng), elements, spherical=False)
@@ -242,19 +287,22 @@ def broken(record, case):
     }[case]()
 
 
-@pytest.mark.parametrize("name", METHODS)
+BAD = {
+    "no uplink": "has no uplink",
+    "uplink frequencies": "26 uplink subcarriers and 25 frequencies",
+    "downlink frequencies": "26 subcarriers and 25 frequencies",
+    "antennas": "and 48 antennas",
+    "array": "47, 3",
+    "two receivers": "needs one receiver",
+    "NaN uplink": "row 3: uplink, 1 of",
+    "NaN downlink": "row 3: 1 of",
+}
+
+
 @pytest.mark.parametrize(
-    ("case", "text"),
-    [
-        ("no uplink", "has no uplink"),
-        ("uplink frequencies", "26 uplink subcarriers and 25 frequencies"),
-        ("downlink frequencies", "26 subcarriers and 25 frequencies"),
-        ("antennas", "and 48 antennas"),
-        ("array", "47, 3"),
-        ("two receivers", "needs one receiver"),
-        ("NaN uplink", "row 3: uplink, 1 of"),
-        ("NaN downlink", "row 3: 1 of"),
-    ],
+    ("name", "case", "text"),
+    # A linear map does not look at the array.
+    [(name, case, text) for name in METHODS for case, text in BAD.items() if (name, case) != ("linear", "array")],
 )
 def test_bad_records_are_named(name, case, text, walk):
     with pytest.raises(InputError, match=text):

@@ -13,6 +13,7 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
+from wrf_mi.baselines import nerf2  # noqa: E402
 from wrf_mi.baselines.band_fields import spread  # noqa: E402
 from wrf_mi.baselines.gaussian_evaluation import AT_ONCE, Evaluation, GaussianSettings, frame_of  # noqa: E402
 from wrf_mi.baselines.gaussian_fields import components_of, method_of  # noqa: E402
@@ -156,6 +157,29 @@ def test_channels_are_learned_from_the_uplink_and_kept(model):
     np.testing.assert_array_equal(method.load(fitted.arrays(), record).predict(inputs, 0), found)
 
 
+def two_stations(rows: int = 60) -> Record:
+    """Channels over positions; the second station's are 20 dB weaker and orthogonal to the first's, some unheard."""
+    rng = np.random.default_rng(4)
+    tx = np.column_stack([rng.uniform(-2, 2, (rows, 2)), np.full(rows, 0.3)])
+    modes = np.exp(2j * np.pi * np.outer([1, 3], np.arange(8)) / 8)
+    h = np.exp(1j * tx[:, :1]) * modes[:, None] * np.array([1e-3, 1e-4])[:, None, None]
+    h[0, :5] = np.nan
+    h[1, 3:9] = np.nan
+    return Record("made", "csi", tx, receivers(2), h.astype(np.complex64))
+
+
+def test_a_second_receiver_with_other_components_is_learned():
+    record = two_stations()
+    split = halves(record)
+    settings = replace(SMALL, components=2, training=Training(steps=300, batch=16, rate=3e-3, rounds=3))
+    fitted = method_of("wrf-gs+").fit(record, split, settings, 0, quiet)
+    inputs = inputs_of(record, split.test)
+    for r in range(2):
+        truth, found = record.observation[r, split.test], fitted.predict(inputs, r)
+        error = np.square(np.abs(found - truth)).sum(axis=1) / np.square(np.abs(truth)).sum(axis=1)
+        assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
+
+
 def test_any_number_of_rows_is_predicted_alike():
     record = strengths(1, 2 * AT_ONCE + 3)
     rows = np.arange(len(record))
@@ -177,3 +201,15 @@ def test_what_cannot_be_learned_from_is_refused():
     with pytest.raises(InputError, match="received no training row"):
         method.fit(deaf, halves(record), SMALL, 0, quiet)
     dr.sync_thread()
+
+
+@pytest.mark.parametrize("name", [*MODELS, "nerf2"])
+@pytest.mark.parametrize("lost", ["position_m", "orientation_xyzw"])
+def test_receivers_without_a_pose_are_refused_where_positions_tell(name, lost):
+    record = strengths()
+    unknown = replace(record.receivers[1], **{lost: np.full(3 if lost == "position_m" else 4, np.nan)})
+    record = replace(record, receivers=(record.receivers[0], unknown))
+    method, quick = method_of(name) if name in MODELS else nerf2.METHOD, Training(steps=2, batch=4, rounds=1)
+    with pytest.raises(InputError, match=r"made: the pose of receiver rx1 is not known.*give its position") as error:
+        method.fit(record, halves(record), method.settings(quick), 0, quiet)
+    assert "\n" not in str(error.value)

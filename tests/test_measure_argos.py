@@ -64,6 +64,11 @@ def write(path: Path, values: np.ndarray, attributes: dict[str, Any], group: str
     return path
 
 
+def kept(attributes: dict[str, Any]) -> dict[str, Any]:
+    """All but those that a text without a letter takes away."""
+    return {key: value for key, value in attributes.items() if not (isinstance(value, str) and value == "")}
+
+
 ARGOS = {"num_mob_ant": USERS, "samples_per_user": 224, "frame_length": 20000, "measured_noise": 1}
 
 
@@ -72,7 +77,7 @@ def argos(path: Path, **changes: Any) -> Path:
     samples = received(np.concatenate([SYMBOL[-32:], SYMBOL, SYMBOL]), 224, 15)
     noise = np.full_like(samples[:, :1], 3)
     every = np.concatenate([samples, noise], axis=1).swapaxes(1, 2)
-    return write(path, every.reshape(FRAMES, ANTENNAS, -1, 2), {k: v for k, v in (ARGOS | changes).items() if v != ""})
+    return write(path, every.reshape(FRAMES, ANTENNAS, -1, 2), kept(ARGOS | changes))
 
 
 SOUNDER = {
@@ -91,7 +96,7 @@ def sounder(path: Path, symbols: int = 4, group: str = "Data", cells: int = 1, *
     samples = received(np.tile(np.concatenate([SYMBOL[-16:], SYMBOL]), symbols), 150 + 80 * symbols, 82)
     values = samples.reshape(FRAMES, 1, USERS, ANTENNAS, -1)
     values = np.concatenate([np.roll(values, k, axis=0) for k in reversed(range(cells))], axis=1)
-    return write(path, values, {k: v for k, v in (SOUNDER | changes).items() if v != ""}, group)
+    return write(path, values, kept(SOUNDER | changes), group)
 
 
 def assert_found(record: Any, symbols: int, frames: Any = slice(None)) -> None:
@@ -178,6 +183,15 @@ def text_file(path: Path) -> Path:
     return path
 
 
+def unreadable_attribute(path: Path) -> Path:
+    """HDF5 has times, NumPy has none like them."""
+    sounder(path)
+    with h5py.File(path, "r+") as file:
+        space = h5py.h5s.create(h5py.h5s.SCALAR)
+        h5py.h5a.create(file["Data"].id, b"STARTED", h5py.h5t.UNIX_D32LE, space)
+    return path
+
+
 WRONG: dict[str, tuple[Callable[[Path], Path], str]] = {
     "not HDF5": (text_file, "not readable as HDF5"),
     "missing": (lambda path: path, "missing; give a capture"),
@@ -196,6 +210,27 @@ WRONG: dict[str, tuple[Callable[[Path], Path], str]] = {
     "other pilots": (
         lambda path: sounder(path, PILOT_SEQ_TYPE=np.array([b"zadoff-chu"])),
         "'zadoff-chu' of 64 samples",
+    ),
+    "attribute of a time": (
+        unreadable_attribute,
+        r"an attribute cannot be read \(.*; write it again as a number or as",
+    ),
+    "no word of pilots": (
+        lambda path: sounder(path, PILOT_SEQ_TYPE=np.array([], "S3")),
+        "attribute PILOT_SEQ_TYPE is empty; it must be lts",
+    ),
+    "empty word of pilots": (
+        lambda path: sounder(path, PILOT_SEQ_TYPE=np.array([b""], "S3")),
+        "attribute PILOT_SEQ_TYPE is empty; it must be lts",
+    ),
+    "nothing of pilots": (
+        lambda path: sounder(path, PILOT_SEQ_TYPE=h5py.Empty("S3")),
+        r"attribute PILOT_SEQ_TYPE is .*Empty\(.*; it must be lts",
+    ),
+    "pilots not UTF-8": (lambda path: sounder(path, PILOT_SEQ_TYPE=np.array([b"\xff\xfe"])), r"pilots .*xff.* of 64"),
+    "many users": (
+        lambda path: argos(path, num_mob_ant=np.full(500, -1)),
+        r"attribute num_mob_ant is array\(\[-1, -1,.*\.\.\.; it must tell",
     ),
     "longer symbols": (lambda path: sounder(path, FFT_SIZE=2048), "of 2048 samples; the long training symbol"),
     "half a pair": (

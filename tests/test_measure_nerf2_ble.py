@@ -66,6 +66,40 @@ def test_columns_go_by_name_or_else_by_place(folder: Path) -> None:
     np.testing.assert_array_equal(read_nerf2_ble(folder).tx_pos_m[1], [1.75, 0.25, 1])
 
 
+def test_what_pandas_writes_of_arrays_without_names_is_read(folder: Path) -> None:
+    expected = read_nerf2_ble(folder)
+    (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "0,1"))
+    (folder / "tx_pos.csv").write_text(POSITIONS.replace("x,y,z", "0,1,2"))
+
+    def same() -> None:
+        found = read_nerf2_ble(folder)
+        np.testing.assert_array_equal(found.observation, expected.observation)
+        np.testing.assert_array_equal(found.tx_pos_m, expected.tx_pos_m)
+
+    same()
+    # Names like these numbers: one of them says nothing of the order, all of them do.
+    (folder / "gateway_position.yml").write_text(GATEWAYS.replace("gateway1", "1").replace("gateway2", "2"))
+    same()
+    (folder / "gateway_position.yml").write_text(GATEWAYS.replace("gateway1", "1").replace("gateway2", "0"))
+    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected.observation[::-1])
+
+
+def test_columns_without_names_of_their_own_go_by_place(folder: Path) -> None:
+    expected = read_nerf2_ble(folder).observation
+    (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "dBm,dBm"))
+    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected)
+
+
+def test_blank_lines_are_skipped(folder: Path) -> None:
+    expected = read_nerf2_ble(folder)
+    for name in ("gateway_rssi.csv", "tx_pos.csv"):
+        lines = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join(["", lines[0], "", lines[1], "  ", *lines[2:], "", ""]))
+    found = read_nerf2_ble(folder)
+    np.testing.assert_array_equal(found.observation, expected.observation)
+    np.testing.assert_array_equal(found.tx_pos_m, expected.tx_pos_m)
+
+
 def text(name: str, old: str, new: str) -> Change:
     """Replace the first match of a pattern in a text file."""
 
@@ -103,10 +137,21 @@ WRONG = {
     "gateways not YAML": (write(YML, "a: ["), YML, "not YAML"),
     "gateway in the plane": (text(YML, ", 3.0", ""), YML, r"gateway1: position is \[1.0, 2.0\]; give a list of 3"),
     "gateway of words": (text(YML, "3.0", "high"), YML, "gateway1: position"),
+    "date that is none": (text(YML, r"\[4, 5, 6\]", "2021-99-99"), YML, "month must be in 1..12.*line 2, column 11"),
+    "gateway of 400 digits": (text(YML, "3.0", "9" * 400), YML, "no int .*too large to convert.*line 1, column 22"),
+    "gateway too far": (text(YML, "3.0", "1.0e+39"), YML, "gateway1: position is .*; give a list of 3 finite numbers"),
+    "deep YAML": (write(YML, "a: " + "[" * 3000), YML, "not YAML"),
+    "gateway of two lines": (
+        write(YML, '"gate\\nway": [1, 2, 3]\n'),
+        YML,
+        r"gateway 'gate\\nway' does not go into one line; call it gateway1",
+    ),
     "two coordinates": (text(POS, "x,y,z", "x,y"), POS, "row 1: 3 fields, but the header has 2"),
     "four coordinates": (write(POS, "a,b,c,d\n1,2,3,4\n"), POS, "line 1: header 'a,b,c,d' has 4 columns"),
     "position not finite": (text(POS, "0.25", "nan"), POS, "row 2: x is 'nan'"),
     "positions without header": (text(POS, "x,y,z\n", ""), POS, "line 1: '0.5,1.5,1' is a row of numbers"),
+    "positions too large": (text(POS, "0.25", "-1e39"), POS, "row 2: x is '-1e39'; give a finite number of single"),
+    "header of other numbers": (text(RSSI, "gateway1,gateway2", "1,0"), RSSI, "line 1: '1,0' is a row of numbers"),
     "powers without header": (text(RSSI, "gateway1,gateway2\n", ""), RSSI, "line 1: '-54.25,-100' is a row of numbers"),
     "rows differ": (text(POS, "1.25,2,1\n", ""), RSSI, "4 rows, but tx_pos.csv has 3"),
     "column too many": (
@@ -116,6 +161,16 @@ WRONG = {
     ),
     "other gateway": (text(RSSI, "gateway2", "gateway9"), RSSI, "line 1: no column gateway2"),
     "power of words": (text(RSSI, "-61", "weak"), RSSI, "row 2: gateway2 is 'weak'"),
+    "power of words in a numbered column": (
+        lambda folder: (folder / RSSI).write_text("0,1\n-50,-60\n\n-50,weak\n") and None,
+        RSSI,
+        r"row 2: column 1 \(gateway2\) is 'weak'",
+    ),
+    "power too large": (
+        text(RSSI, "-61", "1e39"),
+        RSSI,
+        "row 2: gateway2 is '1e39'; give a finite number of single pre",
+    ),
     "power missing": (text(RSSI, "-61", ""), RSSI, "row 2: gateway2 is ''"),
     "deaf gateway": (
         lambda folder: (folder / RSSI).write_text("gateway1,gateway2\n" + "-50,-100\n" * 4) and None,
@@ -124,11 +179,17 @@ WRONG = {
     ),
     "one row": (one_row, POS, "1 row; give 2 at least"),
     "index out of range": (text("train_index.txt", "3", "4"), "train_index.txt", "row 4 is out of range.*rows 0 to 3"),
+    "index of 5000 digits": (
+        text("train_index.txt", "3", "9" * 5000),
+        "train_index.txt",
+        "line 1: '9+' has more than 18 digits; correct it",
+    ),
     "index in both": (text("test_index.txt", "1", "3"), "test_index.txt", "row 3 is in train_index.txt as well"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
 }
 
 
+@pytest.mark.filterwarnings("error")  # a number that overflows on its way is refused without a warning
 @pytest.mark.parametrize("case", WRONG)
 def test_bad_folders_are_refused_with_one_line(folder: Path, case: str) -> None:
     change, name, message = WRONG[case]

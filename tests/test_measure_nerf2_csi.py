@@ -141,13 +141,28 @@ WRONG: dict[str, tuple[Change, str, str]] = {
     "complex NaN": (save(with_value(complex(np.nan, 1))), CSI, r"sample 4, antenna 1, subcarrier 6 \(from 0\).*finite"),
     "imaginary NaN": (save(with_value(complex(1, np.nan))), CSI, "sample 4, antenna 1, subcarrier 6"),
     "infinite": (save(with_value(complex(np.inf, 0))), CSI, "sample 4, antenna 1, subcarrier 6"),
+    "beyond single precision": (save(with_value(1e300)), CSI, r"sample 4, antenna 1.*1e\+300.* too large for single"),
+    "imaginary beyond": (
+        save(with_value(-1e39j)),
+        CSI,
+        "sample 4, antenna 1.* too large for single precision; correct",
+    ),
     "station not YAML": (write(YML, "a: ["), YML, "not YAML"),
-    "station empty": (write(YML, ""), YML, "base_station is 'None'; give x, y, z in metres of each antenna"),
+    "station empty": (write(YML, ""), YML, "base_station is None; give x, y, z in metres of each antenna"),
+    "station of 400 digits": (
+        write(YML, f"base_station:\n- [0, 0, {'9' * 400}]\n"),
+        YML,
+        "no int .*too large to convert.*line 2, column 10",
+    ),
+    "station too far": (station(base_station=[[0, 1, 1e39]] * 3), YML, "base_station is .*give x, y, z in metres"),
+    "date that is none": (write(YML, "base_station: 2021-99-99\n"), YML, "month must be in 1..12.*line 1, column 15"),
     "station in the plane": (station(base_station=[[0, 1]]), YML, "base_station is"),
     "station fewer": (station(base_station=PLACES[:2]), YML, "2 positions in base_station, but csidata.npy has 3 ante"),
     "station not finite": (station(base_station=[[0, 1, float("nan")]] * 3), YML, "base_station is"),
     "orientation": (station(orientation=[1.0, 1, 0, 0]), YML, "quaternion of norm 1.414"),
     "frequency of words": (station(frequencies_hz=["high"] * 8), YML, "frequencies_hz is"),
+    "frequency of 400 digits": (station(frequencies_hz=[10**400] * 8), YML, "no int .*too large to convert"),
+    "frequency too high": (station(frequencies_hz=[1e39] * 8), YML, "frequencies_hz is"),
     "frequencies differ": (station(frequencies_hz=[1e9] * 7), YML, "7 frequencies_hz, but csidata.npy has 8 subcarri"),
     "frequency negative": (station(frequencies_hz=[-1e9] * 8), YML, "frequencies_hz is"),
     "positions fewer": (write("tx_pos.csv", "x,y,z\n1,2,3\n"), "tx_pos.csv", "1 rows, but csidata.npy has 6 samples"),
@@ -164,6 +179,14 @@ WRONG: dict[str, tuple[Change, str, str]] = {
 }
 
 
+def test_frequencies_of_a_call_are_refused_with_one_line(folder: Path) -> None:
+    for wrong in (np.full((9, 2), 1e9), [10**400] * 8):
+        with pytest.raises(InputError, match=r"frequencies_hz is .*; give a list of frequencies in Hz") as error:
+            read_nerf2_csi(folder, frequencies_hz=wrong)  # type: ignore[arg-type]
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("error")  # a number that overflows on its way is refused without a warning
 @pytest.mark.parametrize("case", WRONG)
 def test_bad_folders_are_refused_with_one_line(folder: Path, case: str) -> None:
     change, name, message = WRONG[case]

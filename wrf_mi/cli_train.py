@@ -81,9 +81,12 @@ def _resume(a: Arguments) -> int:
     from .report.baseline_run import is_baseline, resume_baseline
     from .report.hybrid_run import is_hybrid, resume_hybrid
     from .report.runs import resume
+    from .report.traced import is_traced
     from .report.watch import Stages
 
     folder = Path(a.resume)
+    if is_traced(folder):
+        raise InputError(f"{folder}: ray tracing has nothing to go on from; start it anew in another folder")
     if is_hybrid(folder) or is_baseline(folder):
         go_on = resume_hybrid if is_hybrid(folder) else resume_baseline
         with Stages() as stages:

@@ -5,16 +5,19 @@ With an uplink each antenna of each row is a condition of its own, as in NeRF2's
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record
+from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .method import Inputs
+
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+"""The quaternion x, y, z, w of a receiver whose frame is the world's."""
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
@@ -96,6 +99,30 @@ def outputs_of(record: Record) -> Outputs:
     if len(record.receivers) != 1:
         raise InputError(f"{record.name}: has one uplink for {len(record.receivers)} receivers; give one each")
     return Outputs(True, antennas, known)
+
+
+def placed_receivers(record: Record, outputs: Outputs) -> tuple[Receiver, ...]:
+    """The receivers of a record, with poses that are finite.
+
+    With an uplink in the transmitter's place nothing is told in the world's frame, so a receiver whose position is not
+    known defines that frame: it is put at the origin, upright unless its orientation is known.
+
+    Raises:
+        InputError: a pose that is not known, where transmitters are told by their positions.
+    """
+    placed = []
+    for receiver in record.receivers:
+        position, turned = np.asarray(receiver.position_m, float), np.asarray(receiver.orientation_xyzw, float)
+        if not (np.isfinite(position).all() and np.isfinite(turned).all()):
+            if not outputs.by_uplink:
+                raise InputError(
+                    f"{record.name}: the pose of receiver {receiver.name} is not known, which fields over positions "
+                    "need; give its position and orientation, or channels with an uplink"
+                )
+            position = position if np.isfinite(position).all() else np.zeros(3)
+            turned = turned if np.isfinite(turned).all() else UPRIGHT
+        placed.append(replace(receiver, position_m=position, orientation_xyzw=turned))
+    return tuple(placed)
 
 
 def uplink_of(inputs: Inputs) -> NDArray[Any]:

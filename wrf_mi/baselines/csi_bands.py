@@ -122,9 +122,18 @@ def uplink_of(inputs: Inputs, bands: Bands) -> NDArray[np.complex128]:
     Raises:
         InputError: none, of another shape, or not finite.
     """
+    return finite_uplink(inputs, bands.antennas, len(bands.uplink_hz))
+
+
+def finite_uplink(inputs: Inputs, antennas: int, subcarriers: int) -> NDArray[np.complex128]:
+    """The same of a model that knows no frequencies.
+
+    Raises:
+        InputError: as `uplink_of`.
+    """
     if inputs.uplink is None:
         raise InputError("rows without uplink coefficients: give `uplink` [rows, antennas, subcarriers]")
-    expected = (bands.antennas, len(bands.uplink_hz))
+    expected = (antennas, subcarriers)
     if inputs.uplink.ndim != 3 or inputs.uplink.shape[1:] != expected:
         raise InputError(f"uplink {inputs.uplink.shape}: fitted on {expected} antennas and subcarriers a row")
     wrong = int(np.count_nonzero(~np.isfinite(inputs.uplink)))

@@ -24,7 +24,7 @@ from ..hybrid.learned import learned_field
 from ..project.footprint import Pose
 from ..splat.tiles import perception_plane
 from .band_fields import BAND_FIELDS, FeatureEncoding, spread
-from .conditions import Outputs, outputs_of
+from .conditions import Outputs, outputs_of, placed_receivers
 from .tensors import columns
 from .training import Training, opaque_rows
 
@@ -102,10 +102,16 @@ class Frame:
 
 
 def frame_of(model: str, record: Record, basis: NDArray[np.complex128], scale: float) -> Frame:
-    """The frame for a record's receivers."""
-    place = np.stack([receiver.position_m for receiver in record.receivers])
-    turned = np.stack([receiver.to_world for receiver in record.receivers])
-    return Frame(model, record.task, outputs_of(record), basis, scale, place.astype(float), turned)
+    """The frame for a record's receivers.
+
+    Raises:
+        InputError: a receiver without a pose that is needed.
+    """
+    outputs = outputs_of(record)
+    receivers = placed_receivers(record, outputs)
+    place = np.stack([receiver.position_m for receiver in receivers])
+    turned = np.stack([receiver.to_world for receiver in receivers])
+    return Frame(model, record.task, outputs, basis, scale, place, turned)
 
 
 class Evaluation:

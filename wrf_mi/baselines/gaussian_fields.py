@@ -11,8 +11,9 @@ What the paper leaves open, and what was chosen:
 - Channels. "The input is changed from the TX's location to the uplink CSI": each antenna's uplink, normalised as
   `wrf_mi.baselines.conditions.normalised_uplink`, is a condition of its own, and the downlink, divided by the same, is
   compared by its squared error. A Gaussian has a few complex signals, coefficients of the principal components of the
-  training rows' downlink over subcarriers: 26 subcarriers in one band are far from independent, and noise that the
-  components leave out is not learned. Without an uplink the position is the condition, as for spectra.
+  training rows' downlink over subcarriers, all receivers' together: 26 subcarriers in one band are far from
+  independent, and noise that the components leave out is not learned. Without an uplink the position is the condition,
+  as for spectra.
 - Sizes: networks and pictures are smaller than for spectra, since all directions end in one number.
 
 Source: Wen, Tong, Hu, Lin and Zhang, "Neural representation for wireless radiation field reconstruction: a 3D Gaussian
@@ -37,7 +38,16 @@ from ..core import Record, Split
 from ..core.types import IntArray
 from ..field import random_gaussians
 from ..field.network import Weights
-from .conditions import channels_from, conditions_of, normalised_uplink, outputs_of, truth_of, uplink_of
+from .conditions import (
+    Outputs,
+    channels_from,
+    conditions_of,
+    normalised_uplink,
+    outputs_of,
+    placed_receivers,
+    truth_of,
+    uplink_of,
+)
 from .gaussian_evaluation import AT_ONCE, Evaluation, Frame, GaussianSettings, frame_of
 from .method import Inputs, Listen, Method, inputs_of
 from .tensors import columns
@@ -129,15 +139,14 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
     """Fit the fields.
 
     Raises:
-        InputError: positions that the data do not tell, a receiver without training rows, or an uplink of others.
+        InputError: positions or poses that the data do not tell, a receiver without training rows, or an uplink of
+            others.
     """
     outputs, known = outputs_of(record), split.all_train
     scale, basis = 1.0, np.ones((1, 1), complex)
     if record.task == "csi":
-        size = np.sqrt(np.nanmean(np.square(np.abs(record.observation[:, known].astype(complex)))))
-        scale = float(size) or 1.0
-        parts = truth_of(record, outputs, 0, known, scale).astype(float)
-        basis = components_of(parts[:, : outputs.count] + 1j * parts[:, outputs.count :], s.components)
+        basis = components_of(_observed(record, split, outputs, model), s.components)
+        scale = float(np.sqrt(np.nanmean(np.square(np.abs(record.observation[:, known].astype(complex)))))) or 1.0
     if not outputs.by_uplink:
         positions(record, model)
     frame = frame_of(model, record, basis, scale)
@@ -154,6 +163,18 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
         evaluation = Evaluation(s, frame, features)
         fields.append(_fit_group(record, split, evaluation, condition, seed, part, members))
     return FittedGaussians(s, frame, features, fields, record.observation.shape[2:])
+
+
+def _observed(record: Record, split: Split, outputs: Outputs, model: str) -> NDArray[np.complex128]:
+    """Channels [n, outputs] of the training rows that were received, those of all receivers one after the other."""
+    channels = []
+    for r in range(len(record.receivers)):
+        parts = truth_of(record, outputs, r, np.concatenate(usable_rows(record, split, r, model)), 1.0).astype(float)
+        own = parts[:, : outputs.count] + 1j * parts[:, outputs.count :]
+        # Scores are relative, so receivers count alike, however far away or seldom heard.
+        size = np.sqrt(np.square(np.abs(own)).sum())
+        channels.append(own / (size or 1.0))
+    return np.concatenate(channels)
 
 
 def _truth(record: Record, frame: Frame, receiver: int, rows: IntArray) -> NDArray[np.float32]:
@@ -180,8 +201,9 @@ def _fit_group(
     # From here on rows count within the training rows.
     rows = {r: tuple(np.searchsorted(known, part) for part in usable_rows(record, split, r, model)) for r in members}
     rng = np.random.default_rng([seed, *members])
+    receivers = placed_receivers(record, outputs)
     start = random_gaussians(
-        [record.receivers[r] for r in members],
+        [receivers[r] for r in members],
         s.gaussians,
         rng,
         (s.near_m, s.far_m),

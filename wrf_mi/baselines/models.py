@@ -18,6 +18,7 @@ MODULES = {
     "vae": "vae",
     "dcgan": "dcgan",
     "nerf2": "nerf2",
+    "linear": "linear",
     "fire": "fire",
     "r2f2": "r2f2",
     "optml": "optml",

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from ..backend.device import to_tensor
 from ..core import Record, Split
 from ..field.network import Weights
-from .conditions import channels_from, conditions_of, outputs_of, truth_of
+from .conditions import channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from .coordinates import Coordinates
 from .method import Inputs, Listen, Method, inputs_of
 from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
@@ -48,7 +48,7 @@ from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows
 SCORED_RAYS = 512
 """Pixels of each validation spectrum by which steps are chosen."""
 FAR_M = 10.0
-"""Where rays end if no transmitter's position is known: the size of a large room."""
+"""Where rays end if positions are not known: the size of a large room."""
 
 
 class FittedNerf2:
@@ -102,13 +102,15 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen
     """Fit the networks.
 
     Raises:
-        InputError: positions that the data do not tell, a receiver without training rows, or an uplink of others.
+        InputError: positions or poses that the data do not tell, a receiver without training rows, or an uplink of
+            others.
     """
     known = split.all_train
     outputs = outputs_of(record)
     where = record.tx_pos_m[known] if outputs.by_uplink else positions(record, "nerf2")[known]
-    rx = np.stack([receiver.position_m for receiver in record.receivers])
-    if np.isfinite(where).all():
+    known_rx = np.stack([receiver.position_m for receiver in record.receivers])
+    rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs)])
+    if np.isfinite(where).all() and np.isfinite(known_rx).all():
         farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
     else:
         where, farthest = rx, FAR_M

@@ -5,7 +5,7 @@ Source: see `wrf_mi.baselines.nerf2`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
-from ..core import InputError, Record
+from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
-from .conditions import Outputs, normalised_uplink, outputs_of, uplink_of
+from .conditions import Outputs, normalised_uplink, outputs_of, placed_receivers, uplink_of
 from .coordinates import Coordinates
 from .method import Inputs
 from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
@@ -49,7 +49,8 @@ class Nerf2Settings:
         sphere_batch: transmitters of a step for these two; with an uplink, antennas of transmitters.
         samples: points along a ray.
         near_m: distance at which rays start.
-        far_m: distance at which they end; 0: that of the farthest training transmitter, or without positions `FAR_M`.
+        far_m: distance at which they end; 0: that of the farthest training transmitter, or where positions are
+            not known `FAR_M`.
         tx_octaves: of the encoding of transmitter positions.
         shared: one pair of networks for all receivers, or else one for each.
     """
@@ -107,7 +108,7 @@ class Frame:
     groups: tuple[tuple[int, ...], ...]
 
 
-def world_directions(record: Record, sphere_rays: int) -> FloatArray:
+def world_directions(record: Record, receivers: Sequence[Receiver], sphere_rays: int) -> FloatArray:
     """Unit vectors of each receiver's rays in the world's frame, [n_rx, rays, 3].
 
     Those of the pixels for spectra (`wrf_mi.core.angles`), else ``sphere_rays`` over the full sphere.
@@ -117,20 +118,26 @@ def world_directions(record: Record, sphere_rays: int) -> FloatArray:
         own = pixel_directions(height, width).reshape(-1, 3)
     else:
         own = fibonacci_sphere(sphere_rays)
-    return np.stack([own @ receiver.to_world.T for receiver in record.receivers])
+    return np.stack([own @ receiver.to_world.T for receiver in receivers])
 
 
 def frame_of(record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scale: float) -> Frame:
-    """The frame for a record's receivers."""
+    """The frame for a record's receivers.
+
+    Raises:
+        InputError: a receiver without a pose that is needed.
+    """
     everyone = tuple(range(len(record.receivers)))
+    outputs = outputs_of(record)
+    receivers = placed_receivers(record, outputs)
     return Frame(
         coordinates,
         far_m,
         scale,
-        outputs_of(record),
+        outputs,
         record.task,
-        world_directions(record, settings.sphere_rays),
-        np.stack([receiver.position_m for receiver in record.receivers]),
+        world_directions(record, receivers, settings.sphere_rays),
+        np.stack([receiver.position_m for receiver in receivers]),
         (everyone,) if settings.shared else tuple((r,) for r in everyone),
     )
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
 from ..core.files import one_line
+from .folder_files import shown
 
 SUFFIXES = (".hdf5", ".h5")
 PILOTS = "Pilot_Samples"
@@ -147,7 +148,11 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
     for group in (stored, stored.get("Data")):
         pilots = None if group is None or not hasattr(group, "get") else group.get(PILOTS)
         if pilots is not None and hasattr(pilots, "shape"):
-            return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
+            try:
+                return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
+            except (KeyError, TypeError, ValueError) as error:  # types and texts that h5py cannot give
+                text = f"an attribute cannot be read ({one_line(error)})"
+                raise InputError(f"{file}: {text}; write it again as a number or as text") from None
     raise InputError(f"{file}: neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
 
 
@@ -198,8 +203,7 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
     if shape[4] % 2:
         raise InputError(f"{file}: {PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
-    size, kind = _number(attributes, "FFT_SIZE"), np.ravel(attributes.get("PILOT_SEQ_TYPE", b"lts"))[0]
-    text = kind.decode() if isinstance(kind, bytes) else str(kind)
+    size, text = _number(attributes, "FFT_SIZE"), _text(file, attributes, "PILOT_SEQ_TYPE", "lts")
     if size not in (None, FFT) or text.lower() != "lts":
         other = f"pilots {text!r} of {size or FFT:g} samples"
         raise InputError(f"{file}: {other}; the long training symbol (lts) of {FFT} is read")
@@ -218,6 +222,16 @@ def _cell(file: Path, shape: tuple[int, ...], cell: int | None) -> int:
     return cell or 0
 
 
+def _text(file: Path, attributes: dict[str, Any], key: str, default: str) -> str:
+    """A word; what is not UTF-8 stands in escapes."""
+    found = np.ravel(attributes.get(key, default))
+    word = found[0] if len(found) else ""
+    text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
+    if not text or not isinstance(word, bytes | str):
+        raise InputError(f"{file}: attribute {key} is {'empty' if not text else shown(word)}; it must be {default}")
+    return text
+
+
 def _number(attributes: dict[str, Any], key: str) -> float | None:
     try:
         value = float(np.ravel(attributes[key])[0])
@@ -229,7 +243,7 @@ def _number(attributes: dict[str, Any], key: str) -> float | None:
 def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
     value = _number(attributes, key)
     if value is None or value < 0 or value != int(value):
-        found = f"is {attributes[key]!r}" if key in attributes else "is missing"
+        found = f"is {shown(attributes[key])}" if key in attributes else "is missing"
         raise InputError(f"{file}: attribute {key} {found}; it must tell how {PILOTS} is laid out")
     return int(value)
 

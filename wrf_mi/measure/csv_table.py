@@ -11,6 +11,7 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line, text_lines
+from .folder_files import SINGLE_MAX
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,17 @@ class CsvTable:
             may_be_empty: read an empty field (or ``nan``) as NaN.
 
         Raises:
-            InputError: no such column, or a field that is not a finite number.
+            InputError: no such column, or a field that is not a finite number, in single precision too.
         """
         if self.header.count(column) != 1:
             what = "has no column" if column not in self.header else "has twice the column"
             text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
             raise InputError(f"{self.path}: {text}; the first line must name each column once")
-        place, values = self.header.index(column), np.full(len(self.rows), np.nan)
+        return self.numbers_at(self.header.index(column), column, may_be_empty)
+
+    def numbers_at(self, place: int, what: str, may_be_empty: bool = False) -> FloatArray:
+        """Numbers of the column at a place from 0, whatever its name: ``numbers`` with what messages call it."""
+        values = np.full(len(self.rows), np.nan)
         for row, fields in enumerate(self.rows):
             text = fields[place].strip()
             if may_be_empty and text.lower() in ("", "nan"):
@@ -50,19 +55,24 @@ class CsvTable:
                 values[row] = float(text)
             except ValueError:
                 values[row] = np.nan
-            if not np.isfinite(values[row]):
-                remedy = "give a finite number, or leave it empty" if may_be_empty else "give a finite number"
-                raise InputError(f"{self.path}: row {row + 1}: {column} is {text[:40]!r}; {remedy}")
+            if not abs(values[row]) <= SINGLE_MAX:
+                remedy = "give a finite number" + (" of single precision" if np.isfinite(values[row]) else "")
+                remedy += ", or leave it empty" if may_be_empty else ""
+                raise InputError(f"{self.path}: row {row + 1}: {one_line(what)} is {text[:40]!r}; {remedy}")
         return values
 
 
-def read_csv(path: Path) -> CsvTable:
+def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     """Read a CSV file whose first line is its header.
+
+    Args:
+        path: of the file.
+        skip_blank: skip blank lines, as pandas does, and count rows without them; else they are refused.
 
     Raises:
         InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
     """
-    lines = text_lines(path)
+    lines = [line for line in text_lines(path) if line.strip() or not skip_blank]
     if not lines:
         raise InputError(f"{path}: empty; give a header and one row per measurement")
     try:

@@ -15,17 +15,38 @@ from ..core.types import IntArray
 
 POSITIONS = "tx_pos.csv"
 INDEX_FILES = ("train_index.txt", "test_index.txt")
+SINGLE_MAX = float(np.finfo(np.float32).max)
+"""Largest number that single precision holds, in which everything computes."""
+DIGITS = 18
+"""Of a whole number at most: more may not fit into 64 bits."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Says where a value stands that looks like a date or a number and cannot be one."""
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            value = super().construct_object(node, deep)
+            if isinstance(value, int):
+                float(value)  # hundreds of digits are no quantity, and no array takes them
+        except yaml.YAMLError:
+            raise
+        except Exception as error:  # PyYAML's constructors raise a dozen kinds
+            text = f"no {node.tag.rpartition(':')[2]} ({one_line(error)})"
+            raise yaml.constructor.ConstructorError(None, None, text, node.start_mark) from None
+        return value
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
     """The mapping of a YAML file; empty where it holds anything else.
 
     Raises:
-        InputError: missing, not text or not YAML.
+        InputError: missing, not text, not YAML, or with a date or number in it that is none.
     """
+    text = "\n".join(text_lines(path))
     try:
-        content = yaml.safe_load("\n".join(text_lines(path)))
-    except yaml.YAMLError as error:
+        content = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
     return content if isinstance(content, dict) else {}
 
@@ -34,15 +55,31 @@ def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArr
     """A list of ``count`` finite numbers from YAML, shape [count].
 
     Raises:
-        InputError: it is anything else.
+        InputError: it is anything else, or single precision does not hold it.
     """
-    try:
-        values = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        values = np.empty(0)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise InputError(f"{path}: {what} is {value!r}; give a list of {count} finite numbers")
+    values = numbers_of(value)
+    if values.shape != (count,) or not fits_single(values):
+        raise InputError(f"{path}: {one_line(what)} is {shown(value)}; give a list of {count} finite numbers")
     return values
+
+
+def numbers_of(value: object) -> FloatArray:
+    """An array of numbers from YAML or from a call; empty where it is none."""
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
+def fits_single(values: FloatArray) -> bool:
+    """Whether all are finite, in single precision too."""
+    return bool((np.abs(values) <= SINGLE_MAX).all())
+
+
+def shown(value: object) -> str:
+    """A value for a message: on one line and not long."""
+    text = one_line(repr(value))
+    return text if len(text) <= 60 else f"{text[:60]}..."
 
 
 def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
@@ -54,7 +91,9 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
     orientation = finite_numbers(path, f"{name}: orientation", value, 4)
     norm = float(np.linalg.norm(orientation))
     if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
-        raise InputError(f"{path}: {name}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w")
+        raise InputError(
+            f"{path}: {one_line(name)}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w"
+        )
     return orientation
 
 
@@ -75,9 +114,10 @@ def read_positions(path: Path) -> FloatArray:
             positions[row - 1] = [float(value) for value in text.split(",", 3)]
         except ValueError:
             raise InputError(f"{path}: row {row}: {text[:60]!r}; give three numbers x,y,z in metres") from None
-    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(positions) <= SINGLE_MAX).all(axis=1))
     if len(bad):
-        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]]!r} is not finite; correct or remove the row")
+        what = "is not finite" if not np.isfinite(positions[bad[0]]).all() else "is too large for single precision"
+        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]][:60]!r} {what}; correct or remove the row")
     return positions
 
 
@@ -90,6 +130,8 @@ def whole_number(path: Path, line: int, text: str) -> int:
     digits = text.strip()
     if not (digits.isascii() and digits.isdecimal()):
         raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
+    if len(digits) > DIGITS:
+        raise InputError(f"{path}: line {line}: {digits[:40]!r} has more than {DIGITS} digits; correct it")
     return int(digits)
 
 

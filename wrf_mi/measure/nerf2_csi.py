@@ -33,9 +33,12 @@ from ..core.files import atomic_folder, one_line
 from .folder_files import (
     INDEX_FILES,
     POSITIONS,
+    fits_single,
+    numbers_of,
     read_official,
     read_positions,
     read_yaml,
+    shown,
     unit_quaternion,
     write_lines,
     write_positions,
@@ -141,7 +144,7 @@ def read_channels(path: Path) -> NDArray[np.complex64]:
     """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file.
 
     Raises:
-        InputError: missing, damaged, of another shape or type, or not finite.
+        InputError: missing, damaged, of another shape or type, or not finite, in single precision too.
     """
     try:
         values = np.load(path, allow_pickle=False)
@@ -154,23 +157,23 @@ def read_channels(path: Path) -> NDArray[np.complex64]:
         raise InputError(f"{path}: shape {shape}; give complex numbers [samples, antennas, subcarriers]")
     if values.dtype.kind != "c":
         raise InputError(f"{path}: holds {values.dtype}; give complex numbers [samples, antennas, subcarriers]")
-    bad = ~np.isfinite(values)
+    with np.errstate(over="ignore"):
+        single = values.astype(np.complex64)
+    bad = ~np.isfinite(single)
     if bad.any():
         sample, antenna, subcarrier = (int(k) for k in np.argwhere(bad)[0])
         where = f"sample {sample}, antenna {antenna}, subcarrier {subcarrier} (from 0)"
-        text = f"{values[sample, antenna, subcarrier]} is not finite"
+        value = values[sample, antenna, subcarrier]
+        text = f"{value} is {'too large for single precision' if np.isfinite(value) else 'not finite'}"
         raise InputError(f"{path}: {where}: {text}; correct or remove the sample")
-    return values.astype(np.complex64)
+    return single
 
 
 def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> tuple[Receiver, FloatArray]:
     places = info.get("base_station")
-    try:
-        elements = np.array(places, float)
-    except (TypeError, ValueError):
-        elements = np.empty(0)
-    if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
-        raise InputError(f"{path}: base_station is {str(places)[:60]!r}; give x, y, z in metres of each antenna")
+    elements = numbers_of(places)
+    if elements.ndim != 2 or elements.shape[1] != 3 or not fits_single(elements):
+        raise InputError(f"{path}: base_station is {shown(places)}; give x, y, z in metres of each antenna")
     if len(elements) != antennas:
         text = f"{len(elements)} positions in base_station, but {CHANNELS} has {antennas} antennas"
         raise InputError(f"{path}: {text}; give one for each")
@@ -180,12 +183,9 @@ def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> tuple[Rece
 
 
 def _frequencies(path: Path, values: object, subcarriers: int) -> FloatArray:
-    try:
-        frequencies = np.array(values, float)
-    except (TypeError, ValueError):
-        frequencies = np.empty(0)
-    if frequencies.ndim != 1 or not len(frequencies) or not ((frequencies > 0) & (frequencies < np.inf)).all():
-        raise InputError(f"{path}: frequencies_hz is {str(values)[:60]!r}; give a list of frequencies in Hz")
+    frequencies = numbers_of(values)
+    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
+        raise InputError(f"{path}: frequencies_hz is {shown(values)}; give a list of frequencies in Hz")
     if len(frequencies) != subcarriers:
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
         raise InputError(f"{path}: {text}; give one for each, the uplink's first")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..baselines.checks import check_rows
 from ..baselines.method import Listen
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
@@ -161,7 +162,10 @@ def train_hybrid(
     config = HybridConfig(source, split, n_train, seed, None if scene is None else str(scene), material, settings)
     run = HybridRun(Path(out), config, record)
     # Without training rows the split keeps them for the references beside the model, which need some.
-    return run.train(make_splits(record, split, seed, None if n_train == 0 else n_train), listen)
+    splits = make_splits(record, split, seed, None if n_train == 0 else n_train)
+    for rows in splits:
+        check_rows(record, rows)
+    return run.train(splits, listen)
 
 
 def resume_hybrid(folder: Path, listen: Listen = lambda what, share: None) -> Path:

@@ -10,6 +10,7 @@ convergence.json where settings were chosen by convergence: target and estimated
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +22,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from ..baselines.checks import check_rows
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.files import write_atomically
@@ -137,7 +139,7 @@ def trace_run(
         The run folder.
 
     Raises:
-        InputError: data, scene, settings or folder that cannot be used.
+        InputError: data, scene, settings or folder that cannot be used, with nothing left behind.
     """
     folder = Path(out)
     check_new(folder)
@@ -148,6 +150,8 @@ def trace_run(
         raise InputError(f"calibration {calibration!r}: unknown; choose from {', '.join(CALIBRATIONS)}")
     if calibration is not None and record.task != "rssi":
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
+    for rows in splits:
+        check_rows(record, rows)
     config = TraceConfig(source, str(scene), material, split, n_train, seed, options or TraceOptions(), calibration)
     tracer = RayTracer(scene, instrument_of(record), config.options, material)
     choice = None
@@ -165,20 +169,25 @@ def trace_run(
     traced = _trace(tracer, record.tx_pos_m, config, progress, scheduler)
     seconds = time.perf_counter() - start
     folder.mkdir(parents=True, exist_ok=True)
+    try:
+        save_trace(folder / PATHS, traced)
+        if choice is not None:
+            write_atomically(folder / CONVERGENCE, json.dumps(choice.plain(), indent=1) + "\n")
+        start = time.perf_counter()
+        for part, rows in part_folders(folder, splits):
+            part.mkdir(exist_ok=True)
+            save_split(part / SPLIT, rows)
+            if calibration is not None:
+                wanted = CALIBRATIONS[calibration]
+                fitted = calibrate(traced, tracer.scene, record, rows.all_train, wanted, progress)
+                save_calibration(part / CALIBRATION, fitted)
+        spent = {"trace_seconds": seconds, "train_seconds": time.perf_counter() - start if calibration else 0.0}
+        metrics, arrays = _score(folder, record, splits, tracer, traced)
+    except InputError:
+        shutil.rmtree(folder)  # it was new or empty
+        raise
+    # Only now: a trace is not gone on with, so what is left of one that was stopped must not look like a run.
     write_atomically(folder / CONFIG, _config_text(config))
-    save_trace(folder / PATHS, traced)
-    if choice is not None:
-        write_atomically(folder / CONVERGENCE, json.dumps(choice.plain(), indent=1) + "\n")
-    start = time.perf_counter()
-    for part, rows in part_folders(folder, splits):
-        part.mkdir(exist_ok=True)
-        save_split(part / SPLIT, rows)
-        if calibration is not None:
-            wanted = CALIBRATIONS[calibration]
-            fitted = calibrate(traced, tracer.scene, record, rows.all_train, wanted, progress)
-            save_calibration(part / CALIBRATION, fitted)
-    spent = {"trace_seconds": seconds, "train_seconds": time.perf_counter() - start if calibration else 0.0}
-    metrics, arrays = _score(folder, record, splits, tracer, traced)
     write_results(folder, _header(config, traced) | spent | metrics, arrays)
     return folder
 

@@ -1,0 +1,117 @@
+"""Data in which a gateway received nothing to learn from, and traces that were stopped: what the command says of them.
+
+Whatever is refused is refused in one line that names the data, before anything is written or told of progress.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused
+
+from wrf_mi.core import InputError
+from wrf_mi.measure import load
+from wrf_mi.report import traced
+from wrf_mi.report.hybrid_run import train_hybrid
+from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.traced import trace_run
+from wrf_mi.scene.make import make_scene
+from wrf_mi.trace import TraceOptions
+
+DIRECT = TraceOptions(reflection=False, max_depth=0)
+ROWS, TRAINED = 12, 8
+GATEWAYS_M = {"near": (0.4, 0.5, 2.1), "far": (4.5, 3.4, 2.3)}
+
+
+@pytest.fixture
+def unheard(tmp_path: Path) -> Path:
+    """Strengths in the flat's room, in NeRF2's layout; the second gateway received none of the training rows."""
+    folder = tmp_path / "unheard"
+    folder.mkdir()
+    places = np.random.default_rng(4).uniform([0.6, 0.6, 1], [4.2, 3.2, 1.5], (ROWS, 3))
+    lines = [f"{name}: [{x}, {y}, {z}]" for name, (x, y, z) in GATEWAYS_M.items()]
+    (folder / "gateway_position.yml").write_text("\n".join([*lines, ""]))
+    np.savetxt(folder / "tx_pos.csv", places, delimiter=",", header="x,y,z", comments="")
+    powers = [f"{-50 - row},{-100 if row < TRAINED else -70 + row}" for row in range(ROWS)]
+    (folder / "gateway_rssi.csv").write_text("\n".join(["near,far", *powers, ""]))
+    for name, rows in (("train_index.txt", range(TRAINED)), ("test_index.txt", range(TRAINED, ROWS))):
+        (folder / name).write_text("".join(f"{row}\n" for row in rows))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flat's plan, extruded."""
+    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+@pytest.mark.parametrize("model", ["ray-tracing", "hybrid", "hybrid without a mesh", "mri"])
+def test_a_gateway_without_training_rows_is_refused_before_anything_is_done(
+    model: str, unheard: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    asked: list[Any] = ["train", unheard, "--model", model.split()[0], "--out", out]
+    asked += ["--scene", room] if model in ("ray-tracing", "hybrid") else []
+    message = f"{unheard}, receiver far: received none of {TRAINED} training rows; leave it out or use another split"
+    refused(asked, message, capsys)
+    assert not out.exists()
+
+
+def test_every_split_is_looked_at(unheard: Path, room: Path, tmp_path: Path) -> None:
+    """Rows that the second gateway received are in one block: where that is held out, none is left."""
+    record = load(unheard)
+    observation = record.observation.copy()
+    observation[1] = np.where(np.arange(ROWS) == 3, -60, np.nan)
+    object.__setattr__(record, "observation", observation)
+    told: list[str] = []
+    for start in (
+        lambda: trace_run(room, record, tmp_path / "run", DIRECT, split="blocked"),
+        lambda: train_hybrid(record, tmp_path / "run", split="blocked", listen=lambda what, share: told.append(what)),
+    ):
+        with pytest.raises(InputError, match="receiver far: received none of"):
+            start()
+        assert not (tmp_path / "run").exists()
+    assert told == []
+
+
+def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    """It is known only from the paths."""
+    nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, max_depth=1)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match="no training row is both received and reached by a path"):
+        trace_run(room, flat_folder, tmp_path / "run", nothing)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("stage", ["calibrate", "_score"])
+@pytest.mark.parametrize("split", ["official", "blocked"])
+def test_what_is_left_of_a_stopped_trace_is_no_run(
+    stage: str,
+    split: str,
+    flat_folder: Path,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(traced, stage, stopped)
+        with pytest.raises(KeyboardInterrupt):
+            trace_run(room, flat_folder, out, DIRECT, calibration="patterns", split=split)
+    assert (out / "paths.npz").exists()  # an hour's work may lie there
+    for command in (["train", "--resume", out], ["evaluate", out]):
+        refused(command, f"{out}: no config.yaml, so not a run folder; give one made by train", capsys)
+    again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
+    refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)
+    status, _, err = call([*again, "--out", tmp_path / "new"], capsys)
+    assert status == 0, err
+    assert (tmp_path / "new" / "config.yaml").exists()
+    assert read_run(tmp_path / "new").metrics["model"] == "ray-tracing"
+    refused(["train", "--resume", tmp_path / "new"], "ray tracing has nothing to go on from; start it anew", capsys)
