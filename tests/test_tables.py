@@ -10,6 +10,7 @@ from wrf_mi.baselines.models import METHODS
 from wrf_mi.report import table_pages, tables
 from wrf_mi.report.bench import BenchFailed
 from wrf_mi.report.table_plan import PARTS, QUICK_PARTS, Row, plan
+from wrf_mi.trace import open_scene
 
 CHECKOUT = Path(__file__).parents[1]
 PAPER = {
@@ -102,6 +103,18 @@ def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, mo
     path.write_text(path.read_text().replace("--model fire", "--model fire --set training.steps=1"))
     tables.tables(tmp_path, tmp_path / "runs")
     assert asked == [short_plan[0].name]
+
+
+def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "locate", lambda name: flat_folder)
+    for name in ("flat-ble", "rfid-lab"):
+        part = next(part for part in PARTS if part.dataset == name)
+        (flag, path) = tables.scene_of(part, tmp_path)
+        assert flag == "--scene"
+        assert len(open_scene(path, 2.4e9).objects) > 0
+        before = {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")}
+        assert tables.scene_of(part, tmp_path) == [flag, path]
+        assert {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")} == before
 
 
 def test_no_row_is_begun_after_the_time_is_up(short_plan, monkeypatch, tmp_path):

@@ -70,8 +70,10 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     if part.scene == "floor":
         return ["--scene", str(place / MEASURED)]
     if part.scene == "flat":
-        make = partial(make_scene, place / "layout.csv", height_m=FLAT_HEIGHT_M)
-        return ["--scene", str(_once(folder / "flat", make))]
+        made = folder / "flat"
+        if not made.exists():
+            make_scene(place / "layout.csv", made, height_m=FLAT_HEIGHT_M)  # whole, or not at all
+        return ["--scene", str(made)]
     # The room's own mesh is what the data were computed with: a model is given one made from a scan, as on site.
     paths = place / f"{part.dataset.removeprefix('newrf-')}.npz"
     scanned = _once(folder / part.dataset, lambda made: scanned_scene(paths, made, SCAN_SEED))
