@@ -87,7 +87,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         ordered = sorted(medians, key=lambda method: sign * medians[method])
         for place, method in enumerate(ordered):
             ranks.setdefault(method, []).append(place / max(len(ordered) - 1, 1))
-    labels = {method: entry for part in columns for method, entry in part.entries.items()}
+    entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
     heads = [TASKS[task].label, *(_title(part) for part in columns), "paper, other data"]
     lines = ["| " + " | ".join(heads) + " |", "| " + " | ".join(["---"] * len(heads)) + " |"]
     digits = 3 if task == "spectrum" else 2
@@ -95,7 +95,10 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         cells = [f"{medians[method]:.{digits}f}" if method in medians else "" for medians in columns.values()]
         best = [method == min(medians, key=lambda name: sign * medians[name]) for medians in columns.values()]
         cells = [f"**{cell}**" if first else cell for cell, first in zip(cells, best, strict=True)]
-        lines.append("| " + " | ".join([labels[method].label, *cells, labels[method].published]) + " |")
+        # What a method is given may differ from column to column: then its plain name stands for all.
+        labels = {entry.label for entry in entries[method]}
+        label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
+        lines.append("| " + " | ".join([label, *cells, entries[method][0].published]) + " |")
     return "\n".join(lines)
 
 
