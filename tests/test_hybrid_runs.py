@@ -23,7 +23,6 @@ from wrf_mi.report.compare import compare
 from wrf_mi.report.hybrid_run import HybridRun, evaluate_hybrid, open_hybrid, train_hybrid
 from wrf_mi.report.metrics import inside_interval, ssim
 from wrf_mi.report.run_folder import read_run
-from wrf_mi.report.watch import Stages
 from wrf_mi.scene.make import make_scene
 
 QUICK = ("directions=20", "lengths=2")
@@ -396,24 +395,6 @@ def test_settings_of_every_hybrid_are_listed(capsys: pytest.CaptureFixture[str])
     assert status == 0
     for line in ("hybrid, spectra with --scene:", "hybrid, spectra without:", "cone_deg=80.0", "shadow_db=", "folds="):
         assert line in out
-
-
-def test_stages_are_named_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with Stages() as stages:
-        for what, share in (("a", 0.0), ("a", 0.5), ("b", 0.1), ("b", 1.0)):
-            stages.listen(what, share)
-    assert capsys.readouterr().err.splitlines() == ["a", "b"]
-
-
-def test_stages_show_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    with Stages() as stages:
-        stages.listen("first", 0.5)
-        stages.listen("second", 1.0)
-    shown = capsys.readouterr().err
-    assert "first" in shown
-    assert "second" in shown
 
 
 def test_model_is_read_as_it_was_fitted(run: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from wrf_mi.baselines.models import METHODS
+from wrf_mi.core import InputError
 from wrf_mi.report import table_pages, tables
 from wrf_mi.report.bench import BenchFailed
 from wrf_mi.report.table_plan import PARTS, QUICK_PARTS, Row, plan
@@ -27,7 +28,7 @@ def made_row(row: Row, median: float) -> dict:
         "label": row.entry.label,
         "share": row.share,
         "seed": row.seed,
-        "planned": row.planned,
+        "command": row.command,
         "n_train": 10,
         "n_test": 5,
         "train_seconds": 3.0,
@@ -132,6 +133,12 @@ def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path
     assert order == sorted(order)
     assert "8.57" in text  # the paper's figure, in a column of its own that says so
     assert (tmp_path / "csi-traced-csi-flat-official.png").stat().st_size > 5000
+
+
+def test_a_damaged_row_is_told(tmp_path):
+    (tmp_path / "a-seed0.json").write_text('{"row": ')
+    with pytest.raises(InputError, match=r"a-seed0\.json: not readable .*restore it, or delete it"):
+        table_pages.read_rows(tmp_path)
 
 
 def test_data_that_are_not_here_are_left_out(monkeypatch, tmp_path, capsys):

@@ -9,15 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from ..core.files import write_atomically
+from ..core import InputError
+from ..core.files import one_line, write_atomically
 from .figures import save, score_cdf
 from .metrics import TASKS
 from .table_plan import PARTS, SHARES, Part, Row, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
-    """All rows stored in a folder."""
-    return [json.loads(path.read_text()) for path in sorted(place.glob("*-seed*.json"))]
+    """All rows stored in a folder.
+
+    Raises:
+        InputError: a file that is no JSON.
+    """
+    rows = []
+    for path in sorted(place.glob("*-seed*.json")):
+        try:
+            rows.append(json.loads(path.read_text(encoding="utf-8")))
+        except ValueError as error:
+            raise InputError(f"{path}: not readable ({one_line(error)}); restore it, or delete it") from None
+    return rows
 
 
 def write_tables(place: Path, quick: bool = False) -> None:
@@ -51,15 +62,16 @@ OVERVIEWS = {
 }
 """Headings of the overviews, by `wrf_mi.report.table_plan.Part.table`."""
 NOTE = (
-    "Written by `wrf-mi bench tables`; each row's JSON file has its command, machine, versions and date. Scores are "
+    "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
+    "machine, versions and date. Scores are "
     "over test rows: SSIM and channel estimation accuracy (CEA, dB) are better when larger, errors in dB when smaller. "
     "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets; with "
     "fewer rows the seed draws the rows too. Errors of signal strength are pooled over receivers and rows; fields "
     "have one offset a receiver. *Paper* is what the WRF-GS+ paper states **on other data**, NeRF2's and Argos's, "
     "for signal strength as means over twelve receivers: compare orders, not figures. Networks of blocked splits are "
     "fitted in five folds, all but the VAE with a fifth to a half of their steps; in the traced room they take the "
-    "steps of the ten times smaller laboratory. Each run had one thread of a machine that others used "
-    "too: read ratios of times."
+    "steps of the ten times smaller laboratory. Times are of the machine in each file, which others may have used too, "
+    "with as many threads as `worker_threads` says there, or else all: read ratios."
 )
 
 
@@ -79,7 +91,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
             found.setdefault(row.part, {}).setdefault(row.method, []).append(stored[row.name]["score"]["median"])
     if not found:
         return ""
-    columns = {part: {name: float(np.mean(each)) for name, each in methods.items()} for part, methods in found.items()}
+    columns = {part: {key: float(np.mean(each)) for key, each in methods.items()} for part, methods in found.items()}
     task = next(iter(columns)).task
     sign = -1 if TASKS[task].higher_is_better else 1
     ranks: dict[str, list[float]] = {}

@@ -200,9 +200,9 @@ class Row:
         return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
 
     @property
-    def planned(self) -> str:
-        """Its arguments in one line, whatever the scene's place: a row that was measured by others is an old one."""
-        return " ".join(self.arguments(["--scene", f"{{{self.part.scene}}}"]))
+    def command(self) -> str:
+        """What makes it, whatever the scene's place on a machine: a row that another one made is an old row."""
+        return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}}}"])])
 
     def arguments(self, scene: Sequence[str]) -> list[str]:
         """Of ``wrf-mi``, without ``--out``.

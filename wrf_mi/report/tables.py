@@ -104,7 +104,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         BenchFailed: the command ended with an error.
     """
     # A run that other arguments made is another run.
-    folder = runs / f"{row.name}-{zlib.crc32(row.planned.encode()):08x}"
+    folder = runs / f"{row.name}-{zlib.crc32(row.command.encode()):08x}"
     arguments = row.arguments(_scene(row.part, runs) if NAMED in row.entry.arguments else [])
     wall = None
     if not (folder / METRICS).exists():
@@ -125,8 +125,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         "label": row.entry.label,
         "share": row.share,
         "seed": row.seed,
-        "command": "wrf-mi " + " ".join(arguments),
-        "planned": row.planned,
+        "command": row.command,
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine(),
         "versions": versions(),
@@ -164,8 +163,8 @@ def tables(
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:
         print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
-    stored = {one["row"]: one["planned"] for one in read_rows(place)}
-    left = [row for row in rows if available(row.part) and stored.get(row.name) != row.planned]
+    stored = {one["row"]: one["command"] for one in read_rows(place)}
+    left = [row for row in rows if available(row.part) and stored.get(row.name) != row.command]
     print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
     begun = time.perf_counter()
     failures: list[str] = []
