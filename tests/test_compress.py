@@ -187,7 +187,7 @@ def test_more_than_there_are_cannot_be_kept(run: Path, tmp_path: Path, capsys: p
 
 def test_sizes_of_networks_are_settings() -> None:
     def field(*own: str) -> Any:
-        return make_field(small(*own))
+        return make_field(small(*own).resolved(np.zeros((1, 3))))
 
     assert (field().width, field().layers) == (256, 8)
     plus = field("network.width=32", "network.layers=4", "network.still=true")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_type_hints
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
 from wrf_mi.fit.config import PRESETS, TrainConfig, describe, dump, from_dict, to_dict, with_settings
+from wrf_mi.fit.trainer import make_field
 
 
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -174,7 +176,7 @@ def test_settings_that_are_refused(setting: str, message: str) -> None:
         "initial.farthest_m=.inf",
         "encoding.position_octaves=0",
         "encoding.tx_octaves=-1",
-        "encoding.tx_scale_m=0",
+        "encoding.tx_scale_m=-1",
         "encoding.position_scale_m=-1",
         "optimiser.network=-1e-3",
         "optimiser.network=.nan",
@@ -227,13 +229,30 @@ def test_paper_preset_has_what_the_paper_states() -> None:
 
 
 def test_zero_steps_are_as_many_as_the_model_needs() -> None:
-    assert TrainConfig(model="wrf-gs+").scheduled().steps == 9000
-    assert TrainConfig(model="wrf-gs").scheduled().steps == 15000
-    assert TrainConfig(steps=7).scheduled() == TrainConfig(steps=7)
+    near = np.zeros((2, 3))
+    assert TrainConfig(model="wrf-gs+").resolved(near).steps == 9000
+    assert TrainConfig(model="wrf-gs").resolved(near).steps == 15000
+    assert TrainConfig(steps=7).resolved(near).steps == 7
+
+
+@pytest.mark.parametrize(("extent_m", "scale_m"), [(0, 1), (1.99, 1), (2, 2), (3.9, 2), (8.8, 8), (63, 32)])
+def test_zero_scale_tells_all_training_transmitters_apart(extent_m: float, scale_m: float) -> None:
+    """Positions a period, two units, apart are one to the network."""
+    tx = np.array([[5.0, 1, -7], [5, 1 + extent_m, -7], [5, 1, -7.5]])
+    resolved = TrainConfig().resolved(tx)
+    assert resolved.encoding.tx_scale_m == scale_m
+    assert resolved.resolved(10 * tx) == resolved
+    own = with_settings(TrainConfig(), ["encoding.tx_scale_m=0.25"])
+    assert own.resolved(tx).encoding.tx_scale_m == 0.25
+
+
+def test_field_of_open_scale_is_refused() -> None:
+    with pytest.raises(InputError, match=r"encoding\.tx_scale_m: 0 is resolved by the training transmitters"):
+        make_field(TrainConfig())
 
 
 def test_quick_preset_is_shorter() -> None:
-    assert with_settings(TrainConfig(), PRESETS["quick"]).steps < TrainConfig().scheduled().steps
+    assert with_settings(TrainConfig(), PRESETS["quick"]).steps < TrainConfig().resolved(np.zeros((1, 3))).steps
 
 
 def test_description_names_every_setting_and_can_be_set() -> None:

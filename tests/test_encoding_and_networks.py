@@ -21,7 +21,7 @@ import mitsuba as mi  # noqa: E402
 from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, Receiver  # noqa: E402
 from wrf_mi.field import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians  # noqa: E402
-from wrf_mi.field.encoding import encode, encoded_size  # noqa: E402
+from wrf_mi.field.encoding import encode, encoded_size, telling_scale  # noqa: E402
 from wrf_mi.field.network import dense, dense_of_pairs, init_layer, linear, relu  # noqa: E402
 
 FLOAT64_TOLERANCE = 1e-9
@@ -61,6 +61,30 @@ def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float
     # The tolerance grows with the number of turns, whose rounding NumPy's sine sees.
     expected = paper_encoding(points / scale_m, octaves)
     np.testing.assert_allclose(encoded, expected, atol=FLOAT64_TOLERANCE * max(1.0, 1.0 / scale_m))
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    extent_m=arrays(np.float64, 3, elements=st.floats(0, 60)),
+    origin_m=arrays(np.float64, 3, elements=st.floats(-100, 100)),
+    axis=st.integers(0, 2),
+    octaves=st.integers(1, 10),
+)
+def test_telling_scale_leaves_no_two_positions_alike(
+    extent_m: np.ndarray, origin_m: np.ndarray, axis: int, octaves: int
+) -> None:
+    """Two of a room's positions a multiple of two metres apart are one at 1 m a unit, whatever the octaves."""
+    ends = origin_m + np.stack([np.zeros(3), extent_m])
+    twins = np.stack([ends[0], ends[0]])
+    twins[1, axis] += 2.0 * np.floor(extent_m[axis] / 2.0)
+    scale = telling_scale(ends, 1.0)
+    alike = np.ptp(encode(doubles(twins.T), octaves, 1.0).numpy(), axis=1).max()
+    assert alike < FLOAT64_TOLERANCE
+    told = np.ptp(encode(doubles(twins.T), octaves, scale).numpy(), axis=1).max()
+    # Here no period is longer than 64 m, of which twins are 1/32 apart or more: a chord of 2 sin(pi / 32), or 1/sqrt(2)
+    # of it in the sine or the cosine.
+    assert told > np.sqrt(2) * np.sin(np.pi / 32) * 0.99 or extent_m[axis] < 2.0
+    assert scale == 1.0 or scale <= extent_m.max()
 
 
 def test_float32_keeps_its_digits_far_out() -> None:

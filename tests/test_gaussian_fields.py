@@ -81,7 +81,8 @@ def quiet(what: str, share: float) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_power_is_that_of_the_operator_over_the_full_sphere(model):
     record = strengths()
-    evaluation = Evaluation(SMALL, frame_of(model, record, np.ones((1, 1), complex), 1.0), 0)
+    settings = replace(SMALL, tx_scale_m=SMALL.scale_m)
+    evaluation = Evaluation(settings, frame_of(model, record, np.ones((1, 1), complex), 1.0), 0)
     rng = np.random.default_rng(3)
     weights = evaluation.field.init(random_gaussians(record.receivers, 12, rng, size_deg=20, sphere=True), rng)
     offsets = np.array([[-3.0, 7.0]], np.float32)

@@ -52,7 +52,9 @@ class GaussianSettings:
         far_m: farthest.
         position_octaves: of the encoding of Gaussians.
         tx_octaves: of the encoding of transmitter positions.
-        scale_m: metres that make the unit of both.
+        scale_m: metres that make the unit of Gaussians.
+        tx_scale_m: metres that make the unit of transmitters; 0: ``scale_m``, doubled until it tells all training
+            transmitters apart (`wrf_mi.field.encoding`).
         components: of a channel over subcarriers, at most.
         shared: one field for all receivers, or else one for each.
     """
@@ -69,6 +71,7 @@ class GaussianSettings:
     position_octaves: int = 4
     tx_octaves: int = 4
     scale_m: float = 4.0
+    tx_scale_m: float = 0.0
     components: int = 6
     shared: bool = False
 
@@ -127,9 +130,9 @@ class Evaluation:
         self.settings, self.frame = settings, frame
         s = settings
         encoding = (
-            FeatureEncoding(s.position_octaves, s.scale_m, s.tx_octaves, s.scale_m, features)
+            FeatureEncoding(s.position_octaves, s.scale_m, s.tx_octaves, s.tx_scale_m, features)
             if features
-            else Encoding(s.position_octaves, s.scale_m, s.tx_octaves, s.scale_m)
+            else Encoding(s.position_octaves, s.scale_m, s.tx_octaves, s.tx_scale_m)
         )
         sizes: dict[str, Any] = {"encoding": encoding, "layers": s.layers, "width": s.width}
         if frame.model == "wrf-gs":

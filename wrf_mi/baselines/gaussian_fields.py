@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -37,6 +37,7 @@ from ..backend.device import to_tensor
 from ..core import Record, Split
 from ..core.types import IntArray
 from ..field import random_gaussians
+from ..field.encoding import telling_scale
 from ..field.network import Weights
 from .conditions import (
     Outputs,
@@ -149,6 +150,7 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
         scale = float(np.sqrt(np.nanmean(np.square(np.abs(record.observation[:, known].astype(complex)))))) or 1.0
     if not outputs.by_uplink:
         positions(record, model)
+        s = replace(s, tx_scale_m=s.tx_scale_m or telling_scale(record.tx_pos_m[known], s.scale_m))
     frame = frame_of(model, record, basis, scale)
     condition, _ = condition_of(frame, inputs_of(record, known))
     features = condition.shape[0] if outputs.by_uplink else 0

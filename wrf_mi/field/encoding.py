@@ -6,6 +6,7 @@ The paper sets L = 9, ten octaves, and does not say on what scale of coordinates
 coordinate in metres divided by ``scale_m``, so the shortest period is ``2 * scale_m / 2^L``: 4 mm for L = 9
 and one metre. A field changes over about half a wavelength, which for 915 MHz is 0.16 m: shorter periods
 let a network memorise its training positions, which is why fewer octaves serve better (see `docs/model.md`).
+The longest period is ``2 * scale_m``: transmitters that are so far apart along an axis are one to a network.
 """
 
 from __future__ import annotations
@@ -13,8 +14,27 @@ from __future__ import annotations
 from typing import TypeVar
 
 import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike
 
 Tensor = TypeVar("Tensor", bound=dr.ArrayBase)
+
+
+def telling_scale(points_m: ArrayLike, least_m: float) -> float:
+    """A scale with which no two of some points are encoded alike: their extent is within the longest period.
+
+    Args:
+        points_m: positions [n, 3], metres.
+        least_m: scale that is doubled until it is large enough.
+
+    Returns:
+        Metres that make one unit.
+    """
+    extent = float(np.ptp(np.asarray(points_m, float), axis=0).max(initial=0.0))
+    scale = least_m
+    while 2 * scale <= extent:
+        scale *= 2
+    return scale
 
 
 def encoded_size(octaves: int) -> int:

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
 import yaml
+from numpy.typing import ArrayLike
 
 from ..core import InputError
+from ..field.encoding import telling_scale
 from ..splat.skip import Skip
 
 
@@ -46,12 +48,20 @@ class InitialConfig:
 
 @dataclass(frozen=True)
 class EncodingConfig:
-    """Positional encoding: octaves (L + 1 of the paper) and metres per unit, of Gaussians and transmitter."""
+    """Positional encoding (`wrf_mi.field.encoding`).
+
+    Attributes:
+        position_octaves: of Gaussians, L + 1 of the paper.
+        position_scale_m: metres per unit, of Gaussians.
+        tx_octaves: of transmitters.
+        tx_scale_m: metres per unit, of transmitters; 0: as many as tell all training transmitters apart, see
+            `LEAST_TX_SCALE_M`.
+    """
 
     position_octaves: int = 4
     position_scale_m: float = 4.0
     tx_octaves: int = 4
-    tx_scale_m: float = 1.0
+    tx_scale_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -133,6 +143,8 @@ class DensityConfig:
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
 OTHERWISE = 15000
+LEAST_TX_SCALE_M = 1.0
+"""Metres per unit of transmitters within two metres; doubled for wider ones as often as needed."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +183,15 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     skip: Skip = field(default_factory=Skip)
 
-    def scheduled(self) -> TrainConfig:
-        """The same with the number of steps that is meant."""
-        return self if self.steps else dataclasses.replace(self, steps=LONG_ENOUGH.get(self.model, OTHERWISE))
+    def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
+        """The same with the number of steps and the scale of transmitters that are meant.
+
+        Args:
+            tx_pos_m: training transmitters [n, 3], metres.
+        """
+        steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
+        scale = self.encoding.tx_scale_m or telling_scale(tx_pos_m, LEAST_TX_SCALE_M)
+        return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
@@ -213,7 +231,6 @@ _RANGES: Mapping[str, _Range] = {
     "initial.opacity": _INSIDE,
     "encoding.position_octaves": _COUNT,
     "encoding.position_scale_m": _POSITIVE,
-    "encoding.tx_scale_m": _POSITIVE,
     "optimiser.final": _SHARE,
     "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
     "density.start": _SHARE,

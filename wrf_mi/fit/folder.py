@@ -19,7 +19,7 @@ import math
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -226,7 +226,7 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
     trainer = Trainer(record, split, run.settings)
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
-    write_config(folder, run)
+    write_config(folder, replace(run, settings=trainer.config))
     return trainer
 
 

@@ -64,11 +64,13 @@ def make_field(config: TrainConfig) -> Field:
     """The model that a configuration names.
 
     Raises:
-        InputError: no trainable model of that name.
+        InputError: no trainable model of that name, or transmitters whose scale is still open.
     """
     if config.model not in FIELDS:
         raise InputError(f"model {config.model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
     e = config.encoding
+    if not e.tx_scale_m:
+        raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m)
     n = config.network
     sizes: dict[str, Any] = {}
@@ -148,7 +150,7 @@ class Trainer:
             what = f"{record.name}: task {record.task!r}; learned fields are fitted to spectra"
             raise InputError(f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
         check_rows(split, record, f"split {split.name}")
-        config = config.scheduled()
+        config = config.resolved(record.tx_pos_m[split.all_train])
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
         self.field = field or make_field(config)

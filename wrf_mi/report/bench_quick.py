@@ -33,7 +33,7 @@ from ..core.files import one_line, write_atomically  # noqa: E402
 from ..fit.config import TrainConfig, with_settings  # noqa: E402
 from ..fit.folder import versions  # noqa: E402
 from ..fit.step import Prediction, device_pose  # noqa: E402
-from ..fit.trainer import Trainer, make_field  # noqa: E402
+from ..fit.trainer import Trainer  # noqa: E402
 from ..measure import make_splits  # noqa: E402
 from ..splat.render import splat  # noqa: E402
 from ..splat.tiles import perception_plane  # noqa: E402
@@ -129,7 +129,7 @@ def _batch() -> tuple[Call, Call]:
     count, rng = 16, np.random.default_rng(0)
     trainer = Trainer(_record(count), make_splits(_record(count), "random")[0], TrainConfig())
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
-    field, pose = make_field(TrainConfig()), device_pose(RECEIVER)
+    field, pose = trainer.field, device_pose(RECEIVER)
     plane, positions = perception_plane(HEIGHT, WIDTH, mi.Float), transmitter_path(count)
     positions = positions[rng.permutation(count)]
     together, alone = Prediction(field), Prediction(field)

@@ -30,7 +30,7 @@ from ..fit.folder import (
     write_config,
 )
 from ..fit.predictor import Predictor
-from ..fit.trainer import Progress, Trainer, peak_memory_mb
+from ..fit.trainer import Progress, Trainer, check_rows, peak_memory_mb
 from ..measure import make_splits
 from ..parallel import Scheduler, row_parts
 from ..trace import load_record
@@ -117,11 +117,14 @@ def train(
     """
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
-    settings, folder = (config or TrainConfig()).scheduled(), Path(out)
+    settings, folder = config or TrainConfig(), Path(out)
     if isinstance(split, Split):
         splits, name = [split], split.name
     else:
         splits, name = make_splits(record, split, settings.seed, n_train), split
+    for rows in splits:
+        check_rows(rows, record, f"split {rows.name}")
+    settings = settings.resolved(record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
     run = RunConfig(source, name, n_train, settings)
     if len(splits) == 1:
         _fit(start_run(folder, record, splits[0], run), folder, run, "", listen, stop)

@@ -112,7 +112,7 @@ def _networks(count: int) -> Call:
 
 
 def _field(transmitters: int) -> Call:
-    field = make_field(TrainConfig())
+    field = make_field(TrainConfig().resolved(transmitter_path(transmitters)))
     predictor = Predictor(field, field.init(_start(SMALL), np.random.default_rng(0)), [RECEIVER], HEIGHT, WIDTH)
     tx = transmitter_path(transmitters)
     return lambda: predictor(tx)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..measure.registry import locate
@@ -140,6 +140,7 @@ class Part:
         entries: methods.
         few: whether fewer rows are measured too.
         scene: name of what `wrf_mi.report.tables.scene_of` makes; "" where no method needs one.
+        once: methods whose run takes more than three minutes here: one seed.
     """
 
     task: str
@@ -149,13 +150,14 @@ class Part:
     entries: Mapping[str, Entry] = field(hash=False)
     few: bool = False
     scene: str = ""
+    once: Collection[str] = ()
 
 
 PARTS = (
     Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open"),
-    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open"),
-    Part("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room"),
-    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat"),
+    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("vae",)),
+    Part("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room", once=("hybrid",)),
+    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-shared",)),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan"),
     Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
@@ -242,7 +244,12 @@ def plan(quick: bool = False) -> list[Row]:
         if name in FEW
     ]
     few.sort(key=lambda row: row.method not in CHEAP)
-    again = [Row(row.part, row.method, row.share, seed) for row in first for seed in row.entry.seeds[1:]]
+    again = [
+        Row(row.part, row.method, row.share, seed)
+        for row in first
+        if row.method not in row.part.once
+        for seed in row.entry.seeds[1:]
+    ]
     again += [Row(row.part, row.method, row.share, seed) for row in few for seed in row.entry.few_seeds[1:]]
     return [*first, *few, *again]
 
