@@ -115,9 +115,7 @@ POSITION: Mapping[str, Entry] = {
     "idw": Entry("blend", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry(
-        "WRF-GS+", _model("wrf-gs+", *LONGER), FEWER, SEEDS, ONE, published="23.91, p10 20.85, p90 25.52"
-    ),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+", *LONGER), FEWER, SEEDS, ONE, published="23.91, p10 20.85, p90 25.52"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs", *LONGER), FEWER, SEEDS, published="22.98, p10 20.82, p90 24.33"),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
     "fire": Entry("FIRE", _model("fire"), FEWER, SEEDS, published="15.29"),
