@@ -18,6 +18,9 @@ from wrf_mi.baselines.band_fields import spread  # noqa: E402
 from wrf_mi.baselines.gaussian_evaluation import AT_ONCE, Evaluation, GaussianSettings, frame_of  # noqa: E402
 from wrf_mi.baselines.gaussian_fields import components_of, method_of  # noqa: E402
 from wrf_mi.baselines.method import inputs_of  # noqa: E402
+from wrf_mi.baselines.models import METHODS  # noqa: E402
+from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
+from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.field import random_gaussians  # noqa: E402
@@ -35,6 +38,8 @@ SMALL = GaussianSettings(
     columns=24,
     components=3,
 )
+THREADED = 1e-2
+"""Of the largest value: ten steps of Adam, whose gradients are summed by threads in any order."""
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 TURNED = np.array([0.5, -0.5, 0.5, 0.5])
 ROUNDING = 2e-3
@@ -82,7 +87,7 @@ def quiet(what: str, share: float) -> None:
 def test_power_is_that_of_the_operator_over_the_full_sphere(model):
     record = strengths()
     settings = replace(SMALL, tx_scale_m=SMALL.scale_m)
-    evaluation = Evaluation(settings, frame_of(model, record, np.ones((1, 1), complex), 1.0), 0)
+    evaluation = Evaluation(settings, frame_of(model, record, np.ones((1, 1), complex), np.ones(2)), 0)
     rng = np.random.default_rng(3)
     weights = evaluation.field.init(random_gaussians(record.receivers, 12, rng, size_deg=20, sphere=True), rng)
     offsets = np.array([[-3.0, 7.0]], np.float32)
@@ -98,7 +103,7 @@ def test_power_is_that_of_the_operator_over_the_full_sphere(model):
 
 def test_spread_gives_each_component_an_image_of_its_own():
     record = channels()
-    frame = frame_of("wrf-gs+", record, np.eye(3, 8, dtype=complex), 1.0)
+    frame = frame_of("wrf-gs+", record, np.eye(3, 8, dtype=complex), np.ones(1))
     evaluation = Evaluation(SMALL, frame, 16)
     rng = np.random.default_rng(0)
     weights = evaluation.field.init(random_gaussians(record.receivers, 5, rng, sphere=True), rng)
@@ -179,6 +184,24 @@ def test_a_second_receiver_with_other_components_is_learned():
         truth, found = record.observation[r, split.test], fitted.predict(inputs, r)
         error = np.square(np.abs(found - truth)).sum(axis=1) / np.square(np.abs(truth)).sum(axis=1)
         assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
+
+
+@pytest.mark.parametrize("name", [*MODELS, "nerf2"])
+def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(name):
+    """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""
+    record, weak = two_stations(), 2.0**-7
+    fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
+    split, quick = halves(record), Training(steps=10, batch=8, rounds=1)
+    method = METHODS[name]
+    settings = (
+        Nerf2Settings(training=quick, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
+        if name == "nerf2"
+        else replace(SMALL, components=2, shared=True, training=quick)
+    )
+    inputs = inputs_of(record, split.test)
+    plain, faint = (method.fit(one, split, settings, 0, quiet).predict(inputs, 1) for one in (record, fainter))
+    assert np.abs(plain).max() > 1e-6
+    np.testing.assert_allclose(faint, weak * plain, rtol=0, atol=THREADED * weak * np.abs(plain).max())
 
 
 def test_any_number_of_rows_is_predicted_alike():

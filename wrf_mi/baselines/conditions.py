@@ -136,11 +136,27 @@ def uplink_of(inputs: Inputs) -> NDArray[Any]:
     return inputs.uplink
 
 
-def truth_of(record: Record, outputs: Outputs, receiver: int, rows: IntArray, scale: float) -> NDArray[np.float32]:
+def channel_scales(record: Record, rows: IntArray) -> FloatArray:
+    """Root mean square of each receiver's channels in given rows [n_rx], in whose units they are learned.
+
+    One for each, so that a receiver far away counts as much as a near one; 1 where there is nothing to measure by.
+    """
+    power = np.ones(len(record.receivers))
+    if record.task == "csi":
+        for r, seen in enumerate(record.observation):
+            size = np.abs(seen[rows].astype(complex))
+            if np.isfinite(size).any():
+                power[r] = np.nanmean(np.square(size))
+    return np.sqrt(np.where(power > 0, power, 1.0))
+
+
+def truth_of(
+    record: Record, outputs: Outputs, receiver: int, rows: IntArray, scales: FloatArray
+) -> NDArray[np.float32]:
     """What the networks are compared with, one row for each condition.
 
     Greys [n, pixels]; powers [n, 1] in dBm; channels, real parts and then imaginary ones, [n, 2 outputs] in units of
-    ``scale``, or [n * antennas, 2 outputs] divided as `normalised_uplink` divided the uplink.
+    the receiver's of ``scales``, or [n * antennas, 2 outputs] divided as `normalised_uplink` divided the uplink.
     """
     seen = record.observation[receiver, rows]
     if record.task != "csi":
@@ -150,7 +166,7 @@ def truth_of(record: Record, outputs: Outputs, receiver: int, rows: IntArray, sc
         divisor = normalised_uplink(record.uplink[rows])[1]
         channel = seen.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
     else:
-        channel = seen / scale
+        channel = seen / scales[receiver]
     flat = channel.reshape(-1, outputs.count)
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
 

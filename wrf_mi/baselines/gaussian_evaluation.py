@@ -85,7 +85,7 @@ class Frame:
         task: of the record.
         outputs: complex numbers that are asked for.
         basis: unit vectors [components, outputs] that channels are sums of; [1, 1] for powers.
-        scale: channels are in units of it.
+        scales: channels of each receiver are in units of it [n_rx].
         position: of each receiver [n_rx, 3], metres.
         to_world: rotation of each receiver [n_rx, 3, 3].
     """
@@ -94,7 +94,7 @@ class Frame:
     task: str
     outputs: Outputs
     basis: NDArray[np.complex128]
-    scale: float
+    scales: NDArray[np.float64]
     position: NDArray[np.float64]
     to_world: NDArray[np.float64]
 
@@ -104,7 +104,7 @@ class Frame:
         return len(self.basis)
 
 
-def frame_of(model: str, record: Record, basis: NDArray[np.complex128], scale: float) -> Frame:
+def frame_of(model: str, record: Record, basis: NDArray[np.complex128], scales: NDArray[np.float64]) -> Frame:
     """The frame for a record's receivers.
 
     Raises:
@@ -114,7 +114,7 @@ def frame_of(model: str, record: Record, basis: NDArray[np.complex128], scale: f
     receivers = placed_receivers(record, outputs)
     place = np.stack([receiver.position_m for receiver in receivers])
     turned = np.stack([receiver.to_world for receiver in receivers])
-    return Frame(model, record.task, outputs, basis, scale, place, turned)
+    return Frame(model, record.task, outputs, basis, scales, place, turned)
 
 
 class Evaluation:

@@ -41,6 +41,7 @@ from ..field.encoding import telling_scale
 from ..field.network import Weights
 from .conditions import (
     Outputs,
+    channel_scales,
     channels_from,
     conditions_of,
     normalised_uplink,
@@ -101,7 +102,7 @@ class FittedGaussians:
             InputError: fitted to uplink channels, and there are none.
         """
         frame = self._frame
-        condition, divisor = condition_of(frame, inputs)
+        condition, divisor = condition_of(frame, inputs, receiver)
         params = self._params[receiver if len(self._params) > 1 else 0]
         values = self._evaluation.predict(params, condition, receiver).astype(float)
         shape = (len(inputs), *self._shape)
@@ -116,7 +117,7 @@ class FittedGaussians:
         own = {
             "settings": np.asarray(json.dumps(asdict(self._settings))),
             "basis": self._frame.basis,
-            "scale": np.asarray(self._frame.scale),
+            "scales": self._frame.scales,
             "features": np.asarray(self._features),
         }
         for number, weights in enumerate(self._fields):
@@ -124,7 +125,7 @@ class FittedGaussians:
         return own
 
 
-def condition_of(frame: Frame, inputs: Inputs) -> tuple[Any, NDArray[Any] | float]:
+def condition_of(frame: Frame, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
     """What the field is told of transmitters [features or 3, m], and what channels are multiplied by.
 
     Raises:
@@ -133,7 +134,7 @@ def condition_of(frame: Frame, inputs: Inputs) -> tuple[Any, NDArray[Any] | floa
     if frame.outputs.by_uplink:
         features, divisor = normalised_uplink(uplink_of(inputs))
         return to_tensor(features.T), divisor
-    return to_tensor(np.asarray(inputs.tx_pos_m, float).T), frame.scale
+    return to_tensor(np.asarray(inputs.tx_pos_m, float).T), float(frame.scales[receiver])
 
 
 def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int, listen: Listen) -> FittedGaussians:
@@ -144,15 +145,14 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
             others.
     """
     outputs, known = outputs_of(record), split.all_train
-    scale, basis = 1.0, np.ones((1, 1), complex)
+    scales, basis = channel_scales(record, known), np.ones((1, 1), complex)
     if record.task == "csi":
         basis = components_of(_observed(record, split, outputs, model), s.components)
-        scale = float(np.sqrt(np.nanmean(np.square(np.abs(record.observation[:, known].astype(complex)))))) or 1.0
     if not outputs.by_uplink:
         positions(record, model)
         s = replace(s, tx_scale_m=s.tx_scale_m or telling_scale(record.tx_pos_m[known], s.scale_m))
-    frame = frame_of(model, record, basis, scale)
-    condition, _ = condition_of(frame, inputs_of(record, known))
+    frame = frame_of(model, record, basis, scales)
+    condition, _ = condition_of(frame, inputs_of(record, known), 0)
     features = condition.shape[0] if outputs.by_uplink else 0
     everyone = tuple(range(len(record.receivers)))
     groups = [everyone] if s.shared else [(r,) for r in everyone]
@@ -169,9 +169,9 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
 
 def _observed(record: Record, split: Split, outputs: Outputs, model: str) -> NDArray[np.complex128]:
     """Channels [n, outputs] of the training rows that were received, those of all receivers one after the other."""
-    channels = []
+    channels, one = [], np.ones(len(record.receivers))
     for r in range(len(record.receivers)):
-        parts = truth_of(record, outputs, r, np.concatenate(usable_rows(record, split, r, model)), 1.0).astype(float)
+        parts = truth_of(record, outputs, r, np.concatenate(usable_rows(record, split, r, model)), one).astype(float)
         own = parts[:, : outputs.count] + 1j * parts[:, outputs.count :]
         # Scores are relative, so receivers count alike, however far away or seldom heard.
         size = np.sqrt(np.square(np.abs(own)).sum())
@@ -181,7 +181,7 @@ def _observed(record: Record, split: Split, outputs: Outputs, model: str) -> NDA
 
 def _truth(record: Record, frame: Frame, receiver: int, rows: IntArray) -> NDArray[np.float32]:
     """What reports are compared with, a row for each condition: powers in dBm or coefficients of the components."""
-    parts = truth_of(record, frame.outputs, receiver, rows, frame.scale)
+    parts = truth_of(record, frame.outputs, receiver, rows, frame.scales)
     if frame.task == "rssi":
         return parts
     half = frame.outputs.count
@@ -270,7 +270,7 @@ def load(model: str, arrays: dict[str, NDArray[Any]], record: Record) -> FittedG
     """What `FittedGaussians.arrays` described."""
     plain = json.loads(str(arrays["settings"]))
     settings = GaussianSettings(**plain | {"training": Training(**plain["training"])})
-    frame = frame_of(model, record, np.asarray(arrays["basis"]), float(arrays["scale"]))
+    frame = frame_of(model, record, np.asarray(arrays["basis"]), arrays["scales"])
     count = 1 if settings.shared else len(record.receivers)
     fields = [under(f"field{number}", arrays) for number in range(count)]
     return FittedGaussians(settings, frame, int(arrays["features"]), fields, record.observation.shape[2:])

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from ..backend.device import to_tensor
 from ..core import Record, Split
 from ..field.network import Weights
-from .conditions import channels_from, conditions_of, outputs_of, placed_receivers, truth_of
+from .conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from .coordinates import Coordinates
 from .method import Inputs, Listen, Method, inputs_of
 from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
@@ -78,7 +78,7 @@ class FittedNerf2:
         if self._seen is None or self._seen[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
             self._seen = receiver, self._field.look(params, receiver)
-        condition, divisor = condition_of(self._frame, self._settings, inputs)
+        condition, divisor = condition_of(self._frame, self._settings, inputs, receiver)
         values = self._field.march(params, self._seen[1], condition, receiver)
         shape = (len(inputs), *self._shape)
         if self._frame.task == "csi":
@@ -90,7 +90,7 @@ class FittedNerf2:
         own = {
             "settings": np.asarray(json.dumps(asdict(self._settings))),
             "far_m": np.asarray(self._frame.far_m),
-            "scale": np.asarray(self._frame.scale),
+            "scales": self._frame.scales,
         }
         own |= keyed("frame", self._frame.coordinates.arrays())
         for g, weights in enumerate(self._networks):
@@ -114,9 +114,8 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen
         farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
     else:
         where, farthest = rx, FAR_M
-    seen = record.observation[:, known]
-    scale = float(np.sqrt(np.nanmean(np.square(np.abs(seen))))) if record.task == "csi" else 1.0
-    frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scale or 1.0)
+    scales = channel_scales(record, known)
+    frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
     field = Field(settings, frame)
     networks = []
     for g, members in enumerate(frame.groups):
@@ -136,8 +135,8 @@ def _fit_group(
     # From here on rows count within the training rows.
     rows = {r: tuple(np.searchsorted(known, part) for part in usable_rows(record, split, r, "nerf2")) for r in members}
     rng = np.random.default_rng([seed, *members])
-    condition, _ = condition_of(frame, s, inputs_of(record, known))
-    truth = np.concatenate([truth_of(record, outputs, r, known, frame.scale) for r in range(len(record.receivers))])
+    condition, _ = condition_of(frame, s, inputs_of(record, known), members[0])
+    truth = np.concatenate([truth_of(record, outputs, r, known, frame.scales) for r in range(len(record.receivers))])
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
     weights = s.networks.init(condition.shape[0], outputs.count, rng)
@@ -192,7 +191,7 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
     nested = {"training": Training(**plain["training"]), "networks": Networks(**plain["networks"])}
     settings = Nerf2Settings(**plain | nested)
     coordinates = Coordinates.load(under("frame", arrays))
-    frame = frame_of(record, settings, coordinates, float(arrays["far_m"]), float(arrays["scale"]))
+    frame = frame_of(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
     networks = [under(f"group{g}", arrays) for g in range(len(frame.groups))]
     return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
 

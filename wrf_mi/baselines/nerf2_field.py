@@ -90,7 +90,7 @@ class Frame:
     Attributes:
         coordinates: frame of positions.
         far_m: where rays end.
-        scale: channels are in units of it.
+        scales: channels of each receiver are in units of it [n_rx].
         outputs: what rays bring.
         task: of the record.
         directions: of rays in the world [n_rx, rays, 3].
@@ -100,7 +100,7 @@ class Frame:
 
     coordinates: Coordinates
     far_m: float
-    scale: float
+    scales: FloatArray
     outputs: Outputs
     task: str
     directions: NDArray[np.float64]
@@ -121,7 +121,9 @@ def world_directions(record: Record, receivers: Sequence[Receiver], sphere_rays:
     return np.stack([own @ receiver.to_world.T for receiver in receivers])
 
 
-def frame_of(record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scale: float) -> Frame:
+def frame_of(
+    record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
+) -> Frame:
     """The frame for a record's receivers.
 
     Raises:
@@ -133,7 +135,7 @@ def frame_of(record: Record, settings: Nerf2Settings, coordinates: Coordinates, 
     return Frame(
         coordinates,
         far_m,
-        scale,
+        scales,
         outputs,
         record.task,
         world_directions(record, receivers, settings.sphere_rays),
@@ -268,7 +270,9 @@ class Field:
         return np.concatenate(blocks)
 
 
-def condition_of(frame: Frame, settings: Nerf2Settings, inputs: Inputs) -> tuple[Any, NDArray[Any] | float]:
+def condition_of(
+    frame: Frame, settings: Nerf2Settings, inputs: Inputs, receiver: int
+) -> tuple[Any, NDArray[Any] | float]:
     """What the radiance network knows of transmitters [features, m], and what channels are multiplied by.
 
     Raises:
@@ -278,4 +282,4 @@ def condition_of(frame: Frame, settings: Nerf2Settings, inputs: Inputs) -> tuple
         features, divisor = normalised_uplink(uplink_of(inputs))
         return to_tensor(features.T), divisor
     where = frame.coordinates.features(inputs.tx_pos_m, settings.tx_octaves, settings.networks.scale_m)
-    return where, frame.scale
+    return where, float(frame.scales[receiver])
