@@ -201,6 +201,20 @@ def test_fire_beats_copying_the_uplink(walk):
     assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
 
 
+def test_a_row_without_downlink_leaves_fire_as_it_is(walk):
+    truth, record = walk
+    split, settings = split_of(80, 16), FireSettings(Training(steps=60, batch=128, rounds=1), sample="row", width=32)
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    observation = record.observation.copy()
+    observation[0, :2] = 0
+    lost = replace(record, observation=observation)
+    first, second = (
+        np.median(cea_db(fire.METHOD.fit(one, split, settings, 0, lambda what, share: None).predict(inputs, 0), down))
+        for one in (record, lost)
+    )
+    assert second > first - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
+
+
 def test_a_linear_map_beats_copying_the_uplink(walk):
     truth, record = walk
     split = split_of(80, 16)

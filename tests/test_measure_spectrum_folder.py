@@ -225,6 +225,7 @@ WRONG = {
     "fold missing": (text("blocked_folds.txt", r"^0\n", ""), "blocked_folds.txt", "11 folds for 12 rows"),
     "fold of words": (text("blocked_folds.txt", r"^1", "one"), "blocked_folds.txt", "line 2: 'one' is not"),
     "fold without rows": (text("blocked_folds.txt", r"^2", "4"), "blocked_folds.txt", "fold 3 has no row"),
+    "fold far away": (text("blocked_folds.txt", r"^2", "9" * 15), "blocked_folds.txt", "fold 3 has no row"),
     "one fold": (write("blocked_folds.txt", "0\n" * 12), "blocked_folds.txt", "one fold only"),
 }
 

@@ -248,8 +248,9 @@ def _fit(
     per_row = uplink.shape[0] // len(known)
     # Samples are in their own units; errors are to count in their row's.
     energy = np.square(np.abs(downlink)).sum(axis=(1, 2)).reshape(-1, per_row).mean(axis=1).repeat(per_row)
-    weight = np.square(np.abs(unit)) / np.maximum(energy, np.finfo(np.float32).tiny)
-    weight = weight.astype(np.float32)[None]
+    # A row without energy has no relative error.
+    heard = energy > 0
+    weight = np.where(heard, np.square(np.abs(unit)) / np.where(heard, energy, 1), 0).astype(np.float32)[None]
     data = {"uplink": to_tensor(x), "downlink": to_tensor(y), "weight": to_tensor(weight)}
     dr.make_opaque(data)
     rng = np.random.default_rng([seed, int(sample == "row")])

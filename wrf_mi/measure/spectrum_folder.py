@@ -145,10 +145,11 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     folds = np.array([whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
     if len(folds) != rows:
         raise InputError(f"{path}: {len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv")
-    count = int(folds.max(initial=-1)) + 1
-    missing = sorted(set(range(count)) - set(folds.tolist()))
-    if missing or count < 2:
-        what = f"fold {missing[0]} has no row" if missing else "there is one fold only"
+    present = np.unique(folds)
+    # The first number that its place in the sorted ones does not have.
+    missing = np.flatnonzero(present != np.arange(len(present)))
+    if len(missing) or len(present) < 2:
+        what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
         raise InputError(f"{path}: {what}; number the folds 0, 1, ... without gaps, two at least")
     return folds
 
