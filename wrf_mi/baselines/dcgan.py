@@ -20,25 +20,22 @@ predicts spectra from positions, and has not released it. Chosen here:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.device import to_float, to_tensor
-from ..core import InputError, Record, Split
-from ..core.types import IntArray
+from ..core import InputError
 from ..field.network import Weights, init_layer, linear, relu
 from .conv import Grid, coarser, convolve, finer, instance_norm, resized
-from .coordinates import Coordinates, feature_count
-from .method import Inputs, Listen, Method
+from .coordinates import feature_count
+from .method import Listen
+from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
-from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, positions, under, usable_rows
-from .vae import median_dissimilarity
+from .training import Descent, Training, fit_network, opaque_rows
 
 LEVELS = 3
 """Convolutions of stride two in either network."""
@@ -251,113 +248,31 @@ class Duel:
         self._adversary.restore(state[1])
 
 
-class FittedDcgan:
-    """Generators that were fitted, one for each receiver.
-
-    Args:
-        settings: of the networks.
-        coordinates: frame of the positions.
-        networks: weights of each receiver's generator.
-        shape: height and width of a spectrum.
-    """
-
-    def __init__(
-        self, settings: DcganSettings, coordinates: Coordinates, networks: list[Weights], shape: tuple[int, int]
-    ) -> None:
-        self._settings, self._coordinates, self._networks, self._shape = settings, coordinates, networks, shape
-        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in networks]
-
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """Spectra [m, height, width], float32."""
-        s, out = self._settings, np.empty((len(inputs), *self._shape), np.float32)
-        for first in range(0, len(inputs), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            where = self._coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
-            flat = generate_silent(self._params[receiver], s, where, self._shape)
-            out[part] = flat.numpy().reshape(-1, *self._shape)
-        return out
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, frame and generators."""
-        own = {"settings": np.asarray(json.dumps(asdict(self._settings))), "shape": np.asarray(self._shape)}
-        own |= keyed("frame", self._coordinates.arrays())
-        for r, weights in enumerate(self._networks):
-            own |= keyed(f"receiver{r}", weights)
-        return own
-
-
 def generate_silent(params: Mapping[str, Any], s: DcganSettings, where: Any, shape: tuple[int, int]) -> Any:
     """Spectra without noise, a flat array."""
-    with dr.suspend_grad():
-        return generate(params, dr.zeros(type(where), (s.noise, where.shape[1])), where, shape, s.channels).array
+    return generate(params, dr.zeros(type(where), (s.noise, where.shape[1])), where, shape, s.channels).array
 
 
-def fit(record: Record, split: Split, settings: DcganSettings, seed: int, listen: Listen) -> FittedDcgan:
-    """Fit a pair of networks to each receiver.
-
-    Raises:
-        InputError: positions that the data do not tell, or a receiver without training rows.
-    """
-    coordinates = Coordinates.of(positions(record, "dcgan")[split.all_train])
-    networks, count = [], len(record.receivers)
-    for r in range(count):
-
-        def part(what: str, share: float, first: int = r) -> None:
-            listen(what, (first + share) / count)
-
-        networks.append(_fit_receiver(record, split, settings, seed, part, r, coordinates))
-    height, width = (int(side) for side in record.observation.shape[-2:])
-    return FittedDcgan(settings, coordinates, networks, (height, width))
-
-
-def _fit_receiver(
-    record: Record, split: Split, s: DcganSettings, seed: int, listen: Listen, receiver: int, coordinates: Coordinates
-) -> Weights:
-    train, validation = usable_rows(record, split, receiver, "dcgan")
-    known = np.concatenate([train, validation])
-    spectra = np.asarray(record.observation[receiver, known], np.float32)
-    height, width = (int(side) for side in spectra.shape[1:])
-    data = {
-        "where": coordinates.features(record.tx_pos_m[known], s.octaves, s.scale_m),
-        "truth": to_float(spectra),
-    }
+def fit_receiver(own: ReceiverRows, s: DcganSettings, rng: np.random.Generator, listen: Listen) -> Weights:
+    """Weights of a receiver's generator."""
+    data = {"where": own.where, "truth": to_float(own.spectra)}
     dr.make_opaque(data)
-    rng = np.random.default_rng([seed, receiver])
-    grey = float(np.clip(spectra[: len(train)].mean(dtype=np.float64), 0.01, 0.99))
-    duel = Duel(s, (height, width), rng, float(np.log(grey / (1 - grey))))
+    grey = float(np.clip(own.spectra[: own.train].mean(dtype=np.float64), 0.01, 0.99))
+    duel = Duel(s, own.shape, rng, float(np.log(grey / (1 - grey))))
 
     def draw(everything: bool) -> Iterator[Any]:
-        rows: IntArray = np.arange(len(known) if everything else len(train))
-        for picked in epochs(rows, s.training.batch, rng):
+        for picked in own.draw(everything, s.training.batch, rng):
             yield {"rows": opaque_rows(picked), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, s.training.batch)))}
 
-    score = None
-    if len(validation):
-        asked = coordinates.features(record.tx_pos_m[validation], s.octaves, s.scale_m)
-        truth = to_float(spectra[len(train) :])
-
-        def score(params: Mapping[str, Any]) -> float:
-            predicted = generate_silent(params, s, asked, (height, width))
-            return median_dissimilarity(predicted, truth, len(validation), height, width)
-
-    name = record.receivers[receiver].name
-    return fit_network(duel, data, draw, score, s.training, listen, f"dcgan {name}")[0]
+    score = own.score(generate_silent, s)
+    return fit_network(duel, data, draw, score, s.training, listen, f"dcgan {own.receiver}")[0]
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedDcgan:
-    """What `FittedDcgan.arrays` described."""
-    plain = json.loads(str(arrays["settings"]))
-    settings = DcganSettings(**plain | {"training": Training(**plain["training"])})
-    networks = [under(f"receiver{r}", arrays) for r in range(len(record.receivers))]
-    height, width = (int(side) for side in arrays["shape"])
-    return FittedDcgan(settings, Coordinates.load(under("frame", arrays)), networks, (height, width))
-
-
-METHOD = Method(
+METHOD = SpectrumNetwork(
     "dcgan",
-    ("spectrum",),
     DcganSettings,
-    fit,
-    load,
+    fit_receiver,
+    generate_silent,
+    AT_ONCE,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
-)
+).method()

@@ -17,24 +17,22 @@ has not released it. Chosen here:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import to_float, to_tensor
-from ..core import InputError, Record, Split
-from ..core.types import IntArray
+from ..backend.device import to_tensor
+from ..core import InputError
 from ..field.network import Weights, init_layer, linear, relu
-from ..loss.ssim import ssim
-from .coordinates import Coordinates, feature_count
-from .method import Inputs, Listen, Method
+from .coordinates import feature_count
+from .method import Listen
+from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
-from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, positions, under, usable_rows
+from .training import Descent, Training, fit_network, opaque_rows
 
 AT_ONCE = 64
 """Spectra that are predicted together: bounds the memory."""
@@ -150,126 +148,41 @@ def elbo_loss(params: Mapping[str, Any], data: Any, given: Any, noise: float, be
     return (likelihood + (beta / batch) * divergence).array
 
 
-class FittedVae:
-    """Decoders that were fitted, one for each receiver.
-
-    Args:
-        settings: of the networks.
-        coordinates: frame of the positions.
-        networks: weights of each receiver.
-        shape: height and width of a spectrum.
-    """
-
-    def __init__(
-        self, settings: VaeSettings, coordinates: Coordinates, networks: list[Weights], shape: tuple[int, int]
-    ) -> None:
-        self._settings, self._coordinates, self._shape = settings, coordinates, shape
-        self._networks = [{name: w for name, w in weights.items() if name[0] == "p"} for weights in networks]
-        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in self._networks]
-
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """Spectra [m, height, width], float32."""
-        s, out = self._settings, np.empty((len(inputs), *self._shape), np.float32)
-        for first in range(0, len(inputs), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            where = self._coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
-            out[part] = decode_prior(self._params[receiver], s.latent, where).numpy().T.reshape(-1, *self._shape)
-        return out
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, frame and decoders."""
-        own = {"settings": np.asarray(json.dumps(asdict(self._settings))), "shape": np.asarray(self._shape)}
-        own |= keyed("frame", self._coordinates.arrays())
-        for r, weights in enumerate(self._networks):
-            own |= keyed(f"receiver{r}", weights)
-        return own
+def generate(params: Mapping[str, Any], s: VaeSettings, where: Any, shape: tuple[int, int]) -> Any:
+    """Spectra of the decoder at the prior's mean, z = 0, a flat array."""
+    pixels = decoder(params, dr.zeros(type(where), (s.latent, where.shape[1])), where)
+    return dr.moveaxis(pixels, 0, 1).array
 
 
-def decode_prior(params: Mapping[str, Any], latent: int, where: Any) -> Any:
-    """The decoder at the prior's mean, z = 0: [pixels, batch]."""
-    return decoder(params, dr.zeros(type(where), (latent, where.shape[1])), where)
-
-
-def median_dissimilarity(predicted: Any, truth: Any, count: int, height: int, width: int) -> float:
-    """1 - the median structural similarity of flat Dr.Jit arrays of ``count`` spectra."""
-    return 1 - float(np.median(ssim(predicted, truth, count, height, width).numpy()))
-
-
-def fit(record: Record, split: Split, settings: VaeSettings, seed: int, listen: Listen) -> FittedVae:
-    """Fit a network to each receiver.
-
-    Raises:
-        InputError: positions that the data do not tell, or a receiver without training rows.
-    """
-    where_m = positions(record, "vae")
-    coordinates = Coordinates.of(where_m[split.all_train])
-    networks, count = [], len(record.receivers)
-    for r in range(count):
-
-        def part(what: str, share: float, first: int = r) -> None:
-            listen(what, (first + share) / count)
-
-        networks.append(_fit_receiver(record, split, settings, seed, part, r, coordinates))
-    height, width = (int(side) for side in record.observation.shape[-2:])
-    return FittedVae(settings, coordinates, networks, (height, width))
-
-
-def _fit_receiver(
-    record: Record, split: Split, s: VaeSettings, seed: int, listen: Listen, receiver: int, coordinates: Coordinates
-) -> Weights:
-    train, validation = usable_rows(record, split, receiver, "vae")
-    known = np.concatenate([train, validation])
-    spectra = np.asarray(record.observation[receiver, known], np.float32)
-    height, width = (int(side) for side in spectra.shape[1:])
-    cells = pooled(spectra, s.pool)
-    where = coordinates.features(record.tx_pos_m[known], s.octaves, s.scale_m)
-    flat = spectra.reshape(len(known), -1)
-    data = {"cells": to_tensor(cells.T), "where": where, "pixels": to_tensor(flat.T)}
+def fit_receiver(own: ReceiverRows, s: VaeSettings, rng: np.random.Generator, listen: Listen) -> Weights:
+    """Weights of a receiver's decoder."""
+    cells, flat = pooled(own.spectra, s.pool), own.spectra.reshape(len(own.spectra), -1)
+    data = {"cells": to_tensor(cells.T), "where": own.where, "pixels": to_tensor(flat.T)}
     dr.make_opaque(data)
-    rng = np.random.default_rng([seed, receiver])
-    weights = initial_weights(s, cells.shape[1], height * width, rng)
+    weights = initial_weights(s, cells.shape[1], flat.shape[1], rng)
     # The decoder starts at the mean spectrum of the rows that it may learn from.
-    mean = np.clip(flat[: len(train)].mean(axis=0, dtype=np.float64), 0.01, 0.99)
+    mean = np.clip(flat[: own.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
     weights["p.out.bias"] = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
 
     def draw(everything: bool) -> Iterator[Any]:
-        rows: IntArray = np.arange(len(known) if everything else len(train))
-        for picked in epochs(rows, s.training.batch, rng):
+        for picked in own.draw(everything, s.training.batch, rng):
             noise, prior = rng.standard_normal((2, s.latent, s.training.batch))
             yield {"rows": opaque_rows(picked), "noise": to_tensor(noise), "prior": to_tensor(prior)}
 
     def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
         return elbo_loss(params, data, given, s.noise, s.beta, s.prior_share)
 
-    score = None
-    if len(validation):
-        asked = coordinates.features(record.tx_pos_m[validation], s.octaves, s.scale_m)
-        truth = to_float(spectra[len(train) :])
-
-        def score(params: Mapping[str, Any]) -> float:
-            predicted = dr.moveaxis(decode_prior(params, s.latent, asked), 0, 1).array
-            return median_dissimilarity(predicted, truth, len(validation), height, width)
-
-    name = record.receivers[receiver].name
-    return fit_network(
-        Descent(weights, loss, s.training.averaging), data, draw, score, s.training, listen, f"vae {name}"
-    )[0]
+    descent = Descent(weights, loss, s.training.averaging)
+    score = own.score(generate, s)
+    fitted, _ = fit_network(descent, data, draw, score, s.training, listen, f"vae {own.receiver}")
+    return {name: values for name, values in fitted.items() if name[0] == "p"}
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedVae:
-    """What `FittedVae.arrays` described."""
-    plain = json.loads(str(arrays["settings"]))
-    settings = VaeSettings(**plain | {"training": Training(**plain["training"])})
-    networks = [under(f"receiver{r}", arrays) for r in range(len(record.receivers))]
-    height, width = (int(side) for side in arrays["shape"])
-    return FittedVae(settings, Coordinates.load(under("frame", arrays)), networks, (height, width))
-
-
-METHOD = Method(
+METHOD = SpectrumNetwork(
     "vae",
-    ("spectrum",),
     VaeSettings,
-    fit,
-    load,
+    fit_receiver,
+    generate,
+    AT_ONCE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
-)
+).method()
