@@ -100,7 +100,9 @@ def _resume(a: Arguments) -> int:
 def _states_determinism(folder: Path) -> bool:
     """Whether a run's settings ask for it; plain YAML, as all else that reads a run chooses a backend first."""
     try:
-        return bool(yaml.safe_load((folder / "config.yaml").read_text())["settings"]["deterministic"])
+        content = yaml.safe_load((folder / "config.yaml").read_text())
+        # Models that are fitted in one go say it beside their settings.
+        return bool(content["deterministic"] if "deterministic" in content else content["settings"]["deterministic"])
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
         return False  # what is wrong with it is said where it is read
 
@@ -135,6 +137,7 @@ def _train_hybrid(a: Arguments) -> int:
             n_train=a.n_train,
             seed=a.seed or 0,
             settings=tuple(a.set),
+            deterministic=a.deterministic,
             listen=stages.listen,
         )
     return _show_stored(folder, a.json)
@@ -144,9 +147,18 @@ def _train_baseline(a: Arguments, model: str) -> int:
     from .report.baseline_run import train_baseline
     from .report.watch import Stages
 
-    asked: dict[str, Any] = {"split": _split(a), "n_train": a.n_train, "seed": a.seed or 0, "settings": tuple(a.set)}
     with Stages() as stages:
-        folder = train_baseline(a.dataset, a.out, model, **asked, listen=stages.listen)
+        folder = train_baseline(
+            a.dataset,
+            a.out,
+            model,
+            split=_split(a),
+            n_train=a.n_train,
+            seed=a.seed or 0,
+            settings=tuple(a.set),
+            deterministic=a.deterministic,
+            listen=stages.listen,
+        )
     return _show_stored(folder, a.json)
 
 

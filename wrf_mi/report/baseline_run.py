@@ -164,6 +164,7 @@ def read_baseline_config(folder: Path) -> BaselineConfig:
     with stated_config(folder) as content:
         names = ("dataset", "split", "n_train", "seed", "model")
         kept, settings = {name: content[name] for name in names}, content["settings"]
+        kept["deterministic"] = bool(content.get("deterministic"))
     if kept["model"] not in METHODS:
         raise InputError(f"{folder}: a run of {kept['model']}, not of a baseline; give one of {', '.join(METHODS)}")
     kind = METHODS[kept["model"]].settings
@@ -199,6 +200,7 @@ def train_baseline(
     n_train: int | float | None = None,
     seed: int = 0,
     settings: tuple[str, ...] = (),
+    deterministic: bool = False,
     listen: Listen = lambda what, share: None,
 ) -> Path:
     """Fit a baseline to a data set and score it.
@@ -211,6 +213,7 @@ def train_baseline(
         n_train: number or fraction of the training rows to use; None: all.
         seed: of split and fit.
         settings: ``key=value`` of the method.
+        deterministic: on one thread of the CPU, so bit-identical from run to run.
         listen: hears what is being done and the share of it that is done.
 
     Returns:
@@ -222,7 +225,7 @@ def train_baseline(
     check_new(Path(out))
     record, source = opened(dataset)
     chosen, splits = check_baseline(model, record, split, n_train, seed, settings)
-    config = BaselineConfig(source, split, n_train, seed, model, chosen)
+    config = BaselineConfig(source, split, n_train, seed, model, chosen, deterministic=deterministic)
     return BaselineRun(Path(out), config, record).train(splits, listen)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import shutil
 import time
 from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -23,6 +23,7 @@ import yaml
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from ..backend import init
 from ..baselines.method import Listen
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
@@ -48,12 +49,14 @@ class FittedConfig:
         split: its name.
         n_train: number or fraction of training rows; None: all.
         seed: of split and fit.
+        deterministic: fitted on one thread of the CPU, so bit-identical from run to run.
     """
 
     dataset: str
     split: str
     n_train: float | None
     seed: int
+    deterministic: bool = field(default=False, kw_only=True)
 
 
 Config = TypeVar("Config", bound=FittedConfig)
@@ -142,7 +145,10 @@ class FittedRun(ABC, Generic[Config, Model]):
 
         Raises:
             InputError: data that the model cannot be fitted to.
+            BackendError: a deterministic fit in a process that computes on a GPU already.
         """
+        if self.config.deterministic:
+            init("llvm", threads=1)
         for part in stored_parts(self.folder):
             if not (part / self.file).exists():
                 self._fit_part(part, listen)

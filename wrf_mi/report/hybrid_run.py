@@ -123,7 +123,9 @@ def read_hybrid_config(folder: Path) -> HybridConfig:
         if content["model"] != MODEL:
             raise InputError(f"{folder}: a run of {content['model']}, not of the hybrid; give one of the hybrid")
         names = ("dataset", "scene", "material", "split", "n_train", "seed")
-        return HybridConfig(**{name: content[name] for name in names}, settings=tuple(content["settings"]))
+        kept = {name: content[name] for name in names}
+        kept["deterministic"] = bool(content.get("deterministic"))
+        return HybridConfig(**kept, settings=tuple(content["settings"]))
 
 
 def train_hybrid(
@@ -136,6 +138,7 @@ def train_hybrid(
     n_train: int | float | None = None,
     seed: int = 0,
     settings: tuple[str, ...] = (),
+    deterministic: bool = False,
     listen: Listen = lambda what, share: None,
 ) -> Path:
     """Fit a hybrid to a data set and score it.
@@ -149,6 +152,7 @@ def train_hybrid(
         n_train: number or fraction of the training rows to use; None: all; 0: none, physics alone (needs a scene).
         seed: of split and fit.
         settings: ``key=value`` of the model (see `wrf_mi.hybrid.models`).
+        deterministic: on one thread of the CPU, so bit-identical from run to run.
         listen: hears what is being done and the share of it that is done.
 
     Returns:
@@ -159,7 +163,8 @@ def train_hybrid(
     """
     check_new(Path(out))
     record, source = opened(dataset)
-    config = HybridConfig(source, split, n_train, seed, None if scene is None else str(scene), material, settings)
+    place = None if scene is None else str(scene)
+    config = HybridConfig(source, split, n_train, seed, place, material, settings, deterministic=deterministic)
     run = HybridRun(Path(out), config, record)
     # Without training rows the split keeps them for the references beside the model, which need some.
     splits = make_splits(record, split, seed, None if n_train == 0 else n_train)
