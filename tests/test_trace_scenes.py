@@ -14,7 +14,7 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.surfaces import Surface
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
-from wrf_mi.trace.devices import check_devices, solids, winding_number
+from wrf_mi.trace.devices import before_walls, check_devices, solids, winding_number
 from wrf_mi.trace.surfaces import find_planes, scene_surfaces
 
 
@@ -92,6 +92,23 @@ def test_wrong_scenes(tmp_path: Path):
 def in_a_room(tmp_path: Path, *parts: trimesh.Trimesh) -> Any:
     named = {f"part{k}": ("itu_wood", part) for k, part in enumerate(parts)}
     return scene_surfaces(open_scene(write_xml(tmp_path, {**SHOEBOX, **named}), FREQUENCY_HZ))
+
+
+def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Mounted on a wall that a mesh has a millimetre too far inside."""
+    surfaces = in_a_room(tmp_path, sheet(2, 0.7, (2.0, 3.0), (2.0, 3.0)))
+    scene = open_scene(tmp_path / "scene.xml", FREQUENCY_HZ)
+    tx, options = [[1.0, 2, 1]], TraceOptions(upright=True, max_depth=2)
+    on, behind, far = (
+        trace_paths(scene, tx, receiver([x, 2.5, 1.3]), options).paths.length_m.tolist() for x in (0.0, -2e-3, -0.02)
+    )
+    assert len(behind) == len(on) >= 6
+    np.testing.assert_allclose(np.sort(behind), np.sort(on), atol=2e-4)
+    assert not far
+    assert "1 of 1 antennas lie up to 1 cm behind an outer wall (first: receiver rx)" in caplog.text
+    # Of what stands in a room nobody knows which side is meant; outside is not where walls end.
+    places = np.array([[2.5, 2.5, 0.695], [2.5, 2.5, 0.705], [0.0, 2.5, 1.3], [-2e-3, 9.0, 1.3]])
+    np.testing.assert_array_equal(before_walls(surfaces, places, ["one"] * 4), places)
 
 
 def test_an_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ SOLID_M = 0.5
 cabinet 0.3 m, a room of 3 x 3 x 2.5 m 0.94 m."""
 NEAREST_M = 0.01
 """Sionna RT drops paths with a shorter segment."""
+INSIDE_M = 1e-4
+"""An antenna behind the wall that it is mounted on is traced from so far before it."""
+ON_M = 1e-6
+"""So close to a plane float32 does not tell its sides apart; Sionna RT takes the antenna to be on the right one."""
 PAIRS_AT_ONCE = 1 << 20
 
 
@@ -49,6 +53,36 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     if len(near):
         text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
         logger.warning(text, len(near), len(positions_m), names[near[0]])
+
+
+def before_walls(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> FloatArray:
+    """Positions [n, 3], where antennas that are mounted on the scene's outer walls are put before them.
+
+    Such an antenna lies behind its wall by as much as the mesh is wrong, a millimetre in one from a scan, and nothing
+    would reach it. Only walls count that have all of the scene on one side, so that which is the right one is certain.
+
+    Args:
+        surfaces: of the scene.
+        positions_m: shape [n, 3].
+        names: what to call each in the warning that some were moved.
+    """
+    moved = positions_m.copy()
+    for point, plane in _pairs_near(surfaces, positions_m):
+        for one in np.unique(plane):
+            normal, offset = surfaces.normal[one], surfaces.offset[one]
+            scene = surfaces.triangles @ normal - offset
+            side = 1.0 if scene.max() > -scene.min() else -1.0
+            if (side * scene).min() < -NEAREST_M or (side * scene).max() < NEAREST_M:
+                continue  # no outer wall, or all that there is
+            own = point[plane == one]
+            behind = side * (moved[own] @ normal - offset) < -ON_M
+            away = moved[own[behind]] @ normal - offset
+            moved[own[behind]] += (side * INSIDE_M - away)[:, None] * normal
+    changed = np.flatnonzero((moved != positions_m).any(axis=1))
+    if len(changed):
+        text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
+        logger.warning(text, len(changed), len(moved), names[changed[0]])
+    return moved
 
 
 def solids(surfaces: Surfaces) -> list[IntArray]:
@@ -98,16 +132,22 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
 def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
     """Which points have a surface within `NEAREST_M`."""
     close = np.zeros(len(points), bool)
+    for point, plane in _pairs_near(surfaces, points):
+        for one in np.unique(plane):
+            candidates = point[plane == one]
+            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == one], points[candidates])
+    return close
+
+
+def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Points and planes within `NEAREST_M` of each other, bounds of the plane's faces included, in parts."""
     step = max(1, PAIRS_AT_ONCE // max(len(surfaces.normal), 1))
     for start in range(0, len(points), step):
         part = points[start : start + step]
         point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < NEAREST_M)
         along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
         within = ((along > surfaces.low[plane] - NEAREST_M) & (along < surfaces.high[plane] + NEAREST_M)).all(axis=1)
-        for one in np.unique(plane[within]):
-            candidates = start + point[within & (plane == one)]
-            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == one], points[candidates])
-    return close
+        yield start + point[within], plane[within]
 
 
 def _touches(triangles: FloatArray, points: FloatArray) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from .buffer import Legs, join
-from .devices import check_devices
+from .devices import before_walls, check_devices
 from .fields import path_gains, scattering_materials
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
@@ -111,10 +111,13 @@ def trace_paths(
         raise InputError(f"trace_paths: {len(positions)} transmitters and {len(everyone)} receivers; give one at least")
     kept = prepared or Prepared(scene)
     surfaces = kept.surfaces
-    check_devices(surfaces, positions, [f"transmitter {first_row + row + 1}" for row in range(len(positions))])
-    check_devices(
-        surfaces, np.stack([one.position_m for one in everyone]), [f"receiver {one.name}" for one in everyone]
-    )
+    names = [f"transmitter {first_row + row + 1}" for row in range(len(positions))]
+    own = [f"receiver {one.name}" for one in everyone]
+    positions = before_walls(surfaces, positions, names)
+    places = before_walls(surfaces, np.stack([one.position_m for one in everyone]), own)
+    everyone = tuple(replace(one, position_m=place) for one, place in zip(everyone, places, strict=True))
+    check_devices(surfaces, positions, names)
+    check_devices(surfaces, places, own)
     ends, angles = device_ends(positions, everyone, options.upright)
     swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not keeps_direction(options)
     if swap:
