@@ -178,7 +178,10 @@ def test_calls_that_are_refused(
     out = ["--out", tmp_path / "out"]
     train = ["train", flat_folder, "--model", "mri", *out]
     for arguments, message in (
-        (["train", unplaced_folder, "--model", "mri", *out], "unplaced: holds csi; mri serves rssi, so choose another"),
+        (
+            ["train", unplaced_folder, "--model", "mri", *out],
+            "unplaced: holds csi; mri serves rssi, so choose another model: ",
+        ),
         (["train", unplaced_folder, "--model", "idw", *out], "positions are not known, from which idw predicts"),
         (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
         ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),

@@ -247,7 +247,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--fine-tune", type=int, default=0, metavar="STEPS", help="then on the training rows (0)")
     sub.add_argument("--precision", default="half", help="of stored numbers: single, half (default) or 8bit")
 
-    sub = command("compare", _compare, "table, SSIM distribution and pictures of several runs", json_output=False)
+    sub = command("compare", _compare, "table, distribution of scores and pictures of several runs", json_output=False)
     sub.add_argument("runs", nargs="+", metavar="RUN")
     sub.add_argument("--out", required=True, metavar="DIR")
 

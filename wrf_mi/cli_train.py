@@ -262,7 +262,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         print(f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals")
     print(
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
-        f"{metrics['ms_per_sample']:.1f} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
+        f"{metrics['ms_per_sample']:.2g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
     )
     if folder is not None:
         print(f"results: {folder}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +15,13 @@ ROWS_AT_ONCE = 256
 """Rows that are looked at together: a record of spectra is not to be copied for it."""
 
 
-def check_record(method: Method, record: Record) -> None:
+def check_record(method: Method, record: Record, others: Iterable[Method] = ()) -> None:
     """Refuse a record that a method does not serve, or whose parts do not fit together.
+
+    Args:
+        method: that is to be fitted.
+        record: to this.
+        others: methods to be named where it does not serve.
 
     Raises:
         InputError: another task; no uplink for a method that needs one; numbers of rows, antennas, subcarriers and
@@ -22,7 +29,9 @@ def check_record(method: Method, record: Record) -> None:
     """
     if record.task not in method.tasks:
         served = " and ".join(method.tasks)
-        text = f"holds {record.task}; {method.name} serves {served}, so choose another model"
+        able = [other.name for other in others if record.task in other.tasks]
+        named = f": {', '.join(able)}" if able else ""
+        text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
         raise InputError(f"{_place(record)}: {text}")
     if method.needs_uplink and record.uplink is None:
         raise InputError(
@@ -115,7 +124,8 @@ def check_inputs(inputs: Inputs, record: Record, method: Method) -> None:
         raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; leave uplink away")
     if inputs.uplink is None:
         if method.needs_uplink:
-            raise InputError(f"{method.name}: predicts from the uplink; give uplink [m, antennas, subcarriers]")
+            form = "uplink [m, antennas, subcarriers], in the file of `predict --input`"
+            raise InputError(f"{method.name}: predicts from the uplink; give {form}")
         return
     assert record.uplink is not None
     antennas, subcarriers = record.uplink.shape[1:]

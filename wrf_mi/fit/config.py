@@ -8,6 +8,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any, TypeVar, cast
 
 import yaml
@@ -356,7 +357,11 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
         for parent in parents:
             node = node.get(parent) if isinstance(node, dict) else None
         if not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
-            raise InputError(f"--set {setting}: unknown setting {key.strip()}; see `wrf-mi train --help-settings`")
+            known = [name for name, _ in _flat(dataclasses.asdict(config), "")]  # type: ignore[call-overload]
+            close = get_close_matches(key.strip(), known, n=3)
+            meant = f"did you mean {' or '.join(close)}? " if close else ""
+            remedy = f"{meant}All are listed by `wrf-mi train --help-settings`"
+            raise InputError(f"--set {setting}: unknown setting {key.strip()}; {remedy}")
         try:
             node[last] = yaml.safe_load(text) if text.strip() else ""
         except (yaml.YAMLError, ValueError):  # the latter from dates that are none

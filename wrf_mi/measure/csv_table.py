@@ -83,6 +83,6 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
         raise InputError(f"{path}: no rows below the header; give one per measurement")
     for row, fields in enumerate(rows, start=1):
         if len(fields) != len(header):
-            text = f"{len(fields)} fields, but the header has {len(header)}"
+            text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
             raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
     return CsvTable(path, [name.strip() for name in header], rows)

@@ -53,7 +53,7 @@ class BaselineRun(FittedRun[BaselineConfig, Fitted]):
         """
         super().__init__(folder, config, record)
         self.method = known_method(config.model)
-        check_record(self.method, record)
+        check_record(self.method, record, METHODS.values())
 
     @classmethod
     def stored(cls, folder: Path, record: Record | None = None) -> BaselineRun:
@@ -184,7 +184,7 @@ def check_baseline(
     """
     method = known_method(model)
     chosen: Any = with_settings(method.settings(), settings)
-    check_record(method, record)
+    check_record(method, record, METHODS.values())
     splits = make_splits(record, split, seed, n_train)
     for rows in splits:
         check_rows(record, rows)
@@ -223,6 +223,7 @@ def train_baseline(
         InputError: data that the method does not serve or cannot learn from, settings or folder that cannot be used.
     """
     check_new(Path(out))
+    with_settings(known_method(model).settings(), settings)  # before data are read, or even traced
     record, source = opened(dataset)
     chosen, splits = check_baseline(model, record, split, n_train, seed, settings)
     config = BaselineConfig(source, split, n_train, seed, model, chosen, deterministic=deterministic)

@@ -189,6 +189,12 @@ def _outlines(gaussians: Projection) -> FloatArray:
     return np.stack([azimuth, 90 - np.degrees(elevation)], axis=-1)
 
 
+COLOURS = 10
+"""In Matplotlib's cycle."""
+TAIL = 0.01
+"""Share of each curve that may lie beyond either end of the axis: a few rows would squeeze all others together."""
+
+
 def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLike], label: str = "SSIM") -> Figure:
     """Cumulative distributions of a score over test rows, one step curve each; references dashed.
 
@@ -197,16 +203,20 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
         references: the same for what runs are held against.
         label: of the score's axis.
     """
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    figure = Figure(figsize=(7.5, 4), layout="constrained")
     axes = figure.subplots()
-    for group, style in ((scores, "-"), (references, "--")):
-        for name, values in group.items():
-            scored = np.ravel(values)
-            axes.ecdf(scored[~np.isnan(scored)], label=name, linestyle=style)
+    shown = [
+        np.ravel(values)[~np.isnan(np.ravel(values))] for group in (scores, references) for values in group.values()
+    ]
+    for number, (name, scored) in enumerate(zip([*scores, *references], shown, strict=True)):
+        # Beyond the colours there are, the same again in another style.
+        style = "--" if number >= len(scores) else ("-", "-.", ":")[number // COLOURS % 3]
+        axes.ecdf(scored, label=name, linestyle=style, color=f"C{number % COLOURS}")
+    axes.set_xlim(min(np.quantile(one, TAIL) for one in shown), max(np.quantile(one, 1 - TAIL) for one in shown))
     axes.set_xlabel(label)
     axes.set_ylabel("share of test rows below")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside right upper")
     return figure
 
 

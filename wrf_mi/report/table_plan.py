@@ -95,10 +95,10 @@ RSSI: Mapping[str, Entry] = {
     "wrf-gs": Entry("WRF-GS, one a receiver", _model("wrf-gs"), FEWER, SEEDS, published="2.9"),
     "wrf-gs+-shared": Entry("WRF-GS+, one for all", _model("wrf-gs+", *FOR_ALL), FEWER, SEEDS),
     "wrf-gs-shared": Entry("WRF-GS, one for all", _model("wrf-gs", *FOR_ALL), FEWER, SEEDS),
-    "hybrid": Entry("hybrid, knows the heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
-        "ray tracing, calibrated, knows the heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+        "ray tracing, calibrated, knows walls and heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
     ),
     "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
     "kriging": Entry("kriging, knows the heading", _model("kriging")),
@@ -108,9 +108,9 @@ RSSI: Mapping[str, Entry] = {
 POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, SEEDS),
-    "hybrid": Entry("hybrid", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE),
-    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
+    "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
 }
@@ -124,7 +124,7 @@ UPLINK: Mapping[str, Entry] = {
     "linear": Entry("linear map", _model("linear")),
     "kriging": Entry("kriging, from positions", _model("kriging")),
     "ray-tracing": Entry(
-        "ray tracing, from positions", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
+        "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
     ),
 }
 CHEAP = ("hybrid", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
