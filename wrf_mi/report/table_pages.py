@@ -63,14 +63,14 @@ OVERVIEWS = {
 """Headings of the overviews, by `wrf_mi.report.table_plan.Part.table`."""
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
-    "machine, versions and date. Scores are "
-    "over test rows: SSIM and channel estimation accuracy (CEA, dB) are better when larger, errors in dB when smaller. "
-    "With several seeds median, mean, p10 and p90 are means over them and the medians' range stands in brackets; with "
-    "fewer rows the seed draws the rows too. Errors of signal strength are pooled over receivers and rows; fields "
-    "have one offset a receiver. *Paper* is what the WRF-GS+ paper states **on other data**, NeRF2's and Argos's, "
-    "for signal strength as means over twelve receivers: compare orders, not figures. Networks of blocked splits are "
-    "fitted in five folds, all but the VAE with a fifth to a half of their steps; in the traced room NeRF2, VAE and "
-    "DCGAN take the steps of the ten times smaller laboratory, WRF-GS and WRF-GS+ 18,000. Times are of the machine in each file, which others may have used too, "
+    "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "
+    "better when larger, errors in dB when smaller. With several seeds median, mean, p10 and p90 are means over "
+    "them and the medians' range stands in brackets; with fewer rows the seed draws the rows too. Errors of signal "
+    "strength are pooled over receivers and rows; fields have one offset a receiver. *Paper* is what the WRF-GS+ "
+    "paper states **on other data**, NeRF2's and Argos's, for signal strength as means over twelve receivers: "
+    "compare orders, not figures. Networks of blocked splits are fitted in five folds, all but the VAE with a fifth "
+    "to a half of their steps; in the traced room NeRF2, VAE and DCGAN take the steps of the ten times smaller "
+    "laboratory, WRF-GS and WRF-GS+ 18,000. Times are of the machine in each file, which others may have used too, "
     "with as many threads as `worker_threads` says there, or else all: read ratios."
 )
 
