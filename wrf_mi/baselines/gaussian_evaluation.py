@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
-from ..core import Record
+from ..core import InputError, Record
 from ..core.angles import solid_angles
 from ..field import Encoding
 from ..fit.recorded import Recorded
@@ -74,6 +74,23 @@ class GaussianSettings:
     tx_scale_m: float = 0.0
     components: int = 6
     shared: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no field.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        least = {"gaussians": 1, "layers": 1, "width": 1, "height": 1, "columns": 1, "components": 1}
+        least |= {"position_octaves": 1, "tx_octaves": 0, "tx_scale_m": 0}
+        for name, smallest in least.items():
+            if not getattr(self, name) >= smallest:
+                raise InputError(f"{name} {getattr(self, name)}: choose {smallest} or more")
+        for name in ("size_deg", "near_m", "far_m", "scale_m"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"{name} {getattr(self, name)}: choose more than 0")
+        if self.near_m > self.far_m:
+            raise InputError(f"near_m {self.near_m} is beyond far_m {self.far_m}; choose less")
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,14 @@ def telling_scale(points_m: ArrayLike, least_m: float) -> float:
 
     Args:
         points_m: positions [n, 3], metres.
-        least_m: scale that is doubled until it is large enough.
+        least_m: scale, more than 0, that is doubled until it is large enough.
 
     Returns:
         Metres that make one unit.
     """
     extent = float(np.ptp(np.asarray(points_m, float), axis=0).max(initial=0.0))
     scale = least_m
-    while 2 * scale <= extent:
+    while 2 * scale <= extent < np.inf:
         scale *= 2
     return scale
 
