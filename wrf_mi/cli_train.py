@@ -128,18 +128,7 @@ def _train_hybrid(a: Arguments) -> int:
     from .report.watch import Stages
 
     with Stages() as stages:
-        folder = train_hybrid(
-            a.dataset,
-            a.out,
-            a.scene,
-            material=a.material,
-            split=_split(a),
-            n_train=a.n_train,
-            seed=a.seed or 0,
-            settings=tuple(a.set),
-            deterministic=a.deterministic,
-            listen=stages.listen,
-        )
+        folder = train_hybrid(a.dataset, a.out, a.scene, material=a.material, **_fitted(a), listen=stages.listen)
     return _show_stored(folder, a.json)
 
 
@@ -148,18 +137,19 @@ def _train_baseline(a: Arguments, model: str) -> int:
     from .report.watch import Stages
 
     with Stages() as stages:
-        folder = train_baseline(
-            a.dataset,
-            a.out,
-            model,
-            split=_split(a),
-            n_train=a.n_train,
-            seed=a.seed or 0,
-            settings=tuple(a.set),
-            deterministic=a.deterministic,
-            listen=stages.listen,
-        )
+        folder = train_baseline(a.dataset, a.out, model, **_fitted(a), listen=stages.listen)
     return _show_stored(folder, a.json)
+
+
+def _fitted(a: Arguments) -> dict[str, Any]:
+    """What models that are fitted in one go take alike."""
+    return {
+        "split": _split(a),
+        "n_train": a.n_train,
+        "seed": a.seed or 0,
+        "settings": tuple(a.set),
+        "deterministic": a.deterministic,
+    }
 
 
 def _split(a: Arguments) -> str:
