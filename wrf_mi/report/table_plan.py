@@ -65,7 +65,7 @@ SPECTRUM: Mapping[str, Entry] = {
         "WRF-GS", _model("wrf-gs"), _set("steps=400", "validate_every=400"), SEEDS, published="0.82, p90 0.88"
     ),
     "hybrid": Entry("hybrid", _model("hybrid"), (), SEEDS),
-    "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, few_seeds=ONE, published="0.78, p90 0.86"),
+    "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
     "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
     "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
     "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
@@ -109,19 +109,19 @@ POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, SEEDS),
     "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED), (), SEEDS),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("blend", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+", *LONGER), FEWER, SEEDS, ONE, published="23.91, p10 20.85, p90 25.52"),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+", *LONGER), FEWER, SEEDS, published="23.91, p10 20.85, p90 25.52"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs", *LONGER), FEWER, SEEDS, published="22.98, p10 20.82, p90 24.33"),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
     "fire": Entry("FIRE", _model("fire"), FEWER, SEEDS, published="15.29"),
-    "r2f2": Entry("R2F2", _model("r2f2"), published="8.57"),
-    "optml": Entry("OptML", _model("optml"), FEWER, few_seeds=ONE, published="8.47"),
-    "linear": Entry("linear map", _model("linear")),
+    "r2f2": Entry("R2F2", _model("r2f2"), (), SEEDS, published="8.57"),
+    "optml": Entry("OptML", _model("optml"), FEWER, SEEDS, published="8.47"),
+    "linear": Entry("linear map", _model("linear"), (), SEEDS),
     "kriging": Entry("kriging, from positions", _model("kriging")),
     "ray-tracing": Entry(
         "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
@@ -160,16 +160,16 @@ class Part:
 
 LONG_IN_A_ROOM = ("wrf-gs+", "wrf-gs", "hybrid")
 PARTS = (
-    Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs",)),
-    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "vae")),
+    Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
+    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
     Part(
         "spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room", once=("wrf-gs+", "wrf-gs", "hybrid")
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-shared",)),
-    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan"),
+    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
     Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
-    Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+",)),
+    Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
 BLOCKED_SETTINGS: Mapping[str, tuple[str, ...]] = {
