@@ -16,6 +16,7 @@ from wrf_mi.scene.surfaces import Surface
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
 from wrf_mi.trace.devices import before_walls, check_devices, solids, winding_number
 from wrf_mi.trace.surfaces import find_planes, scene_surfaces
+from wrf_mi.trace.tracer import Instrument, RayTracer
 
 
 def refused(words: str, source: Any, frequency_hz: float = FREQUENCY_HZ, **how: Any) -> None:
@@ -108,7 +109,17 @@ def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, cap
     assert "1 of 1 antennas lie up to 1 cm behind an outer wall (first: receiver rx)" in caplog.text
     # Of what stands in a room nobody knows which side is meant; outside is not where walls end.
     places = np.array([[2.5, 2.5, 0.695], [2.5, 2.5, 0.705], [0.0, 2.5, 1.3], [-2e-3, 9.0, 1.3]])
-    np.testing.assert_array_equal(before_walls(surfaces, places, ["one"] * 4), places)
+    np.testing.assert_array_equal(before_walls(surfaces, places), places)
+
+
+def test_rays_for_an_antenna_behind_its_wall_are_settled_before_it(tmp_path: Path):
+    """From behind the wall no ray finds a path, and the fewest would do."""
+    write_xml(tmp_path, SHOEBOX)
+    tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(upright=True, max_depth=2, rays="auto")
+    carrier_hz = np.array([FREQUENCY_HZ])
+    before, behind = (Instrument("rssi", (receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
+    wanted, found = (RayTracer(tmp_path / "scene.xml", one, options).rays(tx) for one in (before, behind))
+    assert found == wanted
 
 
 def test_an_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):

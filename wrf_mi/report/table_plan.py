@@ -158,7 +158,6 @@ class Part:
     once: Collection[str] = ()
 
 
-LONG_IN_A_ROOM = ("wrf-gs+", "wrf-gs", "hybrid")
 PARTS = (
     Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
     Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),

@@ -55,7 +55,7 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         logger.warning(text, len(near), len(positions_m), names[near[0]])
 
 
-def before_walls(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> FloatArray:
+def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Positions [n, 3], where antennas that are mounted on the scene's outer walls are put before them.
 
     Such an antenna lies behind its wall by as much as the mesh is wrong, a millimetre in one from a scan, and nothing
@@ -64,7 +64,6 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[st
     Args:
         surfaces: of the scene.
         positions_m: shape [n, 3].
-        names: what to call each in the warning that some were moved.
     """
     moved = positions_m.copy()
     for point, plane in _pairs_near(surfaces, positions_m):
@@ -78,11 +77,15 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[st
             behind = side * (moved[own] @ normal - offset) < -ON_M
             away = moved[own[behind]] @ normal - offset
             moved[own[behind]] += (side * INSIDE_M - away)[:, None] * normal
-    changed = np.flatnonzero((moved != positions_m).any(axis=1))
+    return moved
+
+
+def tell_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str]) -> None:
+    """Warn of antennas that `before_walls` moved, from positions [n, 3] to others; ``names``: what to call each."""
+    changed = np.flatnonzero((moved_m != positions_m).any(axis=1))
     if len(changed):
         text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
-        logger.warning(text, len(changed), len(moved), names[changed[0]])
-    return moved
+        logger.warning(text, len(changed), len(moved_m), names[changed[0]])
 
 
 def solids(surfaces: Surfaces) -> list[IntArray]:

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from .buffer import Legs, join
-from .devices import before_walls, check_devices
+from .devices import before_walls, check_devices, tell_moved
 from .fields import path_gains, scattering_materials
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
@@ -48,6 +48,12 @@ class Prepared:
         self._scene = scene
         self._found: dict[tuple[bytes, TraceOptions, int], Any] = {}
         self._rays: dict[TraceOptions, int] = {}
+
+    def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
+        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.trace.devices.before_walls`."""
+        places = before_walls(self.surfaces, np.stack([one.position_m for one in receivers]))
+        moved = tuple(replace(one, position_m=place) for one, place in zip(receivers, places, strict=True))
+        return before_walls(self.surfaces, tx_pos_m), moved
 
     def rays(self, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
         """How many rays search; for ``"auto"``, what converged for the first positions that were asked for."""
@@ -113,11 +119,12 @@ def trace_paths(
     surfaces = kept.surfaces
     names = [f"transmitter {first_row + row + 1}" for row in range(len(positions))]
     own = [f"receiver {one.name}" for one in everyone]
-    positions = before_walls(surfaces, positions, names)
-    places = before_walls(surfaces, np.stack([one.position_m for one in everyone]), own)
-    everyone = tuple(replace(one, position_m=place) for one, place in zip(everyone, places, strict=True))
-    check_devices(surfaces, positions, names)
-    check_devices(surfaces, places, own)
+    stated = positions, np.stack([one.position_m for one in everyone])
+    positions, everyone = kept.placed(positions, everyone)
+    traced = positions, np.stack([one.position_m for one in everyone])
+    for before, after, called in zip(stated, traced, (names, own), strict=True):
+        tell_moved(before, after, called)
+        check_devices(surfaces, after, called)
     ends, angles = device_ends(positions, everyone, options.upright)
     swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not keeps_direction(options)
     if swap:

@@ -125,7 +125,8 @@ class RayTracer:
 
     def rays(self, tx_pos_m: ArrayLike) -> int:
         """How many rays search if these positions [n, 3] (metres) are the first: ``"auto"`` is settled on them."""
-        ends = device_ends(np.asarray(tx_pos_m, float), self.instrument.receivers, self.options.upright)[0]
+        placed = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
+        ends = device_ends(*placed, self.options.upright)[0]
         return self._prepared.rays(*(ends if keeps_direction(self.options) else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
