@@ -52,7 +52,7 @@ def scene(folder: Path, wrong: dict[str, float], partition_m: float = 1.5) -> An
 
 def channels(of: Any, positions: np.ndarray) -> np.ndarray:
     """By Sionna RT's paths, all mirrors perfect: what `image_method` of any kind must give."""
-    paths = trace_paths(of, positions, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16, upright=True)).paths
+    paths = trace_paths(of, positions, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16)).paths
     gain = np.exp(-1j * K * paths.length_m) / (2 * K * paths.length_m)
     return np.bincount(paths.tx, gain.real, len(positions)) + 1j * np.bincount(paths.tx, gain.imag, len(positions))
 
@@ -126,7 +126,7 @@ def test_images_follow_their_planes(right: Any) -> None:
 
 
 def test_paths_are_those_of_the_tracer(right: Any, places: np.ndarray) -> None:
-    paths = trace_paths(right, places, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16, upright=True)).paths
+    paths = trace_paths(right, places, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16)).paths
     walls = walls_of(scene_surfaces(right))
     chains = [(-1, -1)] + [(i, j) for i in range(len(walls)) for j in range(-1, len(walls)) if i != j]
     seen = seen_from(walls, images_of(walls, ACCESS_POINT.position_m, np.array(chains)), places)
@@ -250,7 +250,7 @@ def test_several_receivers_and_subcarriers(right: Any, wrong: Any, places: np.nd
     k = 2 * np.pi * frequencies / speed_of_light
     observed = np.zeros((2, len(places), 3), complex)
     for number, access_point in enumerate((ACCESS_POINT, other)):
-        paths = trace_paths(right, places, access_point, TraceOptions(max_depth=2, rays=1 << 16, upright=True)).paths
+        paths = trace_paths(right, places, access_point, TraceOptions(max_depth=2, rays=1 << 16)).paths
         gain = np.exp(-1j * k * paths.length_m[:, None]) / (2 * k * paths.length_m[:, None])
         np.add.at(observed[number], paths.tx, gain)
     both = replace(

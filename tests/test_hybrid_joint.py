@@ -40,7 +40,7 @@ from wrf_mi.trace.materials import BELOW_1_GHZ
 ROWS, COLUMNS = 30, 120
 ARRAY_M = planar_array(4, 4, 0.16)
 TRAIN, HELD_OUT, STEPS = 20, 8, 200
-OPTIONS = TraceOptions(max_depth=1, upright=True, rays=4096)
+OPTIONS = TraceOptions(max_depth=1, rays=4096)
 TRUE_PERMITTIVITY, START_PERMITTIVITY = BELOW_1_GHZ["concrete"][0], 2.5
 PERMITTIVITY = "material.itu_concrete.permittivity"
 ENCODING = Encoding(position_octaves=2, position_scale_m=4.0, tx_octaves=3, tx_scale_m=0.6)

@@ -11,7 +11,7 @@ import pytest
 from traced_rooms import PARTITION, SHOEBOX, write_xml
 from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.hybrid import spectrum, spectrum_rays
 from wrf_mi.hybrid.spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
@@ -53,12 +53,22 @@ def record_of(model: SpectrumModel, tx: np.ndarray) -> Record:
     return Record("made", "spectrum", tx, (RECEIVER,), spectra[None], frequencies_hz=np.array([HZ]), array_m=ARRAY)
 
 
-def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any) -> None:
-    model, tx = begin(INSTRUMENT, scene, HOW), places(20, 0)
+@pytest.mark.parametrize(
+    ("rx", "tx_antenna"),
+    [
+        (Antenna(), Antenna()),
+        (Antenna("hw_dipole", "H"), Antenna("dipole", "H")),
+        (Antenna("tr38901", "V", "array"), Antenna("hw_dipole")),
+    ],
+)
+def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any, rx: Antenna, tx_antenna: Antenna) -> None:
+    receiver = replace(RECEIVER, antenna=rx)
+    instrument = replace(INSTRUMENT, receiver=receiver, tx_antenna=tx_antenna)
+    model, tx = begin(instrument, scene, HOW), places(20, 0)
     waves = model.waves(tx)
     gain, length = waves.gain(model.constants), np.linalg.norm(waves.met.image_m, axis=1)
     options = TraceOptions(transmission=True, max_depth=3, max_reflections=2, rays=1 << 14)
-    paths = trace_paths(scene, tx, RECEIVER, options).paths
+    paths = trace_paths(scene, tx, receiver, options, tx_antenna=tx_antenna).paths
     paths = paths.select((paths.interactions == 4).sum(axis=1) <= 1)
     mine: dict[tuple[int, float], list[complex]] = {}
     for row, far, value in zip(waves.met.tx, length, gain, strict=True):
@@ -156,7 +166,7 @@ def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> 
     waves, frames = bare.waves(tx), bare.frames(tx)
     known = Known.of(bare.table, waves, bare.constants, bare.factor(waves.met), tx)
     search = Search(
-        frames, tx, RECEIVER.position_m, INSTRUMENT.elements_m, RECEIVER.to_world[:, 1], HZ, shapes, INSTRUMENT.grid,
+        frames, tx, RECEIVER.position_m, INSTRUMENT.elements_m, INSTRUMENT.antennas, HZ, shapes, INSTRUMENT.grid,
         known,
     )  # fmt: skip
     (found,) = search(waves.sum @ known.wave, most=1, least_gain=30.0)

@@ -12,7 +12,7 @@ from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room,
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import to_uint
-from wrf_mi.core import InputError, Receiver
+from wrf_mi.core import Antenna, InputError, Receiver
 from wrf_mi.hybrid import TracedField, TracedOptions
 
 # isort: split
@@ -61,12 +61,22 @@ def existing(traced: TracedField, parameters: dict[str, Any]) -> tuple[np.ndarra
 
 
 @pytest.mark.parametrize("turn", [(0, 2, 0), (30, 50, -70)])
-@pytest.mark.parametrize("upright", [False, True])
-def test_paths_are_those_of_sionna_rt(scene: Any, turn: tuple[float, float, float], upright: bool) -> None:
-    """Line of sight, reflections, passages and both, for arrays turned any way."""
-    options = replace(OPTIONS, upright=upright)
-    reference = trace_paths(scene, transmitters(5), receiver(turn), options).paths
-    traced = TracedField(scene, transmitters(5), receiver(turn), TracedOptions(options))
+@pytest.mark.parametrize(
+    ("rx", "tx"),
+    [
+        (Antenna(), Antenna()),
+        (Antenna(frame="array"), Antenna()),
+        (Antenna("iso", "H", "array"), Antenna("iso", "H")),
+        (Antenna("dipole", "V", "array"), Antenna("hw_dipole")),
+        (Antenna("hw_dipole", "H"), Antenna("dipole", "H")),
+        (Antenna("tr38901", "V", "array"), Antenna()),
+    ],
+)
+def test_paths_are_those_of_sionna_rt(scene: Any, turn: tuple[float, float, float], rx: Antenna, tx: Antenna) -> None:
+    """Line of sight, reflections, passages and both, for arrays turned any way and every pattern and polarisation."""
+    array = replace(receiver(turn), antenna=rx)
+    reference = trace_paths(scene, transmitters(5), array, OPTIONS, tx_antenna=tx).paths
+    traced = TracedField(scene, transmitters(5), array, TracedOptions(OPTIONS, tx_antenna=tx))
     gain, length, arrival = existing(traced, tensors(traced))
     assert set(map(tuple, np.sort(reference.interactions, axis=1))) >= {(0, 0), (0, 1), (0, 4), (1, 4)}
     np.testing.assert_allclose(length, reference.length_m, rtol=DOUBLE)
@@ -126,7 +136,7 @@ def test_derivatives_by_materials_are_those_of_sionna_rt(scene: Any) -> None:
         concrete.relative_permittivity, concrete.conductivity = permittivity, conductivity
         surfaces = scene_surfaces(scene)
         buffer = to_buffer(found.legs(surfaces), surfaces, valid=True)
-        gain = field_of(scene, buffer, *found.ends(), found.rays, loop_mode="evaluated")
+        gain = field_of(scene, buffer, found.ends(), found.rays, loop_mode="evaluated")
         dr.backward(dr.sum(gain[0] * mi.Float(weight[0]) + gain[1] * mi.Float(weight[1])))
         theirs = [float(dr.grad(permittivity)[0]), float(dr.grad(conductivity)[0])]
     finally:
@@ -218,11 +228,11 @@ def test_free_space() -> None:
     scene = rt.load_scene()
     scene.frequency = FREQUENCY_HZ
     own = receiver(position=(0.0, 0.0, 1.0))
-    traced = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions(upright=True)))
+    traced = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions()))
     gain, length, arrival = existing(traced, tensors(traced))
     np.testing.assert_allclose(gain, [speed_of_light / traced.frequency_hz / (4 * np.pi * 5)], rtol=DOUBLE)
     np.testing.assert_allclose(length, [5.0], rtol=DOUBLE)
-    stronger = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions(upright=True), gain=30.0))
+    stronger = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions(), gain=30.0))
     np.testing.assert_allclose(existing(stronger, {})[0], 30 * gain, rtol=DOUBLE)
     np.testing.assert_allclose(arrival, [[0.6, 0.8, 0.0]], atol=DOUBLE)
 

@@ -30,9 +30,7 @@ from wrf_mi.trace import TraceOptions, trace_paths  # noqa: E402
 @pytest.fixture(scope="module")
 def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]:
     scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
-    return trace_paths(
-        scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(max_depth=1, rays=1 << 12, upright=True)
-    ).paths, tx
+    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(max_depth=1, rays=1 << 12)).paths, tx
 
 
 def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -> None:

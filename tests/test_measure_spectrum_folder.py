@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import read_spectrum_folder, write_spectrum_folder
 
@@ -133,7 +134,7 @@ def test_carrier_and_array_are_optional(folder: Path, tmp_path: Path):
         ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
         ("frequency_hz: .inf", "frequency_hz is inf"),
         ("frequency_hz: fast", "frequency_hz is 'fast'"),
-        ("frequency_hz: [1, 2]", r"frequency_hz is \[1, 2\]"),
+        ("frequency_hz: [1, x]", r"frequency_hz is \[1, 'x'\]"),
         ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
         ("array: {rows: 4, columns: 4}", "array is .*; give rows, columns and spacing_m"),
         ("array: {rows: 4.5, columns: 4, spacing_m: 1}", "array is"),
@@ -302,3 +303,76 @@ def test_the_real_data_are_read_quickly():
     assert record.official is not None
     assert [len(part) for part in record.official] == [160, 40]
     assert np.bincount(record.folds).tolist() == [77, 16, 19, 50, 38]
+
+
+def test_antennas_are_read_and_written(tmp_path: Path):
+    record = make_record(4, gateways=2)
+    antennas = (Antenna("dipole", "H"), Antenna("tr38901", "V", "array"))
+    told = replace(
+        record,
+        receivers=tuple(replace(one, antenna=a) for one, a in zip(record.receivers, antennas, strict=True)),
+        tx_antenna=Antenna("hw_dipole", "H"),
+    )
+    read = read_spectrum_folder(write_spectrum_folder(tmp_path / "told", told))
+    assert tuple(one.antenna for one in read.receivers) == antennas
+    assert read.tx_antenna == told.tx_antenna
+    plain = read_spectrum_folder(write_spectrum_folder(tmp_path / "plain", record))
+    assert {one.antenna for one in plain.receivers} | {plain.tx_antenna} == {Antenna()}
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("antenna: V", "gateway9: antenna is 'V'; give some of pattern, polarization, frame"),
+        ("antenna: {polarisation: V}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
+        ("antenna: {polarization: vertical}", "polarization is 'vertical'; choose from V, H"),
+        ("antenna: {pattern: tr38901}", "state array"),
+    ],
+)
+def test_wrong_antenna_is_one_line(folder: Path, entry: str, message: str):
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write(f"gateway9:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n  {entry}\n")
+    with pytest.raises(InputError, match=message) as error:
+        read_spectrum_folder(folder)
+    assert "gateway_info.yml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_frame_of_a_transmitters_antenna_is_refused(folder: Path):
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write("tx_antenna: {frame: array}\n")
+    with pytest.raises(InputError, match=r"tx_antenna is .*; give some of pattern, polarization"):
+        read_spectrum_folder(folder)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["frequency_hz: [915e6, 2.4e9]", "frequencies_hz: [915e6, 2.4e9]", "frequency_hz: 915e6\ncarrier_hz: 868e6"],
+)
+def test_several_carriers_are_refused(folder: Path, text: str):
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write(f"{text}\n")
+    with pytest.raises(InputError, match=r"gateway_info.yml: .*several carriers.*make a folder for each"):
+        read_spectrum_folder(folder)
+
+
+def test_several_carriers_of_receivers_are_refused_and_equal_ones_are_one(tmp_path: Path):
+    folder = write_spectrum_folder(tmp_path / "two", make_record(4, gateways=2))
+    info = yaml.safe_load((folder / "gateway_info.yml").read_text())
+    for name in ("gateway1", "gateway2"):
+        info[name]["frequency_hz"] = 915e6
+    (folder / "gateway_info.yml").write_text(yaml.safe_dump(info))
+    np.testing.assert_array_equal(read_spectrum_folder(folder).frequencies_hz, [915e6])
+    info["gateway2"]["frequency_hz"] = 2.44e9
+    (folder / "gateway_info.yml").write_text(yaml.safe_dump(info))
+    with pytest.raises(
+        InputError, match=r"gateway1: frequency_hz of 9.15e\+08 and gateway2: frequency_hz of 2.44e\+09"
+    ):
+        read_spectrum_folder(folder)
+
+
+def test_several_carriers_are_not_written(tmp_path: Path):
+    record = replace(make_record(4), frequencies_hz=np.array([915e6, 2.4e9]))
+    with pytest.raises(InputError, match=r"2 carriers, and gateway_info\.yml states one; write a folder for each"):
+        write_spectrum_folder(tmp_path / "a", record)
+    assert not (tmp_path / "a").exists()

@@ -67,8 +67,11 @@ ROWS, COLUMNS = np.array([85, 60, 45, 70]), np.array([0, 30, 300, 180])
 UPRIGHT = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
-def behind_the_wall(distance_m: float = 7.0) -> tuple[Gaussians, dict[str, Any], np.ndarray]:
-    """Four Gaussians in the directions of four pixels, the sensor, and the Gaussians' positions."""
+def behind_the_wall(distance_m: float = 7.0, turn_deg: float = 0.0) -> tuple[Gaussians, dict[str, Any], np.ndarray]:
+    """Four Gaussians in the directions of four pixels, the sensor, and the Gaussians' positions.
+
+    The sensor may be turned about its normal; the Gaussians stay where they are.
+    """
     position = distance_m * pixel_directions(90, 360)[ROWS, COLUMNS] @ UPRIGHT.T
     ones = np.ones((4, 1))
     gaussians = Gaussians(
@@ -80,7 +83,8 @@ def behind_the_wall(distance_m: float = 7.0) -> tuple[Gaussians, dict[str, Any],
         attenuation=None,
         batch=1,
     )
-    to_world = receiver_to_world(np.zeros(3), Rotation.from_matrix(UPRIGHT).as_quat())
+    turned = Rotation.from_matrix(UPRIGHT) * Rotation.from_euler("z", turn_deg, degrees=True)
+    to_world = receiver_to_world(np.zeros(3), turned.as_quat())
     return gaussians, {"type": "wrf_perception_plane", "to_world": to_world, "film": film(90, 360)}, position
 
 
@@ -108,6 +112,21 @@ def test_wall_passes_what_sionna_rt_passes(tmp_path: Path) -> None:
     gain = (paths.a[0].numpy() + 1j * paths.a[1].numpy())[0, 0, :, 0, 0]
     expected = gain / (speed_of_light / FREQUENCY_HZ / (4 * np.pi * 7.0))
     np.testing.assert_allclose(through, expected, rtol=SIONNA_TOLERANCE, atol=SIONNA_TOLERANCE)
+
+
+def test_walls_pass_vertical_polarisation_however_the_sensor_is_turned() -> None:
+    """A stated polarisation turns with the sensor; the default does not."""
+    gaussians, sensor, _ = behind_the_wall(turn_deg=90)
+    columns_now = (COLUMNS - 90) % 360
+
+    def turned(**stated: Any) -> np.ndarray:
+        own = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ, **stated}
+        scene = scene_of(gaussians, sensor=sensor, brick=BRICK, wall=wall(), integrator=own)
+        return complex_image(mi.render(scene))[ROWS, columns_now]
+
+    upright = at_pixels(brick=BRICK, wall=wall(), integrator={"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ})
+    np.testing.assert_allclose(turned(), upright, rtol=1e-3, atol=1e-4)  # a rotated sensor in single precision
+    assert np.abs(turned(polarization=mi.ScalarVector3f(0, 1, 0)) / upright - 1).max() > 0.05
 
 
 def test_walls_in_front_of_a_gaussian_alone_count() -> None:

@@ -23,7 +23,7 @@ from wrf_mi.trace.target import choose_options, remainder
 from wrf_mi.trace.tracer import Instrument
 
 RX = receiver([3.1, 2.2, 1.5])
-PLAIN = TraceOptions(upright=True)
+PLAIN = TraceOptions()
 FINE = replace(PLAIN, max_depth=6, rays=1 << 16)
 """Three interactions more than a target of 1.5 dB takes here; each adds a third of what the last did."""
 

@@ -29,7 +29,7 @@ from wrf_mi.trace.calibration import (
     with_materials,
 )
 
-OPTIONS = TraceOptions(transmission=True, upright=True, max_depth=3, max_reflections=1, rays=1 << 12)
+OPTIONS = TraceOptions(transmission=True, max_depth=3, max_reflections=1, rays=1 << 12)
 OFFSET_DB = np.array([-31.0, -44.0])
 TRUE_BRICK = (7.0, 0.2)
 TRUE_PARTITION = (9.0, 1.0)

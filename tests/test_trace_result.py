@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room, write_xml
 
-from wrf_mi.core import InputError, Paths, load_paths, save_paths
+from wrf_mi.core import Antenna, InputError, Paths, load_paths, save_paths
 from wrf_mi.trace import TraceOptions, TraceResult, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.trace.buffer import to_buffer
 from wrf_mi.trace.fields import field_of
@@ -16,7 +16,7 @@ from wrf_mi.trace.surfaces import scene_surfaces
 
 SINGLE = 1e-5
 """Relative to the largest; other widths of vector instructions."""
-OPTIONS = TraceOptions(transmission=True, upright=True, rays=1 << 13)
+OPTIONS = TraceOptions(transmission=True, rays=1 << 13)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,8 @@ def test_a_dipole_has_its_pattern(traced: TraceResult, scene: Any):
     """A half-wave dipole's directivity is 1.64 at the horizon, and cos(pi/2 cos) / sin elsewhere, at both ends."""
     direct = traced.select(traced.paths.bounces == 0)
     assert len(direct.paths)
-    dipole = recompute(direct, scene, "hw_dipole").paths.gain
+    antenna = Antenna("hw_dipole")
+    dipole = recompute(direct, scene, rx_antennas=[antenna] * direct.paths.n_rx, tx_antenna=antenna).paths.gain
     cosine = direct.paths.departure[:, 2]
     pattern = 1.643 * (np.cos(np.pi / 2 * cosine) / np.sqrt(1 - cosine**2)) ** 2
     np.testing.assert_allclose(np.abs(dipole / direct.paths.gain), pattern, rtol=1e-3)  # of the rounded 1.643
@@ -146,7 +147,7 @@ def test_derivatives_by_materials(traced: TraceResult, scene: Any, quantity: str
 
     def power(at: Any) -> Any:
         setattr(material, quantity, at)
-        real, imaginary = field_of(scene, buffer, *traced.ends(), traced.rays, loop_mode="evaluated")
+        real, imaginary = field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
         return dr.sum(dr.square(real) + dr.square(imaginary)) * 1e6
 
     variable = mi.Float(value)

@@ -60,7 +60,7 @@ def test_a_bare_mesh_needs_a_material(tmp_path: Path, ending: str):
         open_scene(file, FREQUENCY_HZ, material="perfect"),
         [[1.0, 2, 1]],
         receiver([4, 3, 1]),
-        TraceOptions(upright=True, max_depth=1),
+        TraceOptions(max_depth=1),
     ).paths
     assert len(paths) == 7
     refused("a mesh has no radio material", file)
@@ -99,7 +99,7 @@ def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, cap
     """Mounted on a wall that a mesh has a millimetre too far inside."""
     surfaces = in_a_room(tmp_path, sheet(2, 0.7, (2.0, 3.0), (2.0, 3.0)))
     scene = open_scene(tmp_path / "scene.xml", FREQUENCY_HZ)
-    tx, options = [[1.0, 2, 1]], TraceOptions(upright=True, max_depth=2)
+    tx, options = [[1.0, 2, 1]], TraceOptions(max_depth=2)
     on, behind, far = (
         trace_paths(scene, tx, receiver([x, 2.5, 1.3]), options).paths.length_m.tolist() for x in (0.0, -2e-3, -0.02)
     )
@@ -115,7 +115,7 @@ def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, cap
 def test_rays_for_an_antenna_behind_its_wall_are_settled_before_it(tmp_path: Path):
     """From behind the wall no ray finds a path, and the fewest would do."""
     write_xml(tmp_path, SHOEBOX)
-    tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(upright=True, max_depth=2, rays="auto")
+    tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(max_depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
     before, behind = (Instrument("rssi", (receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
     wanted, found = (RayTracer(tmp_path / "scene.xml", one, options).rays(tx) for one in (before, behind))
@@ -175,7 +175,7 @@ def test_fine_and_coarse_walls_give_the_same_paths(tmp_path: Path):
     for name, parts in (("coarse", SHOEBOX), ("fine", fine)):
         scene = open_scene(write_xml(tmp_path / name, parts), FREQUENCY_HZ)
         assert len(scene_surfaces(scene).normal) == 6
-        found.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions(upright=True)).paths)
+        found.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions()).paths)
     np.testing.assert_allclose(found[1].length_m, found[0].length_m, atol=1e-9)
     np.testing.assert_allclose(found[1].gain, found[0].gain, atol=1e-5 * np.abs(found[0].gain).max())
     assert sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0)).area == pytest.approx(1)

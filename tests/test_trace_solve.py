@@ -40,7 +40,7 @@ OFF_SURFACE = 2e-3
 """Of the largest gain; Sionna RT's own points are some 1e-4 m off the surfaces."""
 EDGE_OF_TWO = 0.05
 """Of the largest gain; which face of an edge diffracts depends on the ray that comes first."""
-UPRIGHT = TraceOptions(upright=True)
+UPRIGHT = TraceOptions()
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Traced paths and spectra against closed forms and against Sionna RT's own arrays; the embedded laboratory."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from wrf_mi_scenes import content_sha256, scenes
 from wrf_mi_scenes.build_laboratory import build, sheet
 
 from wrf_mi import backend
-from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
+from wrf_mi.core import Antenna, InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import make_splits, registry
 from wrf_mi.receive import element_signals
@@ -139,7 +140,7 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
         "south": ("itu_glass", sheet(1, 0.0, (0.0, 6.0), (0.0, 3.0))),
     }
     scene = open_scene(write_xml(tmp_path, walls), FREQUENCY_HZ)
-    receiver = upright(195, (5.0, 2.4, 1.2))
+    receiver = replace(upright(195, (5.0, 2.4, 1.2)), antenna=Antenna(frame="array"))
     source = np.array([1.3, 2.9, 1.6])
     paths = trace_paths(scene, source[None], receiver).paths
     assert len(paths.gain) == 8  # up to one reflection at each of three mutually perpendicular mirrors
@@ -149,7 +150,7 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
     pattern = scene.rx_array.antenna_pattern
     x, y, z = (ARRAY_M / WAVELENGTH_M).T.astype(np.float32)
     scene.rx_array = rt.AntennaArray(pattern, mi.Point3f(z, x, y))
-    angles = mi.Point3f(sionna_orientation(receiver.orientation_xyzw))
+    angles = mi.Point3f(sionna_orientation(receiver.antenna.to_world(receiver.orientation_xyzw)))
     scene.add(rt.Receiver("array", mi.Point3f(receiver.position_m.tolist()), angles))
     scene.add(rt.Transmitter("source", mi.Point3f(source.tolist())))
     traced = rt.PathSolver(deterministic=True)(scene, synthetic_array=False, refraction=False, samples_per_src=10_000)
@@ -168,7 +169,8 @@ def test_orientation_turns_a_device_as_the_quaternion_turns_the_array(quaternion
     import mitsuba as mi
     from sionna.rt.utils import rotation_matrix as sionna_rotation
 
-    device = sionna_rotation(mi.Point3f(sionna_orientation(quaternion))).numpy()[:, :, 0]
+    turned = Antenna(frame="array").to_world(quaternion)
+    device = sionna_rotation(mi.Point3f(sionna_orientation(turned))).numpy()[:, :, 0]
     array = rotation_matrix(quaternion)
     # Boresight, and the array's x and y: Sionna RT has them on its x, y and z.
     np.testing.assert_allclose(device, array[:, [2, 0, 1]], atol=1e-6)  # single precision

@@ -111,7 +111,7 @@ def ends_of(users: np.ndarray) -> list[Receiver]:
     return [Receiver(str(row), place, np.array([0.0, 0, 0, 1])) for row, place in enumerate(users)]
 
 
-OPTIONS = TraceOptions(max_depth=2, rays=1 << 14, upright=True)
+OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
 
 
 def test_specular_channels_are_those_of_the_other_direction(tmp_path: Path) -> None:

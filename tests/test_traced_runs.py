@@ -81,7 +81,7 @@ def test_saved_paths_are_those_of_the_record(flat_folder: Path, run: Path) -> No
     record = load(flat_folder)
     np.testing.assert_array_equal(traced.tx_pos_m, record.tx_pos_m)
     assert traced.paths.n_rx == len(record.receivers)
-    assert traced.options == TraceOptions(reflection=False, max_depth=0, upright=True)
+    assert traced.options == TraceOptions(reflection=False, max_depth=0)
 
 
 def test_calibration_is_kept_and_scores_again_and_predicts(

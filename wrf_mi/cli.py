@@ -14,6 +14,7 @@ from .baselines.models import METHODS
 from .cli_bench import bench_command
 from .cli_train import print_json, progress_bar, show_metrics, sweep_command, trace_command, train_command
 from .core import BackendError, InputError
+from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 
 Arguments = argparse.Namespace
 
@@ -297,6 +298,15 @@ def _add_tracing(sub: Any) -> None:
     fit = "fit antenna patterns, or materials too, to the training rows (signal strengths)"
     sub.add_argument("--calibrate", choices=("patterns", "all"), help=fit)
     sub.add_argument("--rays", metavar="N", help="that search from each source, or auto: until no more paths are found")
+    stated = "in place of what the data state, which is by default"
+    of_receivers = f"pattern of the receivers' antennas {stated} iso"
+    sub.add_argument("--rx-pattern", choices=PATTERNS, help=of_receivers)
+    text = f"polarisation of the receivers' antennas {stated} V: vertical in --rx-frame"
+    sub.add_argument("--rx-polarization", choices=POLARIZATIONS, help=text)
+    text = f"frame in which that is stated, the world's or the array's {stated} the world's"
+    sub.add_argument("--rx-frame", choices=FRAMES, help=text)
+    sub.add_argument("--tx-pattern", choices=OMNIDIRECTIONAL, help="pattern of the transmitter's antenna")
+    sub.add_argument("--tx-polarization", choices=POLARIZATIONS, help="polarisation of the transmitter's antenna")
 
 
 def _add_scheduler(sub: Any) -> None:

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import yaml
 
 from .backend import init
 from .baselines.models import METHODS, PAPER
-from .core import InputError
+from .core import AntennaOptions, InputError
 
 Arguments = argparse.Namespace
 
@@ -27,7 +27,7 @@ def train_command(a: Arguments) -> int:
         return 0
     if a.resume:
         given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset, a.scene, a.material, *_traced(a))
-        if any(value is not None for value in given) or a.set or a.deterministic:
+        if any(value is not None for value in given) or _antennas(a) or a.set or a.deterministic:
             raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
         return _resume(a)
     _check_options(a)
@@ -42,6 +42,10 @@ def train_command(a: Arguments) -> int:
 
 def _traced(a: Arguments) -> tuple[Any, ...]:
     return a.paths, a.depth, a.reflections, a.rays, a.calibrate
+
+
+def _antennas(a: Arguments) -> AntennaOptions:
+    return AntennaOptions(**{one.name: getattr(a, one.name) for one in fields(AntennaOptions)})
 
 
 def _baseline(a: Arguments) -> str | None:
@@ -64,13 +68,15 @@ def _check_options(a: Arguments) -> None:
         return
     if a.model == "hybrid":
         if any(value is not None for value in (*_traced(a), a.preset)):
-            raise InputError("train --model hybrid takes --scene, --material, --split, --n-train, --seed and --set")
+            other = "--scene, --material, antenna options, --split, --n-train, --seed and --set"
+            raise InputError(f"train --model hybrid takes {other}")
     elif (baseline := _baseline(a)) is not None:
-        if any(value is not None for value in (a.scene, a.material, a.preset, *_traced(a))):
+        if any(value is not None for value in (a.scene, a.material, a.preset, *_traced(a))) or _antennas(a):
             other = "a scene belongs to --model ray-tracing or hybrid, a preset to fields of spectra"
             raise InputError(f"{baseline} on {a.dataset}: takes --split, --n-train, --seed and --set; {other}")
-    elif any(value is not None for value in (a.scene, a.material, *_traced(a))):
-        raise InputError("--scene and what is traced in it belong to --model ray-tracing (--scene also to hybrid)")
+    elif any(value is not None for value in (a.scene, a.material, *_traced(a))) or _antennas(a):
+        which = "--model ray-tracing (--scene and antennas also to hybrid)"
+        raise InputError(f"--scene and what is traced in it belong to {which}")
     if not a.dataset or not a.out:
         raise InputError("train needs DATASET and --out RUN (or --resume RUN)")
 
@@ -128,7 +134,8 @@ def _train_hybrid(a: Arguments) -> int:
     from .report.watch import Stages
 
     with Stages() as stages:
-        folder = train_hybrid(a.dataset, a.out, a.scene, material=a.material, **_fitted(a), listen=stages.listen)
+        own = {"material": a.material, "antennas": _antennas(a), **_fitted(a)}
+        folder = train_hybrid(a.dataset, a.out, a.scene, **own, listen=stages.listen)
     return _show_stored(folder, a.json)
 
 
@@ -186,7 +193,7 @@ def trace_command(a: Arguments) -> int:
         options = replace(options, **dict.fromkeys(CHOSEN_KINDS, False))
     asked = {"material": a.material, "split": _split(a), "n_train": a.n_train, "seed": a.seed or 0}
     call = partial(trace_run, a.scene, a.dataset, a.out, options, **asked, calibration=a.calibrate)
-    call = partial(call, target_error_db=target, kinds=kinds)
+    call = partial(call, antennas=_antennas(a), target_error_db=target, kinds=kinds)
     where = getattr(a, "scheduler", None)  # train has none
     with open_scheduler(where) as scheduler:
         folder = call(progress=sys.stderr.isatty(), scheduler=scheduler if where else None)

@@ -89,7 +89,8 @@ class TracedField(ADIntegrator):
     ``walls``               boolean       true      shapes other than ellipsoids attenuate
     ``frequency_hz``        float   Hz    0         carrier; 0 takes that of the walls' Sionna scene,  exposed
                                                     and is an error where walls have none
-    ``polarization``        vector        (0, 1, 0) of the antenna, receiver's frame
+    ``polarization``        vector        vertical  of the antenna, receiver's frame; by default
+                                                    the world's z axis, however the sensor is turned
     ``thickness_<name>``    float   m     0.1       slab thickness of a material ``mat-<name>`` that
                                                     is known by its BSDF's id alone, e.g.
                                                     ``thickness_itu_glass``
@@ -126,9 +127,10 @@ class TracedField(ADIntegrator):
         self.opaque_power = float(props.get("opaque_power", 0.0))
         if not 0 <= self.opaque_power < 1:
             raise InputError(f"{props.plugin_name()}: opaque_power {self.opaque_power}; give a share from 0 to below 1")
-        self.polarization = [float(c) for c in props.get("polarization", mi.ScalarVector3f(0, 1, 0))]
+        stated = props.get("polarization")
+        self.polarization = None if stated is None else [float(c) for c in stated]
         self.thickness_m = {n.removeprefix(THICKNESS): float(props[n]) for n in props if n.startswith(THICKNESS)}
-        if not np.isfinite(self.polarization).all() or not np.any(self.polarization):
+        if self.polarization is not None and not (np.isfinite(self.polarization).all() and np.any(self.polarization)):
             raise InputError(f"{props.plugin_name()}: polarization {self.polarization} is no direction")
         self._bundles, self._crossings, self._lists, self._wall_scenes = (_Kept() for _ in range(4))
 

@@ -60,7 +60,7 @@ def wall_scene(shapes: list[Any]) -> Any:
 
 
 def find_crossings(
-    scene: Any, shapes: list[Any], pose: Pose, direction: list[Any], polarization: list[float]
+    scene: Any, shapes: list[Any], pose: Pose, direction: list[Any], polarization: list[float] | None
 ) -> Crossings:
     """Trace rays through walls, straight on.
 
@@ -69,13 +69,14 @@ def find_crossings(
         shapes: its shapes.
         pose: of the receiver.
         direction: unit vectors of the rays, receiver's frame, three arrays [rays].
-        polarization: of the receiver's antenna, receiver's frame.
+        polarization: of the receiver's antenna, receiver's frame; None: along the world's z axis.
 
     Raises:
         InputError: a ray crosses more than `MOST_CROSSINGS` walls.
     """
     d = _to_world(pose, direction)
-    field = _to_world(pose, [mi.Float(c) for c in polarization])
+    vertical = mi.Vector3f(0, 0, 1)
+    field = vertical if polarization is None else _to_world(pose, [mi.Float(c) for c in polarization])
     field -= dr.dot(field, d) * d
     number = dr.zeros(mi.UInt32, max(_registry(s) for s in shapes) + 1)
     for i, shape in enumerate(shapes):

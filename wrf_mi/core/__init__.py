@@ -1,11 +1,15 @@
 """Constants, angle convention, errors and the plain types."""
 
 from .angles import azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
+from .antenna import Antenna, AntennaOptions
 from .errors import BackendError, InputError
 from .paths import Paths, load_paths, save_paths
+from .receivers import receiver_arrays, stored_receivers
 from .types import Receiver, Record, Split
 
 __all__ = [
+    "Antenna",
+    "AntennaOptions",
     "BackendError",
     "InputError",
     "Paths",
@@ -15,7 +19,9 @@ __all__ = [
     "azimuth_elevation",
     "load_paths",
     "pixel_directions",
+    "receiver_arrays",
     "rotation_matrix",
     "save_paths",
+    "stored_receivers",
     "unit_vectors",
 ]

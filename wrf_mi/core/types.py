@@ -8,23 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import FloatArray, rotation_matrix
+from .antenna import ANTENNA, Antenna
 
 IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Receiver:
-    """A receiver's pose: where its array is and how it is turned.
+    """Pose and antenna of a receiver.
 
     Attributes:
         name: as in the measurement files.
         position_m: shape [3], world frame, metres.
         orientation_xyzw: unit quaternion, receiver's frame to world.
+        antenna: of the receiver, or of each element of its array.
     """
 
     name: str
     position_m: FloatArray
     orientation_xyzw: FloatArray
+    antenna: Antenna = ANTENNA
 
     @property
     def to_world(self) -> FloatArray:
@@ -53,6 +56,7 @@ class Record:
         array_m: elements of the antenna array behind a spectrum, or of channel coefficients the antennas, [m, 3],
             receiver's frame, metres, or None.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
+        tx_antenna: antenna of the transmitter.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
             ``observation``, the downlink's, are to be predicted: [n, antennas, uplink subcarriers], complex64; or None.
         uplink_hz: frequency of each subcarrier of ``uplink``, or None.
@@ -71,6 +75,7 @@ class Record:
     frequencies_hz: FloatArray | None = None
     array_m: FloatArray | None = None
     tx_heading_rad: FloatArray | None = None
+    tx_antenna: Antenna = ANTENNA
     uplink: NDArray[np.complex64] | None = None
     uplink_hz: FloatArray | None = None
     truth: NDArray[np.float32] | NDArray[np.complex64] | None = None

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..backend import init
-from ..core import InputError, Receiver, Record, Split
+from ..core import InputError, Record, Split, receiver_arrays, stored_receivers
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.receivers import KEYS as RECEIVER_KEYS
 from ..measure import load_split, save_split
 from .config import TrainConfig, from_dict, to_dict
 from .packed import pack_params, unpack_params
@@ -38,9 +39,9 @@ from .predictor import Predictor
 from .state import FitState
 from .trainer import Progress, Trainer, check_rows, final_params, make_field
 
-FORMAT = 1
+FORMAT = 3
 """Version of ``checkpoint.npz``."""
-PACKED_FORMAT = 2
+PACKED_FORMAT = 4
 """Version of ``checkpoint.npz`` of a compressed run."""
 
 CONFIG, SPLIT, LOG, CHECKPOINT = "config.yaml", "split.npz", "log.jsonl", "checkpoint.npz"
@@ -147,14 +148,11 @@ def stored_parts(folder: Path) -> list[Path]:
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
     """Write ``checkpoint.npz``: enough to go on and enough to predict."""
-    receivers = trainer.record.receivers
     arrays = trainer.state.arrays() | {
         "format": np.asarray(FORMAT),
         "seconds": np.asarray(trainer.seconds),
         "image_size": np.asarray([trainer.height, trainer.width]),
-        "receiver_name": np.asarray([r.name for r in receivers]),
-        "receiver_position_m": np.stack([r.position_m for r in receivers]),
-        "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in receivers]),
+        **receiver_arrays(trainer.record.receivers),
     }
     write_arrays(folder / CHECKPOINT, arrays)
 
@@ -173,7 +171,7 @@ def write_packed(
     Returns:
         Its size, bytes.
     """
-    kept = ("step", "seconds", "image_size", "receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
+    kept = ("step", "seconds", "image_size", *RECEIVER_KEYS)
     arrays = {"format": np.asarray(PACKED_FORMAT)} | {key: source[key] for key in kept}
     arrays |= pack_params(params, precision)
     return write_arrays(folder / CHECKPOINT, arrays, compressed=True).stat().st_size
@@ -280,9 +278,3 @@ def load_predictor(folder: str | Path, operator: bool = True) -> Predictor:
         operator,
         path,
     )
-
-
-def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> list[Receiver]:
-    """The receivers of a checkpoint."""
-    keys = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
-    return [Receiver(str(n), p, q) for n, p, q in zip(*(arrays[k] for k in keys), strict=True)]

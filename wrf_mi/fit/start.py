@@ -41,7 +41,7 @@ def initial_gaussians(
             raise InputError(f"setting initial.paths: {record.name} states no carrier frequency; start otherwise")
         scene = open_scene(config.paths, float(record.frequencies_hz[0]))
         here = record.tx_pos_m[rows]
-        paths = trace_paths(scene, here, record.receivers).paths
+        paths = trace_paths(scene, here, record.receivers, tx_antenna=record.tx_antenna).paths
         return gaussians_from_paths(paths, here, record.receivers, config.gaussians, rng, config.opacity, config.signal)
     if config.mesh:
         # Only its geometry counts: any frequency and material will do.

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..core import InputError, Receiver, Record
+from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, prior_sd, seen_by_rows
@@ -107,9 +107,7 @@ class CsiHybrid:
             for name in Diffuse.__dataclass_fields__
         }
         arrays = {
-            "receiver.name": np.array([one.name for one in self.receivers]),
-            "receiver.position_m": np.stack([one.position_m for one in self.receivers]),
-            "receiver.orientation_xyzw": np.stack([one.orientation_xyzw for one in self.receivers]),
+            **receiver_arrays(self.receivers),
             "change": model.change,
             "chain": model.images.plane,
             "source": model.source,
@@ -126,21 +124,13 @@ class CsiHybrid:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> CsiHybrid:
         """What `arrays` returned; the scene is not needed."""
-        receivers = tuple(
-            Receiver(str(name), position, turn)
-            for name, position, turn in zip(
-                arrays["receiver.name"],
-                arrays["receiver.position_m"],
-                arrays["receiver.orientation_xyzw"],
-                strict=True,
-            )
-        )
+        receivers = stored_receivers(arrays)
         scan = Walls(*(arrays[f"scan.{name}"] for name in Walls.__dataclass_fields__))
         model = _model(
             scan,
             arrays["chain"],
             arrays["source"],
-            arrays["receiver.position_m"],
+            arrays["receiver_position_m"],
             arrays["k"],
             complex(arrays["reflection"]),
         )

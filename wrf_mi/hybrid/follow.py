@@ -11,6 +11,7 @@ step, with materials that live in the scene; `docs/hybrid.md` compares them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +19,13 @@ import drjit as dr
 import numpy as np
 from scipy.constants import speed_of_light
 
+from ..core import Antenna
+from ..core.antenna import ANTENNA, POLE
 from ..project.footprint import Pose
 from .materials import slab
 
 ALONG = 1e-12
-"""Squared sine below which a direction lies along an antenna's axis or a wall's normal: any polarisation will do."""
+"""Squared sine below which a direction lies along a wall's normal: any plane of incidence will do."""
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
@@ -80,10 +83,11 @@ class Tables:
 
 @dataclass
 class Followed:
-    """Geometry and gain of q paths, without antenna patterns.
+    """Geometry and gain of q paths.
 
     Attributes:
-        gain: lambda / (4 pi length) times interactions and polarisations (re, im), [q]; without the travelling phase.
+        gain: lambda / (4 pi length) times interactions and antennas' fields (re, im), [q]; without the travelling
+            phase.
         length_m: unfolded, [q].
         departure: unit vector leaving the transmitter, in its own frame (turned by its heading), [q] each.
         arrival: unit vector from the receiver to where the wave comes from, in the receiver's frame, [q] each.
@@ -95,18 +99,23 @@ class Followed:
     arrival: Vector
 
 
-def follow(chains: Chains, pose: Pose, tables: Tables, frequency_hz: float, upright: bool = False) -> Followed:
+def follow(
+    chains: Chains,
+    pose: Pose,
+    tables: Tables,
+    frequency_hz: float,
+    rx_antenna: Antenna = ANTENNA,
+    tx_antenna: Antenna = ANTENNA,
+) -> Followed:
     """Follow chains to a receiver. Differentiable in pose, sources, planes and materials.
-
-    Antennas are isotropic, linearly polarised: the transmitters' along the world's z axis, the receiver's along its
-    array's y axis or (``upright``) the world's z axis.
 
     Args:
         chains: q paths.
         pose: of the receiver.
         tables: of the materials.
         frequency_hz: of the carrier.
-        upright: see above.
+        rx_antenna: antenna of the receiver.
+        tx_antenna: antenna of the transmitters.
 
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
     and 5.3; slabs as `wrf_mi.hybrid.materials.slab`.
@@ -129,14 +138,16 @@ def follow(chains: Chains, pose: Pose, tables: Tables, frequency_hz: float, upri
     cosine, sine = chains.heading
     x, y, z = directions[0]
     departure = [cosine * x + sine * y, cosine * y - sine * x, z]
-    real = _theta_hat(directions[0], [zero, zero, one], [cosine, sine, zero])
+    sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, one]]
+    real = antenna_field(tx_antenna, directions[0], sent)
     imaginary = [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
     for level, before, after in zip(chains.levels, directions[:-1], directions[1:], strict=True):
         real, imaginary = _interact(level, before, after, (real, imaginary), tables, frequency_hz)
 
-    up = [zero, zero, one] if upright else [row[1] for row in pose.to_world]
-    ahead = [one, zero, zero] if upright else [row[2] for row in pose.to_world]
-    taken = _theta_hat(arrival, up, ahead)
+    world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
+    # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
+    turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
+    taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
     return Followed(
         (_dot(taken, real) * loss, _dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
@@ -173,11 +184,43 @@ def _interact(
     return out[0], out[1]
 
 
-def _theta_hat(direction: Vector, axis: Vector, reference: Vector) -> Vector:
-    """Unit vector of growing zenith angle from an antenna's axis; along the axis, the one of azimuth zero."""
-    cosine = _dot(direction, axis)
-    down = [cosine * u - a for u, a in zip(direction, axis, strict=True)]
-    return _unit_or(down, [cosine * r for r in reference])
+def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
+    """Real field vectors of an antenna in some directions, with derivatives: `wrf_mi.core.Antenna.field`.
+
+    Args:
+        antenna: pattern and polarisation.
+        direction: unit vectors, three arrays [q] of any float type, world frame.
+        axes: the antenna's x, y and z axis in the world's frame.
+
+    Returns:
+        Three arrays [q], world frame.
+    """
+    x, y, z = (_dot(direction, axis) for axis in axes)
+    square = x * x + y * y
+    pole: Any = square < POLE
+    inverse = dr.rsqrt(dr.select(pole, 1, square))
+    cosine, sine = dr.select(pole, 1, x * inverse), dr.select(pole, 0, y * inverse)
+    level = square * inverse
+    if antenna.polarization == "V":
+        own = [z * cosine, z * sine, -level]
+    else:
+        own = [-sine, cosine, dr.zeros(type(z), dr.width(z))]
+    own = [_amplitude(antenna.pattern, level, z, (cosine, sine), pole, inverse) * component for component in own]
+    return [sum(component * axis[k] for component, axis in zip(own, axes, strict=True)) for k in range(3)]
+
+
+def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, inverse: Any) -> Any:
+    """Amplitude of a pattern; ``level`` and ``z``: sine and cosine of the zenith angle, ``inverse``: 1 / level."""
+    if pattern == "iso":
+        return type(z)(1)
+    if pattern == "dipole":
+        return math.sqrt(1.5) * level
+    if pattern == "hw_dipole":
+        return dr.select(pole, 0, math.sqrt(1.643) * dr.cos(np.pi / 2 * z) * inverse)
+    width = math.radians(65)
+    vertical = dr.minimum(12 * dr.square((dr.atan2(level, z) - np.pi / 2) / width), 30)
+    level_db = dr.minimum(12 * dr.square(dr.atan2(azimuth[1], azimuth[0]) / width), 30)
+    return dr.exp(math.log(10) / 20 * (8 - dr.minimum(vertical + level_db, 30)))
 
 
 def _any_across(direction: Vector) -> Vector:

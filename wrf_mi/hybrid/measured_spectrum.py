@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 
-from ..core import InputError, Receiver, Record
+from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..receive.lags import Lags
@@ -175,9 +175,7 @@ class MeasuredSpectrumHybrid:
             "elements_m": self.elements_m,
             "frequency_hz": np.array(self.frequency_hz),
             "shape": np.array(self.shape),
-            "receiver_name": np.array([r.name for r in self.receivers]),
-            "receiver_position_m": np.stack([r.position_m for r in self.receivers]),
-            "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in self.receivers]),
+            **receiver_arrays(self.receivers),
         }
         for number, side in enumerate(self.sides):
             stored |= {f"{number}/signals/{key}": value for key, value in side.signals.arrays().items()}
@@ -188,8 +186,7 @@ class MeasuredSpectrumHybrid:
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]], scene: Any | None = None) -> MeasuredSpectrumHybrid:
         """A hybrid as `arrays` gave it; ``scene`` is not used."""
-        keys = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
-        receivers = tuple(Receiver(str(n), p, q) for n, p, q in zip(*(arrays[key] for key in keys), strict=True))
+        receivers = stored_receivers(arrays)
 
         def below(prefix: str) -> dict[str, NDArray[Any]]:
             return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .estimate import Estimate
@@ -205,9 +205,7 @@ class RssiHybrid:
         field, stops, base = self._field, self._stops, self._field.base
         heading = stops.places.heading_rad
         arrays: dict[str, Any] = {
-            "receiver.name": np.array([one.name for one in self.receivers]),
-            "receiver.position_m": np.stack([one.position_m for one in self.receivers]),
-            "receiver.orientation_xyzw": np.stack([one.orientation_xyzw for one in self.receivers]),
+            **receiver_arrays(self.receivers),
             "stop.position_m": stops.places.position_m,
             "stop.value_dbm": stops.value_dbm,
             "stop.count": stops.count,
@@ -232,13 +230,12 @@ class RssiHybrid:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> RssiHybrid:
         """What `arrays` returned; the scene is not needed: its map is in them."""
-        names = ("receiver.name", "receiver.position_m", "receiver.orientation_xyzw")
-        receivers = tuple(Receiver(str(n), p, q) for n, p, q in zip(*(arrays[k] for k in names), strict=True))
+        receivers = stored_receivers(arrays)
         traced = None
         if "map.power_dbm" in arrays:
             traced = PowerMap(*(arrays[f"map.{one.name}"] for one in fields(PowerMap)))
         transmit_dbm, frequency_hz = map(float, arrays["base"])
-        base = Base(arrays["receiver.position_m"], transmit_dbm, frequency_hz, traced)
+        base = Base(arrays["receiver_position_m"], transmit_dbm, frequency_hz, traced)
         offset, slope, factor, tx = ((float(a), float(b)) for a, b in arrays["prior.shared"])
         priors = Priors(offset, slope, factor, tx, float(arrays["prior.rx"]))
         knobs = Knobs(**{one.name: float(arrays[f"knob.{one.name}"]) for one in fields(Knobs)})

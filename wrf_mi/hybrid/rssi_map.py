@@ -76,10 +76,9 @@ def trace_map(
     spacing = max(spacing_m, float(np.sqrt(np.prod(high - low) * layers / MOST_POINTS)))
     x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
-    options = TraceOptions(
-        transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth), upright=True
-    )
-    traced = rssi_dbm(trace_paths(scene, grid.reshape(-1, 3), record.receivers, options).paths)
+    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
+    found = trace_paths(scene, grid.reshape(-1, 3), record.receivers, options, tx_antenna=record.tx_antenna)
+    traced = rssi_dbm(found.paths)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers: a floor apart is another place, and they lie wider than the neighbourhood.

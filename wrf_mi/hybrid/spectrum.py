@@ -11,14 +11,14 @@ lower the loss of validation rows, which are taken from the training rows; the l
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .estimate import Estimate
@@ -29,7 +29,7 @@ from .spectrum_rays import Things
 from .spectrum_rest import Rest
 
 Arrays = dict[str, NDArray[Any]]
-FORMAT = 1
+FORMAT = 2
 """Version of `SpectrumHybrid.arrays`."""
 AT_ONCE = 256
 """Transmitters that are predicted together: more are no faster each, and all would take three times their spectra."""
@@ -137,9 +137,8 @@ class SpectrumHybrid:
             one, parts = model.instrument, model.room.things.corners
             slabs, given, maps = model.constants.slabs, model.room.slabs, model.maps
             own: Arrays = {
-                "name": np.array(one.receiver.name),
-                "position_m": one.receiver.position_m,
-                "orientation_xyzw": one.receiver.orientation_xyzw,
+                **receiver_arrays([one.receiver]),
+                "tx_antenna": np.array(astuple(one.tx_antenna)),
                 "array_m": one.array_m,
                 "frequency_hz": np.array(one.frequency_hz),
                 "size": np.array([one.height, one.width]),
@@ -177,9 +176,9 @@ class SpectrumHybrid:
         models = []
         for index in range(int(arrays["receivers"])):
             own = {key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{index}/")}
-            receiver = Receiver(str(own["name"]), own["position_m"], own["orientation_xyzw"])
+            (receiver,), tx_antenna = stored_receivers(own), Antenna(*map(str, own["tx_antenna"]))
             height, width = (int(size) for size in own["size"])
-            instrument = Spectrometer(receiver, own["array_m"], float(own["frequency_hz"]), height, width)
+            instrument = Spectrometer(receiver, own["array_m"], float(own["frequency_hz"]), height, width, tx_antenna)
             edges = np.cumsum([0, *own["thing_faces"]])
             parts = tuple(own["triangles_m"][a:b] for a, b in pairwise(edges))
             room = Room(Things(tuple(str(name) for name in own["thing_names"]), parts), Slabs(*own["given_slabs"]))
@@ -245,7 +244,8 @@ def fit_spectrum(
         def heard(what: str, share: float, index: int = index, name: str = receiver.name) -> None:
             listen(f"{name}: {what}", (index + share) / len(record.receivers))
 
-        instrument = Spectrometer(receiver, record.array_m, float(record.frequencies_hz[0]), height, width)
+        carrier_hz, tx_antenna = float(record.frequencies_hz[0]), record.tx_antenna
+        instrument = Spectrometer(receiver, record.array_m, carrier_hz, height, width, tx_antenna)
         heard("chains of planes", 0.0)
         how = Chaining(settings.reflections, settings.passed, settings.rays, settings.chains, seed)
         model = begin(instrument, scene, how)

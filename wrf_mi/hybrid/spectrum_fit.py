@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .spectrum_gains import Slabs, gains
+from .spectrum_gains import Antennas, Slabs, gains
 from .spectrum_loss import Grid
 from .spectrum_rays import ChainTable, Met
 
@@ -72,14 +72,14 @@ class Waves:
         table: of the chains.
         tx_pos_m: transmitters [n, 3], metres.
         elements_m: of the array less its origin [m, 3], world frame, metres.
-        up: polarisation of the elements, world frame, [3].
+        antennas: of the transmitters and of the elements.
         frequency_hz: of the carrier.
     """
 
     def __init__(
-        self, table: ChainTable, tx_pos_m: FloatArray, elements_m: FloatArray, up: FloatArray, frequency_hz: float
+        self, table: ChainTable, tx_pos_m: FloatArray, elements_m: FloatArray, antennas: Antennas, frequency_hz: float
     ) -> None:
-        self.met, self.count, self._up, self._elements = table(tx_pos_m), len(tx_pos_m), up, elements_m
+        self.met, self.count, self._antennas, self._elements = table(tx_pos_m), len(tx_pos_m), antennas, elements_m
         self._hz, self.wavenumber = frequency_hz, 2 * np.pi * frequency_hz / speed_of_light
         # An image moves by twice a plane's displacement, mirrored by what reflects after it: exactly linear.
         normal = np.zeros((0, 3)) if table.surfaces is None else table.surfaces.normal
@@ -105,7 +105,7 @@ class Waves:
         met = self.met
         if path is not None:
             met = Met(*(getattr(met, name)[path] for name in ("tx", "chain", "image_m", "thing", "plane", "normal")))
-        return gains(met, constants.slabs, self._up, self._hz)
+        return gains(met, constants.slabs, self._antennas, self._hz)
 
     def steering(self, offset_m: FloatArray) -> ComplexArray:
         """Spherical wave of each path at the elements, of amplitude one at the origin: [p, m]."""

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
 from ..core.angles import FloatArray
+from ..core.antenna import MountedAntenna
 from .spectrum_rays import Met
 
 ComplexArray = NDArray[np.complex128]
 ALONG = 1e-12
-"""Squared sine below which a direction lies along an axis or a normal: any polarisation will do."""
+"""Squared sine below which a direction lies along a normal: any plane of incidence will do."""
+Antennas = tuple[MountedAntenna, MountedAntenna]
+"""Of the transmitters and of the receiver."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +59,13 @@ def coefficients(
     )
 
 
-def gains(met: Met, slabs: Slabs, up: FloatArray, frequency_hz: float) -> ComplexArray:
-    """Lambda / (4 pi length) times interactions and polarisations of each path, without the phase of travelling.
-
-    Antennas are isotropic, linearly polarised: the transmitters' along the world's z axis, the receiver's along ``up``.
+def gains(met: Met, slabs: Slabs, antennas: Antennas, frequency_hz: float) -> ComplexArray:
+    """Lambda / (4 pi length) times interactions and antennas' fields of each path, without the phase of travelling.
 
     Args:
         met: p paths.
         slabs: the objects' materials.
-        up: unit vector [3], world frame.
+        antennas: of the transmitters and of the receiver.
         frequency_hz: of the carrier.
 
     Returns:
@@ -79,7 +80,7 @@ def gains(met: Met, slabs: Slabs, up: FloatArray, frequency_hz: float) -> Comple
     for level in reversed(range(depth)):
         back = np.where(met.plane[:, level] >= 0, (directions[0] * met.normal[:, level]).sum(axis=1), 0.0)
         directions.insert(0, directions[0] - 2 * back[:, None] * met.normal[:, level])
-    field: ComplexArray = _theta_hat(directions[0], np.array([0.0, 0.0, 1.0])).astype(complex)
+    field: ComplexArray = antennas[0].field(directions[0]).astype(complex)
     for level in range(depth):
         row = np.flatnonzero(met.thing[:, level] >= 0)
         if not len(row):
@@ -94,15 +95,10 @@ def gains(met: Met, slabs: Slabs, up: FloatArray, frequency_hz: float) -> Comple
         across = _unit_or(np.cross(before, normal), _any_across(before))
         s, p = (field[row] * across).sum(axis=1), (field[row] * np.cross(across, before)).sum(axis=1)
         field[row] = (te * s)[:, None] * across + (tm * p)[:, None] * np.cross(across, after)
-    taken = _theta_hat(arrival, up)
+    taken = antennas[1].field(arrival)
     loss = speed_of_light / frequency_hz / (4 * np.pi) / length
     gain: ComplexArray = (taken * field).sum(axis=1) * loss
     return gain
-
-
-def _theta_hat(direction: FloatArray, axis: FloatArray) -> FloatArray:
-    """Unit vector of growing zenith angle from an antenna's axis."""
-    return _unit_or((direction @ axis)[:, None] * direction - axis, _any_across(direction))
 
 
 def _any_across(direction: FloatArray) -> FloatArray:

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from ..core import Receiver
+from ..core import Antenna, Receiver
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..receive.array import bartlett_spectrum, minmax_scale
 from .materials import read_materials
 from .spectrum_fit import Constants, Maps, Waves, fit_constants, fit_maps, map_places, scan_offsets
-from .spectrum_gains import Slabs
+from .spectrum_gains import Antennas, Slabs
 from .spectrum_loss import Grid
 from .spectrum_rays import ChainTable, Met, Things, find_chains, opened
 from .spectrum_rest import LENGTHS, Rest
@@ -43,6 +44,7 @@ class Spectrometer:
         frequency_hz: of the carrier.
         height: of a spectrum.
         width: of a spectrum.
+        tx_antenna: antenna of the transmitters.
     """
 
     receiver: Receiver
@@ -50,6 +52,13 @@ class Spectrometer:
     frequency_hz: float
     height: int
     width: int
+    tx_antenna: Antenna = ANTENNA
+
+    @property
+    def antennas(self) -> Antennas:
+        """Antennas of the transmitters and of the elements."""
+        receiver = self.receiver
+        return self.tx_antenna.mounted(), receiver.antenna.mounted(receiver.orientation_xyzw)
 
     @property
     def elements_m(self) -> FloatArray:
@@ -142,7 +151,7 @@ class SpectrumModel:
     def waves(self, tx_pos_m: FloatArray) -> Waves:
         """Waves of transmitters [n, 3]."""
         one = self.instrument
-        return Waves(self.table, tx_pos_m, one.elements_m, one.receiver.to_world[:, 1], one.frequency_hz)
+        return Waves(self.table, tx_pos_m, one.elements_m, one.antennas, one.frequency_hz)
 
     def factor(self, met: Met) -> ComplexArray:
         """Amplitude of each path beside its gain, [p]."""
@@ -301,7 +310,7 @@ class Fit:
             tx,
             one.receiver.position_m,
             one.elements_m,
-            one.receiver.to_world[:, 1],
+            one.antennas,
             one.frequency_hz,
             self.shapes[rows],
             one.grid,

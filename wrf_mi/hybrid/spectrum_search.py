@@ -18,7 +18,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .spectrum_gains import Slabs, coefficients, gains
+from .spectrum_gains import Antennas, Slabs, coefficients, gains
 from .spectrum_loss import Grid
 from .spectrum_rays import Met
 from .spectrum_sheets import KINDS, Frame, Known, Sheet
@@ -62,7 +62,7 @@ class Search:
         tx_pos_m: transmitters [n, 3], metres.
         receiver_m: the array's origin [3].
         elements_m: its elements less that [m, 3], world frame.
-        up: their polarisation [3].
+        antennas: of the transmitters and of the elements.
         frequency_hz: of the carrier.
         shapes: the rows' spectra, see `Grid.shapes`.
         grid: of these.
@@ -75,13 +75,14 @@ class Search:
         tx_pos_m: FloatArray,
         receiver_m: FloatArray,
         elements_m: FloatArray,
-        up: FloatArray,
+        antennas: Antennas,
         frequency_hz: float,
         shapes: FloatArray,
         grid: Grid,
         known: Known,
     ) -> None:
-        self.frames, self._tx, self._rx, self._elements, self._up = frames, tx_pos_m, receiver_m, elements_m, up
+        self.frames, self._tx, self._rx, self._elements = frames, tx_pos_m, receiver_m, elements_m
+        self._antennas = antennas
         self._hz, self._shapes, self._grid, self._known = frequency_hz, shapes, grid, known
         self.wavelength_m = speed_of_light / frequency_hz
         self._passed = []
@@ -102,7 +103,7 @@ class Search:
         length = np.linalg.norm(image, axis=1)
         distance = np.linalg.norm(image[:, None] - self._elements, axis=-1)
         wave = length[:, None] / distance * np.exp(-2j * np.pi / self.wavelength_m * distance)
-        gain = [gains(met, Slabs(*(np.array([v]) for v in kind)), self._up, self._hz) for kind in KINDS[:kinds]]
+        gain = [gains(met, Slabs(*(np.array([v]) for v in kind)), self._antennas, self._hz) for kind in KINDS[:kinds]]
         near = float(self._rx @ normal - offset_m)
         fine = near * height > 0  # both on one side
         share = near / np.where(fine, near + height, 1.0)
@@ -167,7 +168,7 @@ class Search:
         rows = min(len(signals), SCANNED_ROWS)
         signals, shapes, known = signals[:rows], self._shapes[:rows], self._known.select(rows)
         some = Search(
-            self.frames, self._tx[:rows], self._rx, self._elements, self._up, self._hz, shapes, self._grid, known
+            self.frames, self._tx[:rows], self._rx, self._elements, self._antennas, self._hz, shapes, self._grid, known
         )  # fmt: skip
         before = self._grid.loss(signals, shapes)[0]
         candidates: list[tuple[float, int, float, FloatArray]] = []

@@ -25,8 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import on_device
-from ..core import InputError, Receiver
+from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..project.footprint import Pose
 from ..trace import TraceOptions, TraceResult, trace_paths
@@ -50,6 +51,7 @@ class TracedOptions:
             they would add is left to the learned side.
         pattern_degree: of the trainable factors of both antennas' patterns, 0 for none (see `wrf_mi.hybrid.patterns`).
         gain: amplitude by which every path is multiplied at first: from the channel's units to the instrument's.
+        tx_antenna: antenna of the transmitters, turned with their heading; the receiver states its own.
         search_again_m: how far the receiver may move before paths are searched again; None: a quarter of a wavelength.
     """
 
@@ -57,6 +59,7 @@ class TracedOptions:
     pattern_degree: int = 0
     gain: float = 1.0
     search_again_m: float | None = None
+    tx_antenna: Antenna = ANTENNA
 
     def __post_init__(self) -> None:
         """Reject what cannot be followed.
@@ -201,7 +204,8 @@ class TracedField:
             chains = chains.select(row * self._each + slot % self._each)
         tables = Tables(*self._materials.tables(parameters, Float64), *self._constants)
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
-        followed = follow(chains, pose, tables, self.frequency_hz, self.options.trace.upright)
+        antennas = self.receiver.antenna, self.options.tx_antenna
+        followed = follow(chains, pose, tables, self.frequency_hz, *antennas)
         # Evaluated here, the kernels of the reverse pass read it instead of computing it each.
         dr.eval(followed)
         amplitude, phase = Float64(np.log(self.options.gain)), Float64(0)
@@ -220,7 +224,8 @@ class TracedField:
 
     def _search(self, here_m: FloatArray) -> None:
         receiver = replace(self.receiver, position_m=here_m)
-        self._take(trace_paths(self.scene, self.tx_pos_m, receiver, self.options.trace), here_m)
+        antenna = self.options.tx_antenna
+        self._take(trace_paths(self.scene, self.tx_pos_m, receiver, self.options.trace, tx_antenna=antenna), here_m)
         self.searches += 1
 
     def _take(self, traced: TraceResult, here_m: FloatArray) -> None:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from ..core import InputError
+from ..core import Antenna, InputError
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
+from ..core.antenna import ANTENNA
 from ..core.files import one_line, text_lines
 from ..core.types import IntArray
 
 POSITIONS = "tx_pos.csv"
 INDEX_FILES = ("train_index.txt", "test_index.txt")
+ANTENNA_WORDS = ("pattern", "polarization", "frame")
+TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
+"""What may be stated of a transmitter's antenna: its frame is always the world, turned with the heading."""
 SINGLE_MAX = float(np.finfo(np.float32).max)
 """Largest number that single precision holds, in which everything computes."""
 DIGITS = 18
@@ -95,6 +100,33 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
             f"{path}: {one_line(name)}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w"
         )
     return orientation
+
+
+def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS) -> Antenna:
+    """An antenna from YAML: a mapping with some of ``pattern``, ``polarization`` and ``frame``; None: the default.
+
+    Args:
+        path: of the file, for messages.
+        name: of the entry, for messages.
+        value: from the file.
+        words: keys that may be given.
+
+    Raises:
+        InputError: anything else.
+    """
+    if value is None:
+        return ANTENNA
+    if not isinstance(value, dict) or not set(value) <= set(words):
+        raise InputError(f"{path}: {one_line(name)} is {shown(value)}; give some of {', '.join(words)}")
+    try:
+        return Antenna(**value)
+    except InputError as error:
+        raise InputError(f"{path}: {one_line(name)}: {error}") from None
+
+
+def antenna_entry(antenna: Antenna) -> dict[str, str]:
+    """What `read_antenna` reads: all that is not the default."""
+    return {key: value for key, value in asdict(antenna).items() if value != getattr(ANTENNA, key)}
 
 
 def read_positions(path: Path) -> FloatArray:

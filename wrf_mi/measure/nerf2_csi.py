@@ -9,7 +9,8 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, cl
 - ``train_index.txt``, ``test_index.txt``, optional: samples, counted from 0, one per line. Both or neither.
 
 Optional and ours: in ``base-station.yml`` ``orientation`` of the array (unit quaternion x, y, z, w, array's frame to
-world) and ``frequencies_hz`` of all subcarriers; ``tx_pos.csv`` with the positions of the moving ends;
+world), ``frequencies_hz`` of all subcarriers, and ``antenna`` and ``tx_antenna`` as in ``gateway_info.yml`` (see
+`wrf_mi.measure.spectrum_folder`); ``tx_pos.csv`` with the positions of the moving ends;
 ``downlink_truth.npy``, the downlink without noise [n, antennas, subcarriers / 2], where it is synthetic.
 
 NeRF2 divides all coefficients, test rows included, by the largest magnitude among them, and takes each antenna for a
@@ -33,8 +34,11 @@ from ..core.files import atomic_folder, one_line
 from .folder_files import (
     INDEX_FILES,
     POSITIONS,
+    TX_ANTENNA_WORDS,
+    antenna_entry,
     fits_single,
     numbers_of,
+    read_antenna,
     read_official,
     read_positions,
     read_yaml,
@@ -94,6 +98,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         uplink=channel[:, :, :half],
         uplink_hz=None if frequencies is None else frequencies[:half],
         truth=_read_truth(folder / TRUTH, (n, antennas, half)),
+        tx_antenna=read_antenna(station, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS),
         source=str(folder),
     )
 
@@ -124,6 +129,8 @@ def write_nerf2_csi(
     }
     if record.uplink_hz is not None and record.frequencies_hz is not None:
         info["frequencies_hz"] = [*record.uplink_hz.tolist(), *record.frequencies_hz.tolist()]
+    antennas = {"antenna": antenna_entry(receiver.antenna), "tx_antenna": antenna_entry(record.tx_antenna)}
+    info |= {key: value for key, value in antennas.items() if value}
     with atomic_folder(Path(path), replace) as part:
         np.save(part / CHANNELS, np.concatenate([up, down[0]], axis=-1).astype(np.complex64))
         text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
@@ -178,7 +185,8 @@ def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> tuple[Rece
         text = f"{len(elements)} positions in base_station, but {CHANNELS} has {antennas} antennas"
         raise InputError(f"{path}: {text}; give one for each")
     orientation = unit_quaternion(path, "base_station", info.get("orientation", list(IDENTITY)))
-    receiver = Receiver("base-station", elements.mean(axis=0), orientation)
+    antenna = read_antenna(path, "antenna", info.get("antenna"))
+    receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
     return receiver, (elements - receiver.position_m) @ receiver.to_world
 
 

@@ -4,8 +4,10 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
 
 - ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
   metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world). Optional and ours: ``frequency_hz``
-  of the carrier, and ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``, a list of x, y, z
-  in the array's frame. ``dataset_name`` and other plain values beside them are not used.
+  of the carrier, one for all receivers; ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``,
+  a list of x, y, z in the array's frame; ``antenna`` in each receiver's entry, and ``tx_antenna`` beside these, with
+  ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with ``frame`` too; see `wrf_mi.core.Antenna`; the
+  default is isotropic and vertical in the world). ``dataset_name`` and other plain values beside them are not used.
 - ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
 - ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
   row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
@@ -34,17 +36,23 @@ from ..core.types import IntArray
 from .folder_files import (
     INDEX_FILES,
     POSITIONS,
+    TX_ANTENNA_WORDS,
+    antenna_entry,
     finite_numbers,
+    read_antenna,
     read_official,
     read_positions,
     read_yaml,
+    shown,
     unit_quaternion,
     whole_number,
     write_lines,
     write_positions,
 )
 
-GATEWAYS = "gateway_info.yml"
+CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
+"""Keys under which a file may state carriers."""
+GATEWAYS, TX_ANTENNA = "gateway_info.yml", "tx_antenna"
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -82,6 +90,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
         frequencies_hz=_frequency(gateways, info),
         array_m=_array(gateways, info),
+        tx_antenna=read_antenna(gateways, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS),
         source=str(folder),
     )
 
@@ -103,12 +112,15 @@ def write_spectrum_folder(
         extra: further files to put into the folder, by their place in it.
 
     Raises:
-        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1.
+        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1 or several carriers.
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
     if record.task != "spectrum" or not (record.observation.min() >= 0 and record.observation.max() <= 1):
         raise InputError(f"{path}: {record.name} holds no spectra within 0..1; scale them first")
+    if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
+        text = f"{record.name} has {len(record.frequencies_hz)} carriers, and {GATEWAYS} states one"
+        raise InputError(f"{path}: {text}; write a folder for each")
     grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
     with atomic_folder(Path(path), replace) as part:
         several = len(record.receivers) > 1
@@ -117,11 +129,8 @@ def write_spectrum_folder(
             images.mkdir(parents=True)
             for row, image in enumerate(spectra, start=1):
                 Image.fromarray(image).save(images / f"{row:05d}.png")
-        poses = {
-            r.name: {"position": r.position_m.tolist(), "orientation": r.orientation_xyzw.tolist()}
-            for r in record.receivers
-        }
-        content = {"dataset_name": record.name, **poses, **_instrument(record)}
+        entries = {receiver.name: _entry(receiver) for receiver in record.receivers}
+        content = {"dataset_name": record.name, **entries, **_instrument(record)}
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
         write_positions(part / POSITIONS, record.tx_pos_m)
@@ -154,8 +163,16 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     return folds
 
 
+def _entry(receiver: Receiver) -> dict[str, Any]:
+    pose = {"position": receiver.position_m.tolist(), "orientation": receiver.orientation_xyzw.tolist()}
+    antenna = antenna_entry(receiver.antenna)
+    return pose | ({"antenna": antenna} if antenna else {})
+
+
 def _instrument(record: Record) -> dict[str, Any]:
     known: dict[str, Any] = {}
+    if antenna := antenna_entry(record.tx_antenna):
+        known[TX_ANTENNA] = antenna
     if record.frequencies_hz is not None:
         known["frequency_hz"] = float(record.frequencies_hz[0])
     if record.array_m is not None:
@@ -164,15 +181,27 @@ def _instrument(record: Record) -> dict[str, Any]:
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
-    if "frequency_hz" not in info:
-        return None
-    try:
-        frequency_hz = float(info["frequency_hz"])  # YAML reads 920e6 as text
-    except (TypeError, ValueError):
-        frequency_hz = np.nan
-    if not 0 < frequency_hz < np.inf:
-        raise InputError(f"{path}: frequency_hz is {info['frequency_hz']!r}; give the carrier in Hz, such as 920e6")
-    return np.array([frequency_hz])
+    """The one carrier, wherever the file states it: for all receivers, or in the entries of these."""
+    stated = {key: info[key] for key in CARRIER_KEYS if key in info}
+    for name, entry in info.items():
+        if isinstance(entry, dict):
+            stated |= {f"{name}: {key}": entry[key] for key in CARRIER_KEYS if key in entry}
+    carriers: dict[float, str] = {}
+    for where, value in stated.items():
+        for one in value if isinstance(value, list) else [value]:
+            try:
+                frequency_hz = float(one)  # YAML reads 920e6 as text
+            except (TypeError, ValueError):
+                frequency_hz = np.nan
+            if not 0 < frequency_hz < np.inf:
+                text = f"{one_line(where)} is {shown(value)}; give the carrier in Hz, such as 920e6"
+                raise InputError(f"{path}: {text}")
+            carriers[frequency_hz] = where
+    if len(carriers) > 1:
+        (a, first), (b, second) = list(carriers.items())[:2]
+        text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this layout has one"
+        raise InputError(f"{path}: {text}; make a folder for each")
+    return np.array(list(carriers)) if carriers else None
 
 
 def _array(path: Path, info: dict[Any, Any]) -> FloatArray | None:
@@ -194,7 +223,7 @@ def _array(path: Path, info: dict[Any, Any]) -> FloatArray | None:
 
 
 def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
-    poses = {key: value for key, value in info.items() if isinstance(value, dict) and key != "array"}
+    poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in ("array", TX_ANTENNA)}
     if not poses:
         raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
     receivers = []
@@ -202,7 +231,9 @@ def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
         if not isinstance(name, str) or Path(name).name != name:
             raise InputError(f"{path}: {name!r} cannot name a folder; call receivers gateway1, gateway2, ...")
         position = finite_numbers(path, f"{name}: position", pose.get("position"), 3)
-        receivers.append(Receiver(name, position, unit_quaternion(path, name, pose.get("orientation"))))
+        orientation = unit_quaternion(path, name, pose.get("orientation"))
+        antenna = read_antenna(path, f"{name}: antenna", pose.get("antenna"))
+        receivers.append(Receiver(name, position, orientation, antenna))
     return tuple(receivers)
 
 

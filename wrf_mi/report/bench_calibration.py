@@ -20,7 +20,7 @@ from ..trace.calibrate import OFFSETS_ALONE, CalibrationOptions, absolute_error_
 
 HEIGHT_M = 2.7
 """The ceiling is not in the data; one receiver is 2.62 m above the floor."""
-OPTIONS = TraceOptions(transmission=True, max_depth=6, max_reflections=2, upright=True)
+OPTIONS = TraceOptions(transmission=True, max_depth=6, max_reflections=2)
 """The layout has two lines for a wall, so three walls are six surfaces."""
 WALLS_M: Mapping[str, Sequence[float]] = {"itu_plasterboard": (0.02, 0.05, 0.1)}
 """Thickness of one of a wall's two lines; the better one on held-out places is taken."""

@@ -185,7 +185,7 @@ def _tracer(record: Record, rows: IntArray, scene: Any, place_m: FloatArray, see
     """Channels by `wrf_mi.trace`, perfect mirrors, up to two reflections."""
     assert record.frequencies_hz is not None
     receiver: Receiver = replace(record.receivers[0], position_m=place_m)
-    options = TraceOptions(max_depth=2, rays=RAYS, seed=seed, upright=True)
+    options = TraceOptions(max_depth=2, rays=RAYS, seed=seed)
     paths = trace_paths(scene, record.tx_pos_m[rows], receiver, options).paths
     k = 2 * np.pi * record.frequencies_hz / speed_of_light
     gain = np.exp(-1j * k * paths.length_m[:, None]) / (2 * k * paths.length_m[:, None])

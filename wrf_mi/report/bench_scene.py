@@ -98,7 +98,7 @@ def scan_to_paths(
         memory = peak_memory_mb()
         other = open_scene(made.folder, frequency_hz)
         end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
-        options = TraceOptions(max_depth=2, rays=rays, seed=seed, upright=True)
+        options = TraceOptions(max_depth=2, rays=rays, seed=seed)
         truth, ours = (trace_paths(scene, chosen, end, options).paths for scene in (original, other))
     found = match(truth, ours)
     shares = {

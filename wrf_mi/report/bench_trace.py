@@ -62,7 +62,7 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
     scene = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     access_point = Receiver("access-point", data["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0]))
     start = time.perf_counter()
-    options = TraceOptions(max_depth=2, rays=rays, seed=seed, upright=True)
+    options = TraceOptions(max_depth=2, rays=rays, seed=seed)
     # The moving end is the transmitter, by reciprocity: MATLAB's last point is our first.
     trace = trace_paths(scene, data["rx_pos"], access_point, options)
     seconds = time.perf_counter() - start

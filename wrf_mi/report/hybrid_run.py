@@ -6,7 +6,8 @@ As `wrf_mi.report.fitted_run` has it, with ``hybrid.npz`` as the model, ``scene`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from ..baselines.checks import check_rows
 from ..baselines.method import Listen
-from ..core import InputError, Record, Split
+from ..core import Antenna, AntennaOptions, InputError, Record, Split
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA, AS_STATED
 from ..core.types import IntArray
 from ..fit.config import with_settings
 from ..fit.folder import check_new, stated_config
@@ -26,6 +28,8 @@ from ..trace import load_record, open_scene
 from ..trace.tracer import instrument_of
 from .fitted_run import FittedConfig, FittedRun, opened
 from .run_folder import stated_model
+
+logger = logging.getLogger(__name__)
 
 MODEL = "hybrid"
 FITTED = "hybrid.npz"
@@ -40,11 +44,13 @@ class HybridConfig(FittedConfig):
         scene: name, scene folder, Mitsuba XML or mesh; None: without a mesh.
         material: of a bare mesh, or None.
         settings: those of the model that were changed, as ``key=value``.
+        antennas: stated in place of the data's.
     """
 
     scene: str | None
     material: str | None
     settings: tuple[str, ...]
+    antennas: AntennaOptions = field(default=AS_STATED, kw_only=True)
 
 
 class HybridRun(FittedRun[HybridConfig, HybridModel]):
@@ -60,7 +66,10 @@ class HybridRun(FittedRun[HybridConfig, HybridModel]):
         Raises:
             InputError: a task that no hybrid serves, a scene that cannot be opened, or a material without one.
         """
-        super().__init__(folder, config, record)
+        if config.antennas and (config.scene is None or record.task == "csi"):
+            why = "without --scene nothing is traced" if config.scene is None else "its channels are of isotropic ones"
+            raise InputError(f"{MODEL} on {record.name}: takes no antenna options: {why}")
+        super().__init__(folder, config, config.antennas.of(record))
         self._kind = kind_of(record, config.scene is not None)
         self._settings = with_settings(self._kind.settings(), config.settings)
         if config.n_train == 0 and config.scene is None:
@@ -68,8 +77,13 @@ class HybridRun(FittedRun[HybridConfig, HybridModel]):
         self._scene: Any | None = None
         if config.scene is not None:
             self._scene = open_scene(config.scene, instrument_of(record).carrier_hz, material=config.material)
+            if record.task == "csi" and any(one != ANTENNA for one in self._antennas()):
+                logger.warning("%s: the hybrid for channels takes all antennas to be isotropic", record.name)
         elif config.material is not None:
             raise InputError("--material belongs to a bare mesh; give it with --scene")
+
+    def _antennas(self) -> list[Antenna]:
+        return [self.record.tx_antenna, *(receiver.antenna for receiver in self.record.receivers)]
 
     @classmethod
     def stored(cls, folder: Path) -> HybridRun:
@@ -125,6 +139,7 @@ def read_hybrid_config(folder: Path) -> HybridConfig:
         names = ("dataset", "scene", "material", "split", "n_train", "seed")
         kept = {name: content[name] for name in names}
         kept["deterministic"] = bool(content.get("deterministic"))
+        kept["antennas"] = AntennaOptions(**content["antennas"])
         return HybridConfig(**kept, settings=tuple(content["settings"]))
 
 
@@ -138,6 +153,7 @@ def train_hybrid(
     n_train: int | float | None = None,
     seed: int = 0,
     settings: tuple[str, ...] = (),
+    antennas: AntennaOptions = AS_STATED,
     deterministic: bool = False,
     listen: Listen = lambda what, share: None,
 ) -> Path:
@@ -152,6 +168,7 @@ def train_hybrid(
         n_train: number or fraction of the training rows to use; None: all; 0: none, physics alone (needs a scene).
         seed: of split and fit.
         settings: ``key=value`` of the model (see `wrf_mi.hybrid.models`).
+        antennas: patterns and polarisations in place of what the data state; with a scene.
         deterministic: on one thread of the CPU, so bit-identical from run to run.
         listen: hears what is being done and the share of it that is done.
 
@@ -164,7 +181,9 @@ def train_hybrid(
     check_new(Path(out))
     record, source = opened(dataset)
     place = None if scene is None else str(scene)
-    config = HybridConfig(source, split, n_train, seed, place, material, settings, deterministic=deterministic)
+    config = HybridConfig(
+        source, split, n_train, seed, place, material, settings, antennas=antennas, deterministic=deterministic
+    )
     run = HybridRun(Path(out), config, record)
     # Without training rows the split keeps them for the references beside the model, which need some.
     splits = make_splits(record, split, seed, None if n_train == 0 else n_train)

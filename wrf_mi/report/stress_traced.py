@@ -68,7 +68,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     with tempfile.TemporaryDirectory() as work:
         parts = {name: ("itu_metal", wall) for name, wall in _sheets(size_m).items()}
         scene = open_scene(write_scene(Path(work), parts, "Hall of metal"), frequency_hz)
-        options = TraceOptions(max_depth=2, rays=1 << 14, upright=True)
+        options = TraceOptions(max_depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
         delays_s = _sionna_delays(scene, tx, rx)
     worst, single, own = Worst(), Worst(), Worst()
@@ -166,7 +166,7 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
         }
         # The calculator is asked again in the reverse pass, when the materials have to be these.
         kept.enter_context(with_materials(scene, constants))
-        return field_of(scene, buffer, *traced.ends(), traced.rays, loop_mode="evaluated")
+        return field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
 
     kept = ExitStack()
     reports: dict[str, Reported] = {

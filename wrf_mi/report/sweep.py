@@ -18,14 +18,14 @@ import re
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core import InputError, Split
+from ..core import AntennaOptions, InputError, Split
 from ..core.files import one_line, write_atomically
 from ..fit.config import TrainConfig, with_settings
 from ..fit.schedule import plan
@@ -55,6 +55,7 @@ OPTIONS = (
     "reflections",
     "rays",
     "calibrate",
+    *(one.name.replace("_", "-") for one in fields(AntennaOptions)),
 )
 """What may vary beside settings: DATASET and the options of ``wrf-mi train``."""
 SHARED = "sweep.json"

@@ -23,8 +23,9 @@ import yaml
 from numpy.typing import NDArray
 
 from ..baselines.checks import check_rows
-from ..core import InputError, Record, Split
+from ..core import AntennaOptions, InputError, Record, Split
 from ..core.angles import FloatArray
+from ..core.antenna import AS_STATED
 from ..core.files import write_atomically
 from ..core.types import IntArray
 from ..fit.folder import CONFIG, SPLIT, check_new, load_rows, part_folders, stated_config, stored_parts, versions
@@ -35,6 +36,7 @@ from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_tra
 from ..trace.calibrate import CalibrationOptions, calibrate
 from ..trace.calibration import Calibration, calibrated_rssi, load_calibration, save_calibration
 from ..trace.offsets import fit_offsets
+from ..trace.polarization import warn_of_cross_polarization
 from ..trace.result import join_traces
 from ..trace.solve import TARGETS_AT_ONCE
 from ..trace.target import CHOSEN_KINDS, choose_options
@@ -66,6 +68,7 @@ class TraceConfig:
         seed: of the split.
         options: what is traced.
         calibration: what is fitted to the training rows beside offsets, a key of `CALIBRATIONS`; None: nothing.
+        antennas: stated in place of the data's.
     """
 
     dataset: str
@@ -76,6 +79,15 @@ class TraceConfig:
     seed: int
     options: TraceOptions
     calibration: str | None = None
+    antennas: AntennaOptions = AS_STATED
+
+    def record(self) -> Record:
+        """The data set, with the antennas that were stated.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        return self.antennas.of(load_record(self.dataset))
 
 
 def is_traced(folder: Path) -> bool:
@@ -91,7 +103,8 @@ def read_trace_config(folder: Path) -> TraceConfig:
     """
     names = ("dataset", "scene", "material", "split", "n_train", "seed", "calibration")
     with stated_config(folder, "trace") as content:
-        return TraceConfig(**{name: content[name] for name in names}, options=TraceOptions(**content["options"]))
+        options, antennas = TraceOptions(**content["options"]), AntennaOptions(**content["antennas"])
+        return TraceConfig(**{name: content[name] for name in names}, options=options, antennas=antennas)
 
 
 def trace_run(
@@ -105,6 +118,7 @@ def trace_run(
     n_train: int | float | None = None,
     seed: int = 0,
     calibration: str | None = None,
+    antennas: AntennaOptions = AS_STATED,
     target_error_db: float | None = None,
     kinds: Sequence[str] = CHOSEN_KINDS,
     progress: bool = False,
@@ -126,6 +140,7 @@ def trace_run(
         seed: of the split. The rays have theirs in ``options``.
         calibration: what to fit to the training rows by gradients, beside offsets: ``"patterns"`` of the antennas,
             or ``"all"``, materials too (a step takes fifty times as long). Signal strengths alone.
+        antennas: patterns and polarisations in place of what the data state.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters (`wrf_mi.trace.target`);
             None: ``options`` as they are.
@@ -145,6 +160,7 @@ def trace_run(
     check_new(folder)
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
+    record = antennas.of(record)
     splits = make_splits(record, split, seed, n_train)
     if calibration is not None and calibration not in CALIBRATIONS:
         raise InputError(f"calibration {calibration!r}: unknown; choose from {', '.join(CALIBRATIONS)}")
@@ -152,22 +168,21 @@ def trace_run(
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     for rows in splits:
         check_rows(record, rows)
-    config = TraceConfig(source, str(scene), material, split, n_train, seed, options or TraceOptions(), calibration)
+    given = options or TraceOptions()
+    config = TraceConfig(source, str(scene), material, split, n_train, seed, given, calibration, antennas)
     tracer = RayTracer(scene, instrument_of(record), config.options, material)
     choice = None
     if target_error_db is not None:
         here = record.tx_pos_m, record.receivers
         spectra = tracer.instrument.observe if record.task == "spectrum" else None
-        choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds, spectra)
-        # The instrument's own needs are the tracer's business: only what was chosen is taken over.
-        chosen = {name: getattr(choice.options, name) for name in ("max_depth", "rays", *CHOSEN_KINDS)}
-        config = replace(config, options=replace(config.options, **chosen))
-        choice = replace(choice, options=config.options)
+        choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds, spectra, record.tx_antenna)
+        config = replace(config, options=choice.options)
         tracer = RayTracer(scene, instrument_of(record), config.options, material)
 
     start = time.perf_counter()
     traced = _trace(tracer, record.tx_pos_m, config, progress, scheduler)
     seconds = time.perf_counter() - start
+    warn_of_cross_polarization(traced, tracer.scene)
     folder.mkdir(parents=True, exist_ok=True)
     try:
         save_trace(folder / PATHS, traced)
@@ -228,7 +243,7 @@ def evaluate_traced(folder: Path, split: str | None = None) -> dict[str, Any]:
         InputError: not a traced run, or files in it that are missing or damaged.
     """
     config = read_trace_config(folder)
-    record = load_record(config.dataset)
+    record = config.record()
     traced = load_trace(folder / PATHS)
     tracer = _tracer_of(config, traced, instrument_of(record))
     if split is None:
@@ -261,7 +276,7 @@ class TracedRun:
             InputError: not a traced run, or one over several splits whose offsets differ.
         """
         config = read_trace_config(folder)
-        self._record = record = load_record(config.dataset)
+        self._record = record = config.record()
         self._instrument = instrument = instrument_of(record)
         traced = load_trace(folder / PATHS)
         self._tracer = _tracer_of(config, traced, instrument)

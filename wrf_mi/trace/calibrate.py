@@ -285,7 +285,7 @@ class _Fit:
 
         power = batch.power
         if self.materials:
-            field = field_of(self.scene, batch.buffer, *self.trace.ends(), self.trace.rays, loop_mode="evaluated")
+            field = field_of(self.scene, batch.buffer, self.trace.ends(), self.trace.rays, loop_mode="evaluated")
             power = path_power(field)
         decibel, shrink = dr.zeros(mi.Float, dr.width(batch.pair)), mi.Float(0)
         for k, harmonic in enumerate(batch.tx_harmonics):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..core import InputError
-from ..core.angles import FloatArray, rotation_matrix
+from ..core.angles import FloatArray
+from ..core.antenna import MountedAntenna
 from .buffer import Legs, to_buffer
 from .options import TraceOptions
 from .surfaces import Surfaces
@@ -20,27 +22,41 @@ from .surfaces import Surfaces
 PATHS_AT_ONCE = 1 << 19
 """Paths of one call of the field calculator, which takes some 300 bytes per path and interaction."""
 
-# The array's axes (x, y, z) in those of a Sionna RT device, whose arrays lie in y-z with boresight +x:
-# array x = device y, array y = device z, array z = device x. A cyclic change, so a proper rotation.
-_DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
-UPRIGHT = (0.0, 0.0, 0.0)
-"""Sionna RT's angles of a device whose antenna is polarised along the world's z axis."""
+@dataclass(frozen=True)
+class Devices:
+    """Devices of one side of a trace, as Sionna RT's field calculator takes them.
+
+    Attributes:
+        position_m: shape [n, 3], metres.
+        antennas: one for each, or one for all.
+    """
+
+    position_m: FloatArray
+    antennas: tuple[MountedAntenna, ...]
+
+    @property
+    def angles(self) -> FloatArray:
+        """Sionna RT's orientation of each device [n, 3] (alpha, beta, gamma; rad)."""
+        angles = np.array([sionna_orientation(one.to_world) for one in self.antennas])
+        return np.broadcast_to(angles, (len(self.position_m), 3))
 
 
-def sionna_orientation(orientation_xyzw: ArrayLike) -> tuple[float, float, float]:
-    """Sionna RT's angles (alpha, beta, gamma; rad) of a device whose array has the given orientation.
+Ends = tuple[Devices, Devices]
+"""Sources and targets of a search, or transmitters and receivers."""
 
-    The one place that turns our arrays (x-y plane, boresight +z) into Sionna RT's (y-z plane, boresight +x).
+
+def sionna_orientation(to_world: ArrayLike) -> tuple[float, float, float]:
+    """Sionna RT's orientation (alpha, beta, gamma; rad) of a device.
 
     Args:
-        orientation_xyzw: unit quaternion, array's frame to world.
+        to_world: rotation [3, 3] from the device's frame, whose boresight is +x, to the world's; see
+            `wrf_mi.core.Antenna.to_world`.
     """
-    device_to_world = rotation_matrix(orientation_xyzw) @ _DEVICE_TO_ARRAY
     with warnings.catch_warnings():
-        # Of an array that looks straight up or down many angles are right, and any of them will do.
+        # Of a device that looks straight up or down many angles are right, and any of them will do.
         warnings.filterwarnings("ignore", "Gimbal lock")
-        alpha, beta, gamma = Rotation.from_matrix(device_to_world).as_euler("ZYX")
+        alpha, beta, gamma = Rotation.from_matrix(to_world).as_euler("ZYX")
     return float(alpha), float(beta), float(gamma)
 
 
@@ -56,10 +72,8 @@ def point_array(points: FloatArray) -> Any:
 def field_of(
     scene: Any,
     buffer: Any,
-    ends_m: tuple[FloatArray, FloatArray],
-    angles: tuple[FloatArray, FloatArray],
+    ends: Ends,
     rays: int,
-    pattern: str = "iso",
     loop_mode: Literal["symbolic", "evaluated"] = "symbolic",
 ) -> tuple[Any, Any]:
     """Complex gains of paths as Dr.Jit arrays, differentiable in the materials with ``loop_mode="evaluated"``.
@@ -67,10 +81,8 @@ def field_of(
     Args:
         scene: ``sionna.rt.Scene``.
         buffer: p paths from source to target, as `wrf_mi.trace.buffer.to_buffer` makes it; may be used again.
-        ends_m: positions of sources [n, 3] and of targets [m, 3].
-        angles: their orientations, as `sionna_orientation` gives them.
+        ends: sources and targets.
         rays: that were shot per source, for diffuse reflections.
-        pattern: Sionna RT's name of an antenna pattern, linearly polarised along the device's z axis.
         loop_mode: Dr.Jit's; the symbolic one is faster and has no derivatives.
 
     Returns:
@@ -78,12 +90,10 @@ def field_of(
     """
     import drjit as dr
     import mitsuba as mi
-    from sionna import rt
     from sionna.rt.path_solvers.field_calculator import FieldCalculator
 
     if buffer.buffer_size == 0:
         return mi.Float(), mi.Float()
-    patterns = rt.PlanarArray(num_rows=1, num_cols=1, pattern=pattern, polarization="V").antenna_pattern.patterns
     calculator = FieldCalculator()
     calculator.loop_mode = loop_mode
     buffer.valid = dr.full(mi.Bool, True, buffer.buffer_size)
@@ -92,27 +102,44 @@ def field_of(
         paths=buffer,
         samples_per_src=rays,
         diffraction=buffer.diffracting_wedges is not None,
-        src_positions=point_array(ends_m[0]),
-        tgt_positions=point_array(ends_m[1]),
-        src_orientations=point_array(angles[0]),
-        tgt_orientations=point_array(angles[1]),
-        src_antenna_patterns=patterns,
-        tgt_antenna_patterns=patterns,
+        src_positions=point_array(ends[0].position_m),
+        tgt_positions=point_array(ends[1].position_m),
+        src_orientations=point_array(ends[0].angles),
+        tgt_orientations=point_array(ends[1].angles),
+        src_antenna_patterns=[_pattern(ends[0], buffer.source_indices)],
+        tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices)],
     )
     gain = done.a[0][0]
     return gain.real, gain.imag
 
 
-def path_gains(
-    scene: Any,
-    surfaces: Surfaces,
-    legs: Legs,
-    ends_m: tuple[FloatArray, FloatArray],
-    angles: tuple[FloatArray, FloatArray],
-    rays: int,
-    pattern: str = "iso",
-) -> NDArray[np.complex128]:
-    """The same as a NumPy array [p], in parts of bounded memory.
+def _pattern(devices: Devices, index: Any) -> Any:
+    """Sionna RT's antenna pattern of the devices ``index`` of p paths, as a function of zenith and azimuth angle."""
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.antenna_pattern import antenna_pattern_registry
+
+    from ..backend.device import to_uint
+
+    own = [one.antenna for one in devices.antennas]
+    distinct = list(dict.fromkeys(own))
+    functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
+    if len(distinct) == 1:
+        return functions[0]
+    kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in own])), index)
+
+    def mixed(theta: Any, phi: Any) -> tuple[Any, Any]:
+        first, second = functions[0](theta, phi)
+        for number, function in enumerate(functions[1:], start=1):
+            other = function(theta, phi)
+            first, second = dr.select(kind == number, other[0], first), dr.select(kind == number, other[1], second)
+        return first, second
+
+    return mixed
+
+
+def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
+    """Complex gains [p] of paths, without the phase of travelling, in parts of bounded memory.
 
     Raises:
         InputError: a gain that is not a number.
@@ -121,7 +148,7 @@ def path_gains(
     for start in range(0, len(legs), PATHS_AT_ONCE):
         part = slice(start, start + PATHS_AT_ONCE)
         buffer = to_buffer(legs.select(part), surfaces, valid=True)
-        real, imaginary = field_of(scene, buffer, ends_m, angles, rays, pattern)
+        real, imaginary = field_of(scene, buffer, ends, rays)
         gain[part] = real.numpy() + 1j * imaginary.numpy()
     if not np.isfinite(gain).all():
         raise InputError("gains that are not numbers: give materials constants that single precision can hold")

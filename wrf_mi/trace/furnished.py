@@ -166,7 +166,7 @@ def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
         material.scattering_coefficient = room.scattering
     # The array searches: all transmitters then see the same patches of rough wall and the same edges. Sionna RT keeps
     # the direction of the search where there is diffraction, so the array takes the transmitter's part.
-    shared: dict[str, Any] = {"transmission": True, "upright": True, "seed": room.seed}
+    shared: dict[str, Any] = {"transmission": True, "seed": room.seed}
     shared |= {"scattering_coefficient": room.scattering}
     exact = TraceOptions(
         diffraction=True, max_depth=room.depth, max_reflections=room.reflections, rays=room.rays, **shared

@@ -28,8 +28,6 @@ class TraceOptions:
             of positions grow no more, see `wrf_mi.trace.solve.converged_rays`.
         seed: of the directions of the rays.
         scattering_coefficient: share of the reflected amplitude that is scattered, 0..1; for ``scattering`` alone.
-        upright: receivers' antennas are polarised along the world's z axis, as transmitters' are. False: along the y
-            axis of the receiver's own array.
     """
 
     line_of_sight: bool = True
@@ -42,7 +40,6 @@ class TraceOptions:
     rays: int | Literal["auto"] = 1 << 17
     seed: int = 1
     scattering_coefficient: float = 0.3
-    upright: bool = False
 
     def __post_init__(self) -> None:
         """Reject what cannot be traced.

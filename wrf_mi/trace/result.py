@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Paths, Receiver
+from ..core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from ..core.paths import read_paths_file, save_paths
 from .buffer import Legs, join
-from .fields import UPRIGHT, path_gains, scattering_materials, sionna_orientation
+from .fields import Devices, Ends, path_gains, scattering_materials
 from .options import TraceOptions
 from .surfaces import Surfaces, scene_surfaces
 
@@ -35,6 +36,7 @@ class TraceResult:
         rays: that searched from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: the search went from receivers to transmitters.
         frequency_hz: of the carrier.
+        tx_antenna: antenna of the transmitters.
     """
 
     paths: Paths
@@ -47,6 +49,7 @@ class TraceResult:
     rays: int
     from_receivers: bool
     frequency_hz: float
+    tx_antenna: Antenna = ANTENNA
 
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -75,30 +78,33 @@ class TraceResult:
         legs = Legs(paths.tx, paths.rx, paths.interactions, face, paths.vertices_m, self.probability, self.wedge)
         return legs.reverse() if self.from_receivers else legs
 
-    def ends(self) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-        """Positions and Sionna RT's angles of sources and of targets, in the direction of the search."""
-        positions, angles = device_ends(self.tx_pos_m, self.receivers, self.options.upright)
-        if self.from_receivers:
-            return (positions[1], positions[0]), (angles[1], angles[0])
-        return positions, angles
+    def ends(self) -> Ends:
+        """Sources and targets, in the direction of the search."""
+        transmitters, receivers = device_ends(self.tx_pos_m, self.receivers, self.tx_antenna)
+        return (receivers, transmitters) if self.from_receivers else (transmitters, receivers)
 
 
-def device_ends(
-    tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], upright: bool
-) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-    """Positions of transmitters and receivers, and Sionna RT's angles of both."""
+def device_ends(tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], tx_antenna: Antenna) -> Ends:
+    """Transmitters and receivers as Sionna RT's devices."""
+    antennas = tuple(one.antenna.mounted(one.orientation_xyzw) for one in receivers)
     rx = np.stack([receiver.position_m for receiver in receivers])
-    turned = [UPRIGHT if upright else sionna_orientation(receiver.orientation_xyzw) for receiver in receivers]
-    return (tx_pos_m, rx), (np.zeros((len(tx_pos_m), 3)), np.asarray(turned, float))
+    return Devices(tx_pos_m, (tx_antenna.mounted(),)), Devices(rx, antennas)
 
 
-def recompute(traced: TraceResult, scene: Any, pattern: str = "iso") -> TraceResult:
+def recompute(
+    traced: TraceResult,
+    scene: Any,
+    *,
+    rx_antennas: Sequence[Antenna] | None = None,
+    tx_antenna: Antenna | None = None,
+) -> TraceResult:
     """Gains of the same paths with the scene's present materials (and frequency), without tracing again.
 
     Args:
         traced: from `wrf_mi.trace.trace_paths` or `load_trace`.
         scene: a ``sionna.rt.Scene`` of the same geometry.
-        pattern: Sionna RT's name of the antenna pattern of both ends (``"iso"``, ``"dipole"``, ``"hw_dipole"``, ...).
+        rx_antennas: other antennas of the receivers, one for each; None: those that were traced with.
+        tx_antenna: another antenna of the transmitters; None: the one that was traced with.
 
     Returns:
         The same paths with other gains.
@@ -106,9 +112,14 @@ def recompute(traced: TraceResult, scene: Any, pattern: str = "iso") -> TraceRes
     Raises:
         InputError: the scene lacks an object that a path meets.
     """
+    if rx_antennas is not None:
+        own = (replace(one, antenna=a) for one, a in zip(traced.receivers, rx_antennas, strict=True))
+        traced = replace(traced, receivers=tuple(own))
+    if tx_antenna is not None:
+        traced = replace(traced, tx_antenna=tx_antenna)
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
-        gain = path_gains(scene, surfaces, traced.legs(surfaces), *traced.ends(), traced.rays, pattern)
+        gain = path_gains(scene, surfaces, traced.legs(surfaces), traced.ends(), traced.rays)
     return replace(traced, paths=replace(traced.paths, gain=gain), frequency_hz=float(scene.frequency[0]))
 
 
@@ -149,18 +160,16 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
 
 def save_trace(file: str | Path, traced: TraceResult) -> Path:
     """Write to an ``.npz`` of plain arrays that `wrf_mi.core.load_paths` reads too."""
-    receivers = traced.receivers
     extra = {
         "tx_pos_m": traced.tx_pos_m,
-        "receiver_name": np.asarray([r.name for r in receivers]),
-        "receiver_position_m": np.stack([r.position_m for r in receivers]),
-        "receiver_orientation_xyzw": np.stack([r.orientation_xyzw for r in receivers]),
+        **receiver_arrays(traced.receivers),
         "primitives": traced.primitives,
         "probability": traced.probability,
         "options": json.dumps(asdict(traced.options)),
         "rays": traced.rays,
         "from_receivers": traced.from_receivers,
         "frequency_hz": traced.frequency_hz,
+        "tx_antenna": np.array(astuple(traced.tx_antenna)),
     }
     return save_paths(file, traced.paths, extra | {f"wedge/{name}": values for name, values in traced.wedge.items()})
 
@@ -173,12 +182,10 @@ def load_trace(file: str | Path) -> TraceResult:
     """
     paths, extra = read_paths_file(file)
     try:
-        keys = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw")
-        receivers = tuple(Receiver(str(n), p, q) for n, p, q in zip(*(extra[key] for key in keys), strict=True))
         return TraceResult(
             paths,
             extra["tx_pos_m"],
-            receivers,
+            stored_receivers(extra),
             extra["primitives"],
             extra["probability"],
             {key.removeprefix("wedge/"): values for key, values in extra.items() if key.startswith("wedge/")},
@@ -186,6 +193,7 @@ def load_trace(file: str | Path) -> TraceResult:
             int(extra["rays"]),
             bool(extra["from_receivers"]),
             float(extra["frequency_hz"]),
+            Antenna(*map(str, extra["tx_antenna"])),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import Progress
 
-from ..core import InputError, Paths, Receiver
+from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from .buffer import Legs, join
 from .devices import before_walls, check_devices, tell_moved
 from .fields import path_gains, scattering_materials
@@ -79,11 +80,11 @@ def trace_paths(
     progress: bool = False,
     prepared: Prepared | None = None,
     first_row: int = 0,
+    tx_antenna: Antenna = ANTENNA,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
-    Antennas are isotropic and linearly polarised, the transmitters' along the world's z axis, the receivers' along
-    their arrays' y axes (or upright, see `TraceOptions`). Rays search from the side with fewer devices: by reciprocity
+    Rays search from the side with fewer devices: by reciprocity
     a path and its gain are the same both ways. Sequences of reflecting planes that the rays of one source find are
     tried for every position of the other side, so that rays are not shot for each; Sionna RT's image method decides
     which are paths, and its field calculator gives their gains.
@@ -100,6 +101,7 @@ def trace_paths(
         prepared: of the scene, where one traces again and again to the same receivers: rays then always go out from
             these, and only the first time.
         first_row: what errors call the first transmitter, where one traces in parts.
+        tx_antenna: antenna of the transmitters; the receivers state theirs.
 
     Returns:
         The paths, the same for the same seed whatever the parts. Lengths and directions are float64: a float32 length
@@ -125,15 +127,16 @@ def trace_paths(
     for before, after, called in zip(stated, traced, (names, own), strict=True):
         tell_moved(before, after, called)
         check_devices(surfaces, after, called)
-    ends, angles = device_ends(positions, everyone, options.upright)
-    swap = (prepared is not None or len(ends[1]) <= len(ends[0])) and not keeps_direction(options)
-    if swap:
-        ends, angles = (ends[1], ends[0]), (angles[1], angles[0])
-    rays = kept.rays(*ends, options)
+    swap = (prepared is not None or len(everyone) <= len(positions)) and not keeps_direction(options)
+    transmitters, its_receivers = device_ends(positions, everyone, tx_antenna)
+    ends = (its_receivers, transmitters) if swap else (transmitters, its_receivers)
+    places = ends[0].position_m, ends[1].position_m
+    rays = kept.rays(*places, options)
     with scattering_materials(scene, options):
-        legs = _search(scene, kept, ends, options, rays, progress)
-        gain = path_gains(scene, surfaces, legs, ends, angles, rays)
-    return _result(legs, gain, surfaces, positions, everyone, options, rays, swap, float(scene.frequency[0]))
+        legs = _search(scene, kept, places, options, rays, progress)
+        gain = path_gains(scene, surfaces, legs, ends, rays)
+    hz = float(scene.frequency[0])
+    return _result(legs, gain, surfaces, positions, everyone, options, rays, swap, hz, tx_antenna)
 
 
 def keeps_direction(options: TraceOptions) -> bool:
@@ -234,8 +237,9 @@ def _result(
     rays: int,
     swap: bool,
     frequency_hz: float,
+    tx_antenna: Antenna,
 ) -> TraceResult:
-    ends = device_ends(tx_pos_m, receivers, options.upright)[0]
+    ends = tx_pos_m, np.stack([receiver.position_m for receiver in receivers])
     legs = legs.reverse() if swap else legs
     length = _lengths(legs, *ends)
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
@@ -273,6 +277,7 @@ def _result(
         int(rays),
         swap,
         frequency_hz,
+        tx_antenna,
     )
 
 

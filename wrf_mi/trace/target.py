@@ -26,8 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Paths, Receiver
+from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..receive import rssi_dbm
 from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
@@ -135,9 +136,15 @@ class _Sampled:
     """Received power, and spectra, of sampled transmitters under several settings."""
 
     def __init__(
-        self, scene: Any, positions: FloatArray, receivers: Sequence[Receiver], spectra: Spectra | None = None
+        self,
+        scene: Any,
+        positions: FloatArray,
+        receivers: Sequence[Receiver],
+        tx_antenna: Antenna,
+        spectra: Spectra | None,
     ) -> None:
-        self.scene, self.receivers, self._spectra = scene, receivers, spectra
+        self.scene, self._spectra = scene, spectra
+        self._ends: dict[str, Any] = {"receivers": receivers, "tx_antenna": tx_antenna}
         self._prepared = Prepared(scene)
         self._known: dict[TraceOptions, tuple[FloatArray, FloatArray | None]] = {}
         rows = np.unique(np.linspace(0, len(positions) - 1, min(SAMPLE, len(positions))).round().astype(int))
@@ -147,7 +154,7 @@ class _Sampled:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
         if options not in self._known:
             here = self.positions[self._few()] if options.sampled else self.positions
-            paths = trace_paths(self.scene, here, self.receivers, options, prepared=self._prepared).paths
+            paths = trace_paths(self.scene, here, options=options, prepared=self._prepared, **self._ends).paths
             images = None if self._spectra is None else np.asarray(self._spectra(paths))
             self._known[options] = np.asarray(rssi_dbm(paths), float), images
         return self._known[options]
@@ -188,6 +195,7 @@ def choose_options(
     options: TraceOptions,
     kinds: Sequence[str] = CHOSEN_KINDS,
     spectra: Spectra | None = None,
+    tx_antenna: Antenna = ANTENNA,
 ) -> Choice:
     """Depth, rays and kinds of path for a stated error of received power, and of spectra where they are reported.
 
@@ -196,10 +204,11 @@ def choose_options(
         tx_pos_m: transmitter positions [n, 3], metres; a sample of them is traced.
         receivers: one or several.
         target_db: error to reach, dB.
-        options: what stays as it is: kinds that are on, seed, antennas. Depth and rays are chosen.
+        options: what stays as it is: kinds that are on, seed. Depth and rays are chosen.
         kinds: that may be switched on, of `CHOSEN_KINDS`.
         spectra: what is reported of paths, [n_rx, n, height, width], as `wrf_mi.trace.tracer.Instrument.observe` does;
             None: power alone is judged by.
+        tx_antenna: antenna of the transmitters.
 
     Returns:
         The choice. Where the estimate stays above the target (a warning says so), the largest settings are taken.
@@ -210,7 +219,7 @@ def choose_options(
     if not (np.isfinite(target_db) and target_db > 0):
         raise InputError(f"target-error {target_db}: give a number of dB above 0")
     everyone = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
-    sample = _Sampled(scene, np.atleast_2d(np.asarray(tx_pos_m, float)), everyone, spectra)
+    sample = _Sampled(scene, np.atleast_2d(np.asarray(tx_pos_m, float)), everyone, tx_antenna, spectra)
     share, trials = target_db / PARTS, list[Trial]()
     now, left = _depth(sample, replace(options, diffraction=False, scattering=False), share, trials)
     now, more = _rays(sample, now, share, trials)

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Paths, Receiver, Record
+from ..core import Antenna, InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
+from ..core.antenna import ANTENNA
 from ..receive import antenna_csi, bartlett_spectrum, csi, element_signals, minmax_scale, rssi_dbm
 from .options import DEFAULTS, TraceOptions
-from .result import TraceResult, device_ends
+from .result import TraceResult
 from .scenes import open_scene
 from .solve import Prepared, keeps_direction, trace_paths
 
@@ -29,6 +30,7 @@ class Instrument:
         array_m: elements of the array behind a spectrum, or antennas of a receiver of channel coefficients, [m, 3],
             receiver's frame, metres; None for receivers with one antenna.
         size: height and width of a spectrum; None otherwise.
+        tx_antenna: antenna of the transmitters.
     """
 
     task: str
@@ -36,6 +38,7 @@ class Instrument:
     frequencies_hz: FloatArray
     array_m: FloatArray | None = None
     size: tuple[int, int] | None = None
+    tx_antenna: Antenna = ANTENNA
 
     @property
     def carrier_hz(self) -> float:
@@ -80,14 +83,15 @@ def instrument_of(record: Record) -> Instrument:
             "frequencies_hz in base-station.yml" if record.task == "csi" else "frequency_hz in its gateway_info.yml"
         )
         raise InputError(f"{record.name}: carrier frequency unknown; state {stated}")
+    single = Instrument(record.task, record.receivers, record.frequencies_hz, tx_antenna=record.tx_antenna)
     if record.task == "rssi" or (record.task == "csi" and record.observation.ndim == 3):
-        return Instrument(record.task, record.receivers, record.frequencies_hz)
+        return single
     if record.task == "csi" and record.array_m is not None:
-        return Instrument(record.task, record.receivers, record.frequencies_hz, record.array_m)
+        return replace(single, array_m=record.array_m)
     if record.array_m is None:
         raise InputError(f"{record.name}: antenna array unknown; state array in its gateway_info.yml")
     height, width = record.observation.shape[-2:]
-    return Instrument(record.task, record.receivers, record.frequencies_hz, record.array_m, (height, width))
+    return replace(single, array_m=record.array_m, size=(height, width))
 
 
 class RayTracer:
@@ -107,26 +111,26 @@ class RayTracer:
         Args:
             scene: see `wrf_mi.trace.open_scene`.
             instrument: from `instrument_of`.
-            options: what is traced. Single antennas stand upright, whatever is asked for: only arrays are turned.
+            options: what is traced.
             material: of a bare mesh.
 
         Raises:
             InputError: a scene that cannot be opened.
         """
         self.instrument = instrument
-        self.options = options if instrument.task == "spectrum" else replace(options, upright=True)
+        self.options = options
         self.scene = open_scene(scene, instrument.carrier_hz, material=material)
         self._prepared = Prepared(self.scene)
 
     def trace(self, tx_pos_m: ArrayLike, progress: bool = False, first_row: int = 0) -> TraceResult:
         """Paths from transmitter positions [n, 3] (metres), ``first_row`` and following, to all receivers."""
-        receivers = self.instrument.receivers
-        return trace_paths(self.scene, tx_pos_m, receivers, self.options, progress, self._prepared, first_row)
+        ends = self.instrument.receivers, self.options, progress, self._prepared, first_row
+        return trace_paths(self.scene, tx_pos_m, *ends, self.instrument.tx_antenna)
 
     def rays(self, tx_pos_m: ArrayLike) -> int:
         """How many rays search if these positions [n, 3] (metres) are the first: ``"auto"`` is settled on them."""
-        placed = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
-        ends = device_ends(*placed, self.options.upright)[0]
+        positions, receivers = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
+        ends = positions, np.stack([receiver.position_m for receiver in receivers])
         return self._prepared.rays(*(ends if keeps_direction(self.options) else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:

@@ -192,7 +192,7 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION))
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
     # Diffuse reflection: the base station searches, so that all users see the same patches of rough wall.
-    shared: dict[str, Any] = {"transmission": True, "upright": True, "seed": walk.seed}
+    shared: dict[str, Any] = {"transmission": True, "seed": walk.seed}
     shared |= {"scattering_coefficient": walk.scattering}
     specular = TraceOptions(max_depth=walk.depth, max_reflections=walk.reflections, rays=walk.rays, **shared)
     rough = TraceOptions(scattering=True, max_depth=walk.scattered_depth, rays=walk.scattered_rays, **shared)

@@ -1,0 +1,109 @@
+"""Patterns and polarisations of antennas: against Sionna RT, in files, as options, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wrf_mi import backend
+from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record, receiver_arrays, stored_receivers
+from wrf_mi.core.antenna import FRAMES, PATTERNS, POLARIZATIONS
+
+SINGLE = 1e-6
+"""Sionna RT's patterns in single precision."""
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("polarization", POLARIZATIONS)
+def test_field_is_that_of_sionna_rt(pattern: str, polarization: str) -> None:
+    backend.init()
+    import mitsuba as mi
+    from sionna.rt.antenna_pattern import antenna_pattern_registry
+
+    rng = np.random.default_rng(0)
+    theta, phi = np.arccos(rng.uniform(-0.999, 0.999, 200)), rng.uniform(-np.pi, np.pi, 200)
+    sine, cosine = np.sin(theta), np.cos(theta)
+    field = Antenna(pattern, polarization, "array").field(
+        np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=-1)
+    )
+    theta_hat = np.stack([cosine * np.cos(phi), cosine * np.sin(phi), -sine], axis=-1)
+    phi_hat = np.stack([-np.sin(phi), np.cos(phi), np.zeros(200)], axis=-1)
+    function = antenna_pattern_registry.get(pattern)(polarization=polarization).patterns[0]
+    expected = [part.real.numpy() for part in function(mi.Float(theta), mi.Float(phi))]
+    np.testing.assert_allclose((field * theta_hat).sum(axis=1), expected[0], atol=20 * SINGLE)
+    np.testing.assert_allclose((field * phi_hat).sum(axis=1), expected[1], atol=20 * SINGLE)
+    assert (field * np.cross(theta_hat, phi_hat)).sum(axis=1) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_field_is_finite_along_the_axis(pattern: str) -> None:
+    for polarization in POLARIZATIONS:
+        field = Antenna(pattern, polarization, "array").field([[0.0, 0, 1], [0, 0, -1], [1e-9, 0, 1]])
+        assert np.isfinite(field).all()
+
+
+def test_default_is_vertical_in_the_world_however_the_array_is_turned() -> None:
+    for turn in Rotation.random(5, rng=3).as_quat():
+        assert np.array_equal(Antenna().to_world(turn), np.eye(3))
+        turned = Antenna(frame="array").to_world(turn)
+        array = Rotation.from_quat(turn).as_matrix()
+        # Boresight +x is the array's normal, and V lies along the array's y axis.
+        np.testing.assert_allclose(turned, array[:, [2, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"pattern": "horn"}, "pattern is 'horn'; choose from iso, dipole, hw_dipole, tr38901"),
+        ({"polarization": "VH"}, "polarization is 'VH'; choose from V, H"),
+        ({"frame": "body"}, "frame is 'body'; choose from world, array"),
+        ({"pattern": "tr38901"}, "has a boresight, which frame world does not tell; state array"),
+        ({"pattern": ["iso"]}, "pattern is"),
+    ],
+)
+def test_unknown_antennas_are_refused(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Antenna(**words)
+
+
+def made(antenna: Antenna) -> Record:
+    receivers = tuple(
+        Receiver(name, np.zeros(3), np.array([0, 0, 0, 1.0]), antenna) for name in ("gateway1", "gateway2")
+    )
+    return Record("made", "rssi", np.ones((2, 3)), receivers, np.zeros((2, 2), np.float32))
+
+
+def test_options_replace_what_the_data_state_and_leave_the_rest() -> None:
+    record = made(Antenna("dipole", "H"))
+    assert AntennaOptions().of(record) is record
+    changed = AntennaOptions(rx_polarization="V", tx_pattern="hw_dipole").of(record)
+    assert [astuple(one.antenna) for one in changed.receivers] == [("dipole", "V", "world")] * 2
+    assert changed.tx_antenna == Antenna("hw_dipole")
+    with pytest.raises(InputError, match="state array"):
+        AntennaOptions(rx_pattern="tr38901").of(record)
+    assert AntennaOptions(rx_pattern="tr38901", rx_frame="array").of(record).receivers[1].antenna.frame == "array"
+
+
+def test_stored_receivers_are_the_same(tmp_path: Path) -> None:
+    words = [(p, q, f) for p in PATTERNS for q in POLARIZATIONS for f in FRAMES]
+    stated = [Antenna(*one) for one in words if (one[0], one[2]) != ("tr38901", "world")]
+    rng = np.random.default_rng(2)
+    given = [Receiver(f"r{i}", rng.normal(size=3), rng.normal(size=4), antenna) for i, antenna in enumerate(stated)]
+    np.savez(tmp_path / "receivers.npz", **receiver_arrays(given))
+    with np.load(tmp_path / "receivers.npz", allow_pickle=False) as arrays:
+        read = stored_receivers(arrays)
+    for one, other in zip(given, read, strict=True):
+        assert (one.name, one.antenna) == (other.name, other.antenna)
+        np.testing.assert_array_equal(one.position_m, other.position_m)
+        np.testing.assert_array_equal(one.orientation_xyzw, other.orientation_xyzw)
+
+
+def test_turning_twice_is_the_same_antenna() -> None:
+    antenna = Antenna("dipole", "H", "array")
+    assert antenna.turned.turned == antenna
+    assert antenna.turned == replace(antenna, polarization="V")
