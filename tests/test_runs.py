@@ -241,7 +241,7 @@ def test_damaged_checkpoints(finished: Path, tmp_path: Path) -> None:
     with np.load(path) as stored:
         arrays = dict(stored)
     np.savez(path, **(arrays | {"format": np.asarray(99)}))
-    with pytest.raises(InputError, match="format 99, this version reads 1"):
+    with pytest.raises(InputError, match="format 99, this version reads 3"):
         load_predictor(run)
     path.unlink()
     with pytest.raises(InputError, match=r"no checkpoint\.npz"):
