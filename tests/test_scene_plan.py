@@ -208,9 +208,9 @@ def test_grids_without_walls_are_refused():
         (np.zeros(5), "two axes"),
     ):
         with pytest.raises(InputError, match=line):
-            grid_from_probability(values, 0.05)
+            grid_from_probability(values, 0.05, "top")
     with pytest.raises(InputError, match="resolution is 0"):
-        grid_from_probability(np.ones((3, 3)), 0)
+        grid_from_probability(np.ones((3, 3)), 0, "top")
 
 
 def test_points_that_make_no_grid_are_refused():
@@ -227,13 +227,13 @@ def test_points_that_make_no_grid_are_refused():
     not DATA or not Path(DATA, "flat-ble", "lidar").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/lidar/"
 )
 def test_flat_from_the_robots_map():
-    from wrf_mi.report.bench_plan import GRID_RESOLUTION_M, wall_agreement
+    from wrf_mi.report.bench_plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
     from wrf_mi.scene.plan_sources import read_plan
     from wrf_mi.scene.register import register_walls
     from wrf_mi.scene.register_search import sample_walls
 
     home = Path(DATA, "flat-ble")
-    grid = read_plan(home / "lidar" / "gridmap.npz", GRID_RESOLUTION_M)
+    grid = read_plan(home / "lidar" / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0)
     assert isinstance(grid, PlanGrid)
     walls, true = find_walls(grid), layout_walls(read_layout(home / "layout.csv"))
     registration = register_walls(sample_walls(walls), true)

@@ -13,7 +13,7 @@ ODDS = np.array([[-3.0, np.nan, 4.0], [-3.0, -3.0, 4.0]])
 
 def test_grid_of_log_odds(tmp_path):
     file = tmp_path / "map.npz"
-    np.savez(file, log_odds=ODDS, resolution_m=0.5, origin_m=[1.0, 2.0])
+    np.savez(file, log_odds=ODDS, resolution_m=0.5, origin_m=[1.0, 2.0], row_0="top")
     grid = read_plan(file)
     assert isinstance(grid, PlanGrid)
     assert grid.resolution_m == 0.5
@@ -24,9 +24,36 @@ def test_grid_of_log_odds(tmp_path):
     assert read_plan(file, 0.1).resolution_m == 0.1
 
 
+def test_row_0_of_a_grid_is_what_the_file_states_unless_the_caller_states_it(tmp_path):
+    file = tmp_path / "map.npz"
+    upwards = [[False, False, True], [False, False, True]], [[True, True, False], [True, False, False]]
+    as_stored = upwards[0], upwards[1][::-1]
+    for stated, given, expected in (
+        ("top", None, upwards),
+        ("bottom", None, as_stored),
+        (b"Bottom", None, as_stored),
+        ("bottom", "top", upwards),
+        (None, "bottom", as_stored),
+    ):
+        arrays = {} if stated is None else {"row_0": stated}
+        np.savez(file, log_odds=ODDS, resolution_m=0.5, **arrays)
+        grid = read_plan(file, row_0=given)
+        assert (grid.occupied.tolist(), grid.free.tolist()) == expected
+        assert grid.origin_m.tolist() == [0, 0]
+
+
+def test_row_0_is_refused_where_the_format_fixes_it(tmp_path):
+    Image.fromarray(np.array([[254, 205, 0]], np.uint8)).save(tmp_path / "flat.png")
+    (tmp_path / "layout.csv").write_text("x,y\n0,0\n1,0\n")
+    np.savez(tmp_path / "points.npz", xy_m=np.eye(2))
+    for name, why in (("flat.png", "is its top"), ("layout.csv", "no rows of cells"), ("points.npz", "no rows")):
+        with pytest.raises(InputError, match=rf"{name}: --row-0 is for .*{why}; leave it out"):
+            read_plan(tmp_path / name, 0.1, "top")
+
+
 def test_probabilities_are_told_from_log_odds(tmp_path):
     file = tmp_path / "map.npz"
-    np.savez(file, log_odds=np.array([[0.0, 0.5, 1.0]]), resolution_m=0.1)
+    np.savez(file, log_odds=np.array([[0.0, 0.5, 1.0]]), resolution_m=0.1, row_0="top")
     grid = read_plan(file)
     assert grid.occupied.tolist() == [[False, False, True]]
     assert grid.free.tolist() == [[True, False, False]]
@@ -66,8 +93,13 @@ def test_layout(tmp_path):
     ("arrays", "line"),
     [
         ({"log_odds": ODDS}, r"no resolution_m; give the side of a cell in metres \(--resolution\)"),
-        ({"log_odds": np.full((3, 3), np.nan), "resolution_m": 0.1}, "every cell is NaN"),
-        ({"log_odds": np.full((3, 3), -1.0), "resolution_m": 0.1}, "no cell is occupied"),
+        ({"log_odds": ODDS, "resolution_m": 0.1}, r"which side of the plan the first row is; store row_0 .* --row-0"),
+        ({"log_odds": ODDS, "resolution_m": 0.1, "row_0": "upper"}, "row_0 is 'upper'; give top .* or bottom"),
+        ({"log_odds": ODDS, "resolution_m": 0.1, "row_0": ["top", "top"]}, "row_0 is .*; give top .* or bottom"),
+        ({"log_odds": ODDS, "resolution_m": 0.1, "row_0": 0}, "row_0 is '0'; give top .* or bottom"),
+        ({"log_odds": ODDS, "resolution_m": 0.1, "origin_m": [1.0]}, "origin_m is .*; give x and y"),
+        ({"log_odds": np.full((3, 3), np.nan), "resolution_m": 0.1, "row_0": "top"}, "every cell is NaN"),
+        ({"log_odds": np.full((3, 3), -1.0), "resolution_m": 0.1, "row_0": "top"}, "no cell is occupied"),
         ({"log_odds": np.array([["a"]]), "resolution_m": 0.1}, "log_odds holds no numbers"),
         ({"xy_m": np.zeros((3, 3))}, r"xy_m has shape \(3, 3\)"),
         ({"xy_m": np.zeros((3, 2)), "time_s": np.zeros(2)}, r"time_s has shape \(2,\); expected \[3\]"),

@@ -101,7 +101,7 @@ def test_options_that_do_not_fit_the_source(tmp_path: Path) -> None:
         make_scene(tmp_path / "plan.npz", out)
     with pytest.raises(InputError, match=r"a plan is in metres"):
         make_scene(tmp_path / "plan.npz", out, height_m=2.5, units="mm")
-    with pytest.raises(InputError, match=r"leave out --height, --floor and --resolution"):
+    with pytest.raises(InputError, match=r"leave out --height, --floor, --resolution and --row-0"):
         make_scene(tmp_path / "scan.npz", out, height_m=2.5)
     with pytest.raises(InputError, match=r"registration: not rigid"):
         make_scene(tmp_path / "scan.npz", out, registration=np.diag([2.0, 2.0, 2.0, 1.0]))

@@ -83,6 +83,8 @@ def _mesh(a: Arguments) -> int:
         resolution_m=a.resolution,
         registration=None if pairs is None else pairs.matrix,
         register_walls_of=a.register_walls,
+        positions=a.positions,
+        row_0=a.row_0,
         replace=a.replace,
     )
     kinds = list(scene.materials.surfaces.values())
@@ -188,9 +190,13 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--height", type=float, metavar="M", help="from floor to ceiling; a plan needs it")
     sub.add_argument("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
     sub.add_argument("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
+    text = "side of a plan where the first row of an NPZ grid lies, where the file does not state row_0"
+    sub.add_argument("--row-0", choices=("top", "bottom"), help=text)
     sub.add_argument("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     sub.add_argument("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     sub.add_argument("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
+    text = "measured positions x,y[,z] in the scene's frame: refuse a plan that they fit better when it is mirrored"
+    sub.add_argument("--positions", metavar="CSV", help=text)
     sub.add_argument("--replace", action="store_true", help="take the place of an existing scene folder")
 
     text = "fit a field to measured spectra, or a hybrid or a baseline to any measurements, and score it"

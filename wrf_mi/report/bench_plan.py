@@ -14,7 +14,7 @@ from ..core.angles import FloatArray
 from ..measure.registry import locate
 from ..scene.plan import read_walls
 from ..scene.plan_align import grid_from_scans
-from ..scene.plan_sources import PlanGrid, PlanPoints, grid_from_points, read_plan
+from ..scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_plan
 from ..scene.plan_walls import find_walls
 from ..scene.register import register_walls
 from ..scene.register_search import sample_walls
@@ -24,6 +24,8 @@ NEAR_M = 0.2
 GRID_RESOLUTION_M = 0.04
 """Of the SLAM map, whose file does not tell: ``size = 20, res = 0.04`` in the notebook of its author
 (github.com/marckolak/graphSLAM, examples/Mapping.ipynb), so 500 cells; registration to the layout finds the same."""
+GRID_ROW_0: Row0 = "top"
+"""Of the same map, which does not tell either: registration to the layout refuses its mirror image."""
 ASKED = "0.85 and 0.85"
 
 
@@ -64,7 +66,7 @@ def flat_plan(folder: str | Path | None = None) -> dict[str, Any]:
         raise InputError("flat-ble: not on this machine; fetch it or name its folder in WRF_MI_DATA")
     true = read_walls(home / "layout.csv")
     lidar = home / "lidar"
-    grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M), read_plan(lidar / "points.npz")
+    grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0), read_plan(lidar / "points.npz")
     if not isinstance(grid, PlanGrid) or not isinstance(returns, PlanPoints) or returns.time_s is None:
         raise InputError(f"{lidar}: expected log_odds in gridmap.npz, xy_m and time_s in points.npz")
     begin = time.perf_counter()

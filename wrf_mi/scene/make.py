@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace as changed
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,9 @@ from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh import SUFFIXES, read_mesh
 from .packages import lidar_package
+from .plan_sources import PlanGrid, Row0, read_plan
 from .points import check_extent, read_points
-from .surfaces import Surface
+from .surfaces import Surface, moved, moved_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -34,6 +34,8 @@ def make_scene(
     resolution_m: float | None = None,
     registration: ArrayLike | None = None,
     register_walls_of: str | Path | None = None,
+    positions: str | Path | None = None,
+    row_0: Row0 | None = None,
     replace: bool = False,
 ) -> SceneFolder:
     """Make a scene folder that Mitsuba and Sionna RT both open.
@@ -51,6 +53,9 @@ def make_scene(
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None leaves the frame.
         register_walls_of: a layout file whose walls the scene's walls are to lie on (`wrf_mi.scene.plan.read_walls`,
             `wrf_mi.scene.register.register_walls`), in place of ``registration``.
+        positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
+            source whose walls they cross, or that they fit better when mirrored, is refused.
+        row_0: side of the plan where the first row of an NPZ grid lies, where the file does not tell or tells wrongly.
         replace: let the folder take the place of an existing one.
 
     Returns:
@@ -72,19 +77,26 @@ def make_scene(
     for name in ("shapely", "mapbox_earcut"):
         lidar_package(name)
     from .plan import read_walls
+    from .positions import check_positions, read_positions, reflections
     from .register import register_walls, wall_points
 
-    surfaces, points = _surfaces(file, units, height_m, floor_m, resolution_m)
-    if register_walls_of is not None:
-        matrix = register_walls(wall_points(surfaces), read_walls(register_walls_of), str(file)).matrix
+    measured = None if positions is None else read_positions(positions)
+    known_walls = None if register_walls_of is None else read_walls(register_walls_of)
+    surfaces, points, grid = _surfaces(file, units, height_m, floor_m, resolution_m, row_0)
+    if known_walls is not None:
+        matrix = register_walls(wall_points(surfaces), known_walls, str(file)).matrix
     counts = {} if points is None else {"points": len(points)}
     sample = None if points is None else _some(points)
+    placed = surfaces
     if matrix is not None:
-        surfaces = [changed(surface, vertices_m=_moved(surface.vertices_m, matrix)) for surface in surfaces]
-        sample = None if sample is None else _moved(sample, matrix)
+        placed = moved(surfaces, matrix)
+        sample = None if sample is None else moved_points(sample, matrix)
+    if measured is not None:
+        mirrored = reflections(surfaces, file, grid, matrix, known_walls)
+        check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
     write_scene(
         out,
-        surfaces,
+        placed,
         frame=f"that of {file.name}, z upwards" + ("" if matrix is None else ", moved by the registration"),
         source=str(file),
         materials=materials,
@@ -97,9 +109,14 @@ def make_scene(
 
 
 def _surfaces(
-    file: Path, units: str, height_m: float | None, floor_m: float, resolution_m: float | None
-) -> tuple[list[Surface], FloatArray | None]:
-    """The surfaces of a source, and its points if it is a scan."""
+    file: Path,
+    units: str,
+    height_m: float | None,
+    floor_m: float,
+    resolution_m: float | None,
+    row_0: Row0 | None,
+) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
+    """The surfaces of a source, its points if it is a scan, and its cells if it is an occupancy grid."""
     from .cloud import surfaces_from_points
     from .plan import plan_surfaces
 
@@ -108,14 +125,16 @@ def _surfaces(
             raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
         if units != "m":
             raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
-        return plan_surfaces(file, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m), None
-    if height_m is not None or resolution_m is not None or floor_m:
-        raise InputError(f"{file}: has heights of its own; leave out --height, --floor and --resolution")
+        plan = read_plan(file, resolution_m, row_0)
+        walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
+        return walls, None, plan if isinstance(plan, PlanGrid) else None
+    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if _has_faces(file):
-        return read_mesh(file, units), None
+        return read_mesh(file, units), None, None
     points = read_points(file, units)
     check_extent(points, file)
-    return surfaces_from_points(points), points
+    return surfaces_from_points(points), points, None
 
 
 def is_plan(path: str | Path) -> bool:
@@ -162,7 +181,3 @@ def _rigid(registration: ArrayLike) -> FloatArray:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     return matrix
-
-
-def _moved(points_m: FloatArray, matrix: FloatArray) -> FloatArray:
-    return points_m @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,8 +1,8 @@
 """Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices.
 
 Everything that walls are looked for in becomes a `PlanGrid`: cells that a wall may fill, cells that were seen empty,
-and the rest, of which nothing is known. Rows of the files run from the top, as in a picture and as in a map of ROS;
-rows of a `PlanGrid` run with y.
+and the rest, of which nothing is known. Rows of a `PlanGrid` run with y. Row 0 of a picture, and so of a ROS map, is
+its top (largest y); an NPZ file states which side its row 0 is.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import csv
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import yaml
@@ -22,6 +22,8 @@ from ..core.angles import FloatArray
 from ..core.files import one_line, text_lines
 
 Mask = NDArray[np.bool_]
+Row0 = Literal["top", "bottom"]
+"""Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
@@ -69,13 +71,14 @@ class PlanPoints:
 
 
 def grid_from_probability(
-    probability: ArrayLike, resolution_m: float, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
+    probability: ArrayLike, resolution_m: float, row_0: Row0, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
 ) -> PlanGrid:
     """A grid from the probability that a cell is occupied.
 
     Args:
-        probability: shape [rows, columns], the first row on top (largest y); NaN where nothing is known.
+        probability: shape [rows, columns]; NaN where nothing is known.
         resolution_m: side of a cell.
+        row_0: side of the plan where the first row lies.
         origin_m: lower left corner of the lower left cell, shape [2].
         name: of the source, for errors.
 
@@ -87,7 +90,8 @@ def grid_from_probability(
         raise InputError(f"{name}: an occupancy grid has two axes (rows, columns), this one has shape {p.shape}")
     if not (np.isfinite(resolution_m) and resolution_m > 0):
         raise InputError(f"{name}: the resolution is {resolution_m}; give the side of a cell in metres, above zero")
-    p = p[::-1]
+    if row_0 == "top":
+        p = p[::-1]
     with np.errstate(invalid="ignore"):
         occupied, free = p > OCCUPIED_PROBABILITY, p < FREE_PROBABILITY
     if not occupied.any():
@@ -129,19 +133,20 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: s
     return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
 
 
-def read_plan_arrays(path: Path, resolution_m: float | None = None) -> PlanGrid | PlanPoints:
+def read_plan_arrays(path: Path, resolution_m: float | None = None, row_0: Row0 | None = None) -> PlanGrid | PlanPoints:
     """A plan in an NPZ file: an occupancy grid or points.
 
-    Grid: ``log_odds`` [rows, columns], optionally ``resolution_m`` and ``origin_m`` [2]. Values that all lie in 0..1
-    are taken as probabilities (log odds of free cells are negative). Points: ``xy_m`` [n, 2], optionally ``time_s``
-    [n], the same for all returns of a scan.
+    Grid: ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally ``origin_m`` [2]
+    of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities (log odds of free
+    cells are negative). Points: ``xy_m`` [n, 2], optionally ``time_s`` [n], the same for all returns of a scan.
 
     Args:
         path: of the file.
         resolution_m: side of a cell; wins over the file's.
+        row_0: side of the plan where the first row lies; wins over the file's.
 
     Raises:
-        InputError: unreadable, neither of both, or a grid without a resolution.
+        InputError: unreadable, neither of both, a grid without a resolution or ``row_0``, or points with ``row_0``.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -155,8 +160,13 @@ def read_plan_arrays(path: Path, resolution_m: float | None = None) -> PlanGrid 
                 raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
             resolution_m = float(_numbers(content["resolution_m"], path, "resolution_m").reshape(-1)[0])
         origin = _numbers(content.get("origin_m", np.zeros(2)), path, "origin_m")
-        return grid_from_probability(_probability(values), resolution_m, origin, str(path))
+        if origin.shape != (2,) or not np.isfinite(origin).all():
+            raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
+        row_0 = row_0 or _row_0(content, path)
+        return grid_from_probability(_probability(values), resolution_m, row_0, origin, str(path))
     if "xy_m" in content:
+        if row_0 is not None:
+            raise _no_rows(path, "it holds points, which have no rows")
         xy = _numbers(content["xy_m"], path, "xy_m")
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
@@ -165,6 +175,23 @@ def read_plan_arrays(path: Path, resolution_m: float | None = None) -> PlanGrid 
             raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
         return PlanPoints(xy, time)
     raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
+
+
+def _row_0(content: dict[str, NDArray[Any]], path: Path) -> Row0:
+    """What an NPZ file states about its first row."""
+    if "row_0" not in content:
+        way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, bottom if the smallest"
+        raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
+    stated = content["row_0"]
+    word = str(stated.astype(str).reshape(-1)[0]).strip().lower() if stated.size == 1 else str(stated.tolist())
+    for side in get_args(Row0):
+        if word == side:
+            return side
+    raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
+
+
+def _no_rows(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: --row-0 is for an occupancy grid in an NPZ file, and {why}; leave it out")
 
 
 def _numbers(values: NDArray[Any], path: Path, key: str) -> FloatArray:
@@ -185,7 +212,8 @@ def read_plan_picture(path: Path, resolution_m: float | None = None) -> PlanGrid
     """A map as a grey picture, dark where occupied: PGM or PNG, with the YAML file of a ROS map beside it or without.
 
     The YAML file has the picture's name or is given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw],
-    ``negate`` (https://wiki.ros.org/map_server); the yaw has to be zero. Its thresholds are not used.
+    ``negate`` (https://wiki.ros.org/map_server); the yaw has to be zero. Its thresholds are not used. The first row is
+    the top of the plan, and the origin its lower left corner, as the format defines them.
 
     Raises:
         InputError: unreadable, no resolution, or a turned origin.
@@ -216,7 +244,7 @@ def read_plan_picture(path: Path, resolution_m: float | None = None) -> PlanGrid
             grey = np.asarray(picture.convert("L"), float) / 255
     except OSError as error:
         raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
-    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, origin, str(path))
+    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
 
 
 def read_plan_text(path: Path) -> PlanPoints:
@@ -261,7 +289,9 @@ def _pair(words: list[str], path: Path, number: int) -> tuple[float, float]:
     return x, y
 
 
-def read_plan(path: str | Path, resolution_m: float | None = None) -> PlanGrid | PlanPoints | FloatArray:
+def read_plan(
+    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None
+) -> PlanGrid | PlanPoints | FloatArray:
     """Any file that shows a plan, told by its ending and its content.
 
     ``.npz`` with ``log_odds`` or ``xy_m``; ``.png``, ``.pgm``, ``.yaml`` (ROS map); ``.csv`` with the header ``x,y``
@@ -270,6 +300,7 @@ def read_plan(path: str | Path, resolution_m: float | None = None) -> PlanGrid |
     Args:
         path: of the file.
         resolution_m: side of a cell of a grid; wins over what the file says.
+        row_0: side of the plan where the first row of an NPZ grid lies; wins over what the file says.
 
     Returns:
         A grid, points, or wall vertices [n, 2].
@@ -280,9 +311,13 @@ def read_plan(path: str | Path, resolution_m: float | None = None) -> PlanGrid |
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .yaml, .csv or .xyz")
-    match path.suffix.lower():
+    suffix = path.suffix.lower()
+    if row_0 is not None and suffix != ".npz":
+        fixed = suffix in (".png", ".pgm", ".yaml", ".yml")
+        raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
+    match suffix:
         case ".npz":
-            return read_plan_arrays(path, resolution_m)
+            return read_plan_arrays(path, resolution_m, row_0)
         case ".png" | ".pgm" | ".yaml" | ".yml":
             return read_plan_picture(path, resolution_m)
         case ".csv":

@@ -160,6 +160,16 @@ def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatA
     return sample_walls(np.array(pieces), step_m)
 
 
+def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
+    """The turn about z and shift [4, 4] in which points [n, 2] fit walls [m, 2, 2] best, however badly."""
+    pose = find_poses(_thinned(points_m), walls_m)[0].pose
+    return _motion(rotation_2d(pose[2]), pose[:2])
+
+
+def _thinned(points_m: FloatArray) -> FloatArray:
+    return points_m[:: -(-len(points_m) // MOST_POINTS)]
+
+
 def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> Registration:
     """The turn about z and shift that lay a scene's walls on known walls.
 
@@ -178,7 +188,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     points, walls = np.asarray(points_m, float)[:, :2], np.asarray(walls_m, float)
     if len(points) < 3 or not len(walls):
         raise InputError(f"{name}: registration to walls needs points and walls, got {len(points)} and {len(walls)}")
-    points = points[:: -(-len(points) // MOST_POINTS)]
+    points = _thinned(points)
     fits = find_poses(points, walls)
     best = fits[0]
     residual = distance_to_walls(moved(points, best.pose), walls)
@@ -188,7 +198,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     if mirrored.score > max(best.score + CLEAR_LEAD, LEAST_AGREEMENT):
         raise InputError(
             f"{name}: its mirror image fits the walls better (agreement {mirrored.score:.2f}, not {best.score:.2f}); "
-            "turn the order of the rows of the grid or the sign of one axis"
+            "give the other row_0 of a grid (--row-0), or change the sign of one axis"
         )
     if best.score < LEAST_AGREEMENT:
         scale = best_scale(points, best, walls)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -47,3 +47,13 @@ def number_names(kinds: Sequence[Kind]) -> list[str]:
         seen[kind] += 1
         names.append(kind if kinds.count(kind) == 1 else f"{kind}_{seen[kind]:02d}")
     return names
+
+
+def moved_points(points_m: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Points [n, 3] moved by a matrix [4, 4]."""
+    return points_m @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
+    """Surfaces moved by a matrix [4, 4]."""
+    return [replace(surface, vertices_m=moved_points(surface.vertices_m, matrix)) for surface in surfaces]

@@ -1,0 +1,217 @@
+"""Measured positions against the walls of a scene: a mirrored plan has walls where somebody walked.
+
+Nobody walks through a wall. The shortest lines that join the measured positions (a minimum spanning tree, which needs
+no order of them) stay within rooms and pass through open doors, so few of them cross a wall. In the reflection of the
+building many do, or positions lie outside the floor.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import shapely
+import trimesh
+from scipy import sparse
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..measure.csv_table import read_csv
+from .plan_sources import PlanGrid
+from .register import best_motion, wall_points
+from .surfaces import Surface, moved
+
+logger = logging.getLogger(__name__)
+
+CELL_M = 0.1
+"""Of positions in one square of this side one is used: a robot that stands still adds nothing."""
+REACH_M = 1.0
+"""Longest line between two positions that tells where somebody walked."""
+NEIGHBOURS = 8
+"""Nearest positions among which the lines are looked for."""
+OUTSIDE_M = 0.2
+"""A position this far beyond the floor's edge lies outside: the blur of a robot's map."""
+WALKING_HEIGHT_M = 1.0
+"""Above the lowest floor: where walls are cut if the positions have no height; doors are open there."""
+EDGE_SHARE = 0.1
+"""Share of the walls' height, from below and above, within which they are not cut."""
+TOLERATED, TOLERATED_SHARE = 1, 0.005
+"""Conflicts, and share of the positions in conflict, that tell nothing: a cupboard taken for a wall, a position that is
+off. Walls found from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
+LARGEST_SHARE = 0.1
+"""A larger share of positions in conflict is refused though no reflection fits better."""
+
+
+@dataclass(frozen=True)
+class Conflicts:
+    """How badly positions fit a scene.
+
+    Attributes:
+        crossings: lines between neighbouring positions that cross a wall.
+        outside: positions that do not lie over a floor or below a ceiling.
+    """
+
+    crossings: int
+    outside: int
+
+    @property
+    def total(self) -> int:
+        """Crossings and positions outside."""
+        return self.crossings + self.outside
+
+
+def read_positions(path: str | Path) -> FloatArray:
+    """Measured positions from a CSV file with the columns x, y and perhaps z in metres; others are ignored.
+
+    Returns:
+        Shape [n, 3], z NaN where the file has none.
+
+    Raises:
+        InputError: missing, no such column, or a field that is not a finite number.
+    """
+    table = read_csv(Path(path), skip_blank=True)
+    table = replace(table, header=[name.lower() for name in table.header])
+    z = table.numbers("z") if "z" in table.header else np.full(len(table.rows), np.nan)
+    return np.stack([table.numbers("x"), table.numbers("y"), z], axis=-1)
+
+
+def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> Conflicts:
+    """How often positions are in conflict with a scene's walls and floors.
+
+    Args:
+        positions_m: shape [n, 3]; z NaN where it is not known.
+        surfaces: in the same frame; those of kind wall are crossed, floors and ceilings are where positions may lie.
+
+    Raises:
+        InputError: there is no wall.
+    """
+    walls = [surface for surface in surfaces if surface.kind == "wall"]
+    if not walls:
+        raise InputError("the scene has no wall that positions could cross; leave out --positions")
+    places = _distinct(positions_m)
+    lines = shapely.linestrings(_joined(places))
+    cut = shapely.STRtree(shapely.linestrings(_cut(walls, surfaces, positions_m[:, 2])))
+    crossings = len(np.unique(cut.query(lines, predicate="intersects")[0]))
+    level = [surface for surface in surfaces if surface.kind in ("floor", "ceiling")]
+    if not level:
+        return Conflicts(crossings, 0)
+    corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in level])
+    area = shapely.buffer(shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6)), OUTSIDE_M)
+    return Conflicts(crossings, int(np.count_nonzero(~shapely.contains_xy(area, places))))
+
+
+def check_positions(
+    positions_m: FloatArray,
+    surfaces: Sequence[Surface],
+    mirrored: Sequence[tuple[str, Sequence[Surface]]],
+    name: str,
+) -> None:
+    """Refuse a scene that measured positions do not fit, above all a mirrored one.
+
+    Args:
+        positions_m: shape [n, 3] in the scene's frame; z NaN where it is not known.
+        surfaces: of the scene.
+        mirrored: the remedy that undoes each reflection of the source, and the surfaces of it (`reflections`).
+        name: of the source and the positions, for errors.
+
+    Raises:
+        InputError: a reflection fits the positions clearly better, or the positions fit neither.
+    """
+    count = len(_distinct(positions_m))
+    here = conflicts(positions_m, surfaces)
+    others = [(remedy, conflicts(positions_m, those)) for remedy, those in mirrored]
+    remedy, best = min(others, key=lambda pair: pair[1].total)
+    lines = f"{here.crossings} lines between neighbouring positions cross walls"
+    text = f"{name}: {lines} and {here.outside} of {count} positions lie outside"
+    text += f"; mirrored it is {best.crossings} and {best.outside}"
+    tolerated = TOLERATED + TOLERATED_SHARE * count
+    if here.total > 2 * best.total + tolerated:
+        raise InputError(f"{text}: {remedy}")
+    if here.total > tolerated + LARGEST_SHARE * count:
+        raise InputError(f"{text}: check the registration and the frame of the positions")
+    logger.info("%s", text)
+
+
+def reflections(
+    surfaces: Sequence[Surface],
+    file: Path,
+    grid: PlanGrid | None,
+    matrix: FloatArray | None,
+    known_walls_m: FloatArray | None,
+) -> list[tuple[str, list[Surface]]]:
+    """The scenes that a source would make if its y, or its x, ran the other way.
+
+    Args:
+        surfaces: of the source, in its frame.
+        file: the source, for the remedy.
+        grid: the source's cells if it is an occupancy grid: rows that run the other way keep the middle of its rows.
+        matrix: registration of the source [4, 4], or None.
+        known_walls_m: end points [m, 2, 2] of walls that the source was registered to; each reflection is registered
+            to them anew.
+
+    Returns:
+        The remedy and the surfaces of each reflection.
+    """
+    if grid is not None:
+        # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.
+        totals = 2 * grid.origin_m + grid.resolution_m * np.array(grid.occupied.shape[::-1])
+        remedies = ("reverse its columns", "give the other row_0, in the file or by --row-0")
+        if file.suffix.lower() != ".npz":
+            remedies = ("flip the picture left to right", "flip the picture upside down")
+        flips = [(axis, float(totals[axis]), remedies[axis]) for axis in (1, 0)]
+    else:
+        vertices = np.concatenate([surface.vertices_m for surface in surfaces])
+        totals = vertices.min(axis=0) + vertices.max(axis=0)
+        flips = [(axis, 0.0, f"change the sign of its {'xy'[axis]}") for axis in (1, 0)]
+        for axis, letter in ((1, "y"), (0, "x")):
+            flips.append((axis, float(totals[axis]), f"replace its {letter} by {totals[axis]:.6g} - {letter}"))
+    if known_walls_m is not None:
+        del flips[1:]  # all reflections are the same once they are registered
+    found = []
+    for axis, total, remedy in flips:
+        flip = np.eye(4)
+        flip[axis, axis], flip[axis, 3] = -1, total
+        mirrored = moved(surfaces, flip)
+        motion = best_motion(wall_points(mirrored), known_walls_m) if known_walls_m is not None else matrix
+        found.append((remedy, mirrored if motion is None else moved(mirrored, motion)))
+    return found
+
+
+def _distinct(positions_m: FloatArray) -> FloatArray:
+    """Positions [k, 2] seen from above, one of each cell."""
+    xy = positions_m[:, :2]
+    _, first = np.unique(np.floor(xy / CELL_M).astype(np.int64), axis=0, return_index=True)
+    return np.asarray(xy[np.sort(first)])
+
+
+def _joined(places_m: FloatArray) -> FloatArray:
+    """End points [m, 2, 2] of the shortest lines that join neighbouring places [n, 2]."""
+    n = len(places_m)
+    if n < 2:
+        return np.empty((0, 2, 2))
+    length, other = cKDTree(places_m).query(places_m, k=min(NEIGHBOURS + 1, n), distance_upper_bound=REACH_M)
+    near = np.isfinite(length) & (length > 0)
+    one = np.broadcast_to(np.arange(n)[:, None], other.shape)
+    tree = minimum_spanning_tree(sparse.csr_array((length[near], (one[near], other[near])), shape=(n, n))).tocoo()
+    return np.stack([places_m[tree.row], places_m[tree.col]], axis=1)
+
+
+def _cut(walls: Sequence[Surface], surfaces: Sequence[Surface], z_m: FloatArray) -> FloatArray:
+    """End points [m, 2, 2] of where walls are at the height of the positions, or at `WALKING_HEIGHT_M`."""
+    heights = np.concatenate([wall.vertices_m[:, 2] for wall in walls])
+    low, high = heights.min(), heights.max()
+    at = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
+    if np.isfinite(z_m).all():
+        at = float(np.median(z_m))
+    margin = EDGE_SHARE * (high - low)
+    at = float(np.clip(at, low + margin, high - margin))
+    parts = []
+    for wall in walls:
+        mesh = trimesh.Trimesh(wall.vertices_m, wall.faces, process=False)
+        parts.append(trimesh.intersections.mesh_plane(mesh, (0, 0, 1), (0, 0, at)))
+    return np.concatenate(parts)[..., :2]
