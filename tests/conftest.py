@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from made_flat import write_flat
+from made_flat import write_flat, write_plain_flat
 
 if TYPE_CHECKING:
     from wrf_mi.core import Record
@@ -53,3 +53,9 @@ def folder(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Signal strengths in a flat of one room."""
     return write_flat(tmp_path_factory.mktemp("data") / "flat")
+
+
+@pytest.fixture(scope="session")
+def plain_flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same without headings, with heights that differ and anchors that have names."""
+    return write_plain_flat(tmp_path_factory.mktemp("data") / "plain")

@@ -38,6 +38,7 @@ def make_run(
         truth=truth,
         tx_pos=np.zeros((len(rows), 3)),
         reference_idw4=blend.astype(np.float32),
+        **({} if receivers is None else {"receiver_name": [f"gateway{r}" for r in range(receivers)]}),
     )
     metrics = {
         "task": "spectrum",
@@ -173,10 +174,12 @@ def test_blend_is_drawn_once_for_the_same_rows(tmp_path, monkeypatch):
     assert list(references) == ["blend of 4 nearest, official", "blend of 4 nearest, official of c"]
 
 
-def test_several_receivers_are_pooled(tmp_path):
+def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
+    calls = captured(monkeypatch, "spectrum_table")
     run = make_run(tmp_path / "two", receivers=2)
     assert read_run(run).score.shape == (2, 6)
     compare([run], tmp_path / "out")
+    assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in calls[-1][0])
 
 
 def test_runs_of_the_same_name_are_told_apart(tmp_path):

@@ -1,5 +1,6 @@
 """The layout of the BLE signal-strength data: what is read, and every way in which a folder can be wrong."""
 
+import logging
 import os
 import re
 from pathlib import Path
@@ -57,6 +58,39 @@ def test_reads_a_folder(folder: Path):
     assert load(folder).task == "rssi"
 
 
+def test_heights_are_those_of_the_rows(folder: Path):
+    heights("0.25", "2.5")(folder)
+    record = read_ble_folder(folder)
+    np.testing.assert_array_equal(record.tx_pos_m[:, 2], [0.25, 0.25, 0.25, 0.25, 2.5])
+    np.testing.assert_array_equal(record.tx_pos_m[:, :2], [[0.5, 1.5], [0.25, 1.75], [1, 2], [1.25, 2], [2, 3]])
+
+
+def test_the_default_height_is_logged(folder: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO, "wrf_mi"):
+        read_ble_folder(folder)
+        assert caplog.messages == [f"{folder}: no column z; all transmitters are taken to be 1.3 m above the floor"]
+        caplog.clear()
+        heights("1", "1")(folder)
+        read_ble_folder(folder)
+        assert caplog.messages == []
+
+
+def test_headings_are_optional(folder: Path):
+    for name in (TRAIN_FILE, TEST_FILE):
+        text(name, "heading", "yaw")(folder)
+    assert read_ble_folder(folder).tx_heading_rad is None
+
+
+def test_anchors_have_numbers_or_names(folder: Path):
+    (folder / "anchors.csv").write_text('id,x,y,z\n"hall, upper",1,2,2.5\n4e10,0,-1,2\n07,3,3,3\nKüche,0,0,1\n')
+    header = 'rssi_4e10, rssi_Küche ,y,x,rssi_7.0,"rssi_hall, upper"'
+    (folder / TRAIN_FILE).write_text(f"{header}\n-1,-2,0,0,-3,-4\n")
+    (folder / TEST_FILE).write_text(f"{header}\n-5,-6,0,0,-7,-8\n")
+    record = read_ble_folder(folder)
+    assert [r.name for r in record.receivers] == ["hall, upper", "4e10", "anchor7", "Küche"]
+    np.testing.assert_array_equal(record.observation, [[-4, -8], [-1, -5], [-3, -7], [-2, -6]])
+
+
 def test_rows_that_no_anchor_received_are_in_no_split(folder: Path):
     (split,) = make_splits(read_ble_folder(folder), "official")
     assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1, 3], [4])
@@ -77,6 +111,17 @@ def text(name: str, old: str, new: str):
 def write(name: str, content: str | bytes):
     def change(folder: Path) -> None:
         (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def heights(training: str, test: str):
+    """Add a column z with one text for each file."""
+
+    def change(folder: Path) -> None:
+        for name, value in ((TRAIN_FILE, training), (TEST_FILE, test)):
+            header, *rows = (folder / name).read_text().splitlines()
+            (folder / name).write_text("\n".join([f"z,{header}", *(f"{value},{row}" for row in rows)]) + "\n")
 
     return change
 
@@ -105,7 +150,15 @@ WRONG = {
     "not text": (write(TRAIN_FILE, b"\xff\xfe\x00"), TRAIN_FILE, "cannot be read"),
     "no header": (text(TEST_FILE, r"^ts.*\n", "1,2,3,4,5,6\n"), TEST_FILE, "line 1: header '1,2,3,4,5,6' has no col"),
     "no column x": (text(TRAIN_FILE, ",x,", ",X,"), TRAIN_FILE, "line 1: header .* has no column x;"),
-    "no heading": (text(TRAIN_FILE, "heading", "yaw"), TRAIN_FILE, "no column heading"),
+    "heading for the test rows alone": (
+        text(TRAIN_FILE, "heading", "yaw"),
+        TRAIN_FILE,
+        r"line 1: no column heading, but test_robot_df\.csv has one; give it in both files or in neither",
+    ),
+    "heading for the training rows alone": (text(TEST_FILE, "heading", "yaw"), TEST_FILE, "no column heading, but cal"),
+    "height of the training rows alone": (text(TRAIN_FILE, "ts", "z"), TEST_FILE, "no column z, but calibration_df"),
+    "NaN height": (heights("0.4", "nan"), TEST_FILE, "row 1: z is 'nan'"),
+    "empty height": (heights("", "1"), TRAIN_FILE, "row 1: z is ''"),
     "column twice": (text(TRAIN_FILE, "ts", "x"), TRAIN_FILE, "has twice the column x"),
     "no z of anchors": (text("anchors.csv", "z", "height"), "anchors.csv", "no column z"),
     "position of words": (text(TRAIN_FILE, "0.25", "here"), TRAIN_FILE, "row 2: x is 'here'; give a finite number"),
@@ -130,8 +183,18 @@ WRONG = {
         r"2 columns rssi_\*, but anchors.csv has 3 anchors \(rssi_7 is missing\)",
     ),
     "anchor with another id": (text(TEST_FILE, "rssi_3", "rssi_2"), TEST_FILE, r"rssi_2 belongs to none"),
-    "anchor twice": (text("anchors.csv", "^1", "3"), "anchors.csv", "row 2: id is '3'; number the anchors"),
-    "anchor with half a number": (text("anchors.csv", "^1", "1.5"), "anchors.csv", "row 2: id is '1.5'"),
+    "column of an anchor twice": (text(TRAIN_FILE, "^,ts", "rssi_01,ts"), TRAIN_FILE, "rssi_01 and rssi_1 name one"),
+    "anchor twice": (text("anchors.csv", "^1", "3"), "anchors.csv", "row 2: id '3' gives the name anchor3, as row 1"),
+    "anchor twice in another form": (text("anchors.csv", "^1", "03.0"), "anchors.csv", "row 2: id '03.0' gives the na"),
+    "anchor with the name of a number": (text("anchors.csv", "^1", "anchor3"), "anchors.csv", "row 2: id 'anchor3' gi"),
+    "anchor with half a number": (text("anchors.csv", "^1", "1.5"), "anchors.csv", "row 2: id '1.5' is neither a who"),
+    "anchor without an id": (text("anchors.csv", "^1", " "), "anchors.csv", "row 2: id ' ' is empty"),
+    "anchor of pandas without an id": (text("anchors.csv", "^1", "nan"), "anchors.csv", "row 2: id 'nan' is neither"),
+    "anchor named like a path": (text("anchors.csv", "^1", "../up"), "anchors.csv", r"row 2: id '\.\./up' cannot name"),
+    "anchor named like a Windows path": (text("anchors.csv", "^1", r"a\\b"), "anchors.csv", "row 2: id .* cannot name"),
+    "anchor named like a folder": (text("anchors.csv", "^1", ".."), "anchors.csv", r"row 2: id '\.\.' cannot name a"),
+    "anchor with a tab in it": (text("anchors.csv", "^1", "a\tb"), "anchors.csv", "row 2: id .* does not go into one"),
+    "no ids": (text("anchors.csv", "id", "number"), "anchors.csv", "has no column id"),
     "NaN anchor": (text("anchors.csv", "-1", "nan"), "anchors.csv", "row 2: y is 'nan'"),
 }
 

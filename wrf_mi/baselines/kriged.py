@@ -70,8 +70,11 @@ def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, list
     """Krige what each receiver received.
 
     Raises:
-        InputError: settings out of range, positions that are not known, or too few rows.
+        InputError: settings out of range, a length over headings where the data have none, positions that are not
+            known, or too few rows.
     """
+    if settings.heading_length is not None and record.tx_heading_rad is None:
+        raise InputError(f"{record.name}: has no headings for kriging's heading_length; leave the setting away")
     name = settings.trend or (LOG_DISTANCE if record.task == "rssi" else CONSTANT)
     how = settings.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):

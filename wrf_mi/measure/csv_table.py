@@ -38,11 +38,23 @@ class CsvTable:
         Raises:
             InputError: no such column, or a field that is not a finite number, in single precision too.
         """
+        return self.numbers_at(self._place(column), column, may_be_empty)
+
+    def texts(self, column: str) -> list[str]:
+        """Fields of a column as they stand.
+
+        Raises:
+            InputError: no such column.
+        """
+        place = self._place(column)
+        return [fields[place] for fields in self.rows]
+
+    def _place(self, column: str) -> int:
         if self.header.count(column) != 1:
             what = "has no column" if column not in self.header else "has twice the column"
             text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
             raise InputError(f"{self.path}: {text}; the first line must name each column once")
-        return self.numbers_at(self.header.index(column), column, may_be_empty)
+        return self.header.index(column)
 
     def numbers_at(self, place: int, what: str, may_be_empty: bool = False) -> FloatArray:
         """Numbers of the column at a place from 0, whatever its name: ``numbers`` with what messages call it."""

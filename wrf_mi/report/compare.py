@@ -82,7 +82,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     write_atomically(folder / "compare.csv", text.getvalue())
     for _, pictures in sections:
         for name, _, figure in pictures:
-            figures.save(figure, folder / name)
+            figures.save(figures.without_formulas(figure), folder / name)
     shown = [(heading, [(folder / name, title) for name, title, _ in pictures]) for heading, pictures in sections]
     return write_atomically(folder / "index.html", _page(table, shown))
 
@@ -185,7 +185,7 @@ def _spectra(runs: Sequence[Run]) -> tuple[str, Figure]:
         receiver, chosen = np.unravel_index(order[round(quantile * (len(order) - 1))], score.shape)
         m = int(candidates[chosen])
         places = [_position(run, first, m) for run in runs]
-        name = f"row {first.row[m]}" + (f", receiver {receiver}" if len(first.truth) > 1 else "")
+        name = f"row {first.row[m]}" + (f", {first.receivers[receiver]}" if len(first.truth) > 1 else "")
         predictions = [None if p is None else run.prediction[receiver, p] for run, p in zip(runs, places, strict=True)]
         rows.append((name, [first.truth[receiver, m], *predictions, first.reference[receiver, m]]))
     columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]

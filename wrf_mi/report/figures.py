@@ -15,6 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import ArrayLike
 
 from wrf_mi.core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
@@ -235,6 +236,13 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figu
     axes.set_ylabel("SSIM on held-out validation rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    return figure
+
+
+def without_formulas(figure: Figure) -> Figure:
+    """The figure with every text as it stands: names may hold dollar signs, between which Matplotlib sees a formula."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     return figure
 
 
