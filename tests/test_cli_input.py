@@ -161,5 +161,6 @@ def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.
     good, out = ["--tx", tmp_path / "tx.csv"], ["--out", tmp_path / "out.npz"]
     refused(["predict", run, "--tx", tmp_path / "no.csv", *out], "no.csv: no such file", capsys)
     refused(["predict", tmp_path, *good, *out], "no config.yaml, so not a run folder", capsys)
-    refused(["predict", run, *good, "--out", tmp_path], "choose another place", capsys)
+    (tmp_path / "folder.npz").mkdir()
+    refused(["predict", run, *good, "--out", tmp_path / "folder.npz"], "choose another place", capsys)
     refused(["predict", run, *good, "--out", tmp_path / "tx.csv" / "out.npz"], "choose another place", capsys)

@@ -10,8 +10,13 @@ import pytest
 from calling import call, refused, stored
 from made_flat import NAMED_ANCHORS_M
 
-from wrf_mi.measure import load
+from wrf_mi.core import Record
+from wrf_mi.measure import load, write_spectrum_folder
+from wrf_mi.measure.csv_table import read_csv
+from wrf_mi.report.baseline_run import train_baseline
 from wrf_mi.report.compare import compare
+from wrf_mi.report.prediction_file import write_prediction_file
+from wrf_mi.report.tx_file import read_inputs
 
 NAMES = list(NAMED_ANCHORS_M)
 MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": (), "hybrid": ()}
@@ -51,6 +56,67 @@ def test_models_see_the_height(
     assert call(["predict", runs[model], "--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.npz"], capsys)[0] == 0
     with np.load(tmp_path / "out.npz") as found:
         assert (np.abs(np.diff(found["prediction"], axis=1)) > 1e-3).any()
+
+
+@pytest.mark.parametrize("model", ["mri", "hybrid"])
+def test_predicted_table_holds_what_the_arrays_do(
+    model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tx.csv").write_text("x,y,z,heading_rad\n0.1,2,0.5,0.3\n3,1,1.75,-1\n")
+    for name in ("out.npz", "out.CSV"):
+        given = ["predict", runs[model], "--tx", tmp_path / "tx.csv", "--out", tmp_path / name, "--json"]
+        status, printed, err = call(given, capsys)
+        assert (status, err) == (0, "")
+    assert json.loads(printed)["arrays"]["prediction"] == [2, 2]
+    table = read_csv(tmp_path / "out.CSV")
+    with np.load(tmp_path / "out.npz") as found:
+        arrays = dict(found)
+    assert ("std" in arrays) == (model == "hybrid")
+    values = {"prediction": "dbm"} | ({"std": "std_db"} if "std" in arrays else {})
+    names = [f"{name}_{unit}" for unit in values.values() for name in NAMES]
+    assert table.header == ["x", "y", "z", "heading_rad", *names]
+    for key, unit in values.items():
+        for r, name in enumerate(NAMES):
+            np.testing.assert_array_equal(table.numbers(f"{name}_{unit}").astype(arrays[key].dtype), arrays[key][r])
+    # The table begins with the columns that `predict --tx` reads.
+    asked = read_inputs(tmp_path / "out.CSV", None)
+    np.testing.assert_array_equal(asked.tx_pos_m, [[0.1, 2, 0.5], [3, 1, 1.75]])
+    np.testing.assert_array_equal(asked.tx_heading_rad, [0.3, -1])
+
+
+def test_table_of_one_receiver_has_empty_fields_where_nothing_is_received(tmp_path: Path) -> None:
+    """And names that CSV quotes."""
+    arrays = {
+        "row": np.arange(2),
+        "prediction": np.array([[-50.25, np.nan]], np.float32),
+        "tx_pos": np.arange(6).reshape(2, 3),
+        "receiver_name": np.array(['hall, "upper"']),
+    }
+    assert write_prediction_file(tmp_path / "out.csv", arrays, None)["prediction"].shape == (2,)
+    table = read_csv(tmp_path / "out.csv")
+    np.testing.assert_array_equal(table.numbers('hall, "upper"_dbm', may_be_empty=True), [-50.25, np.nan])
+    assert (tmp_path / "out.csv").read_text().splitlines()[2] == "3.0,4.0,5.0,"
+
+
+@pytest.mark.parametrize("name", ["out", "out.txt", "out.csv.gz", "out.npy"])
+def test_files_of_other_forms_are_refused(
+    name: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tx.csv").write_text("x,y,z\n0.1,2,0.5\n")
+    given = ["predict", runs["mri"], "--tx", tmp_path / "tx.csv", "--out", tmp_path / "new" / name]
+    refused(given, f"{name}: predictions are written as .npz, or signal strengths as .csv; give such a name", capsys)
+    assert not (tmp_path / "new").exists()
+
+
+def test_table_of_spectra_is_refused(one_gateway: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_spectrum_folder(tmp_path / "data", one_gateway)
+    run = train_baseline(data, tmp_path / "run", "idw")
+    (tmp_path / "tx.csv").write_text("x,y,z\n0.1,2,0.5\n")
+    given = ["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.csv"]
+    refused(given, r"out\.csv: \.csv holds signal strengths \(rssi\), .* predicts spectrum; give out\.npz", capsys)
+    assert not (tmp_path / "out.csv").exists()
+    (run / "metrics.json").unlink()
+    refused(given, "no metrics.json, so no finished run", capsys)
 
 
 def test_comparison_shows_names_as_they_are(runs: dict[str, Path], tmp_path: Path) -> None:

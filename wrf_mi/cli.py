@@ -237,7 +237,8 @@ def _parser() -> argparse.ArgumentParser:
     text = "array tx_pos [m, 3] in metres (and heading_rad [m]), or uplink [m, antennas, subcarriers]"
     given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
     given.add_argument("--input", metavar="FILE.npz", help=text)
-    sub.add_argument("--out", required=True, metavar="FILE.npz")
+    text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
+    sub.add_argument("--out", required=True, metavar="FILE", help=text)
     _add_operator(sub)
     _add_scheduler(sub)
 

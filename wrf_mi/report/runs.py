@@ -35,8 +35,9 @@ from ..measure import make_splits
 from ..parallel import Scheduler, row_parts
 from ..trace import load_record
 from .baseline_run import evaluate_baseline, is_baseline, open_baseline
-from .evaluate import Predict, evaluate, pool, stored_metrics, write_predictions, write_results
+from .evaluate import Predict, evaluate, pool, stored_metrics, write_results
 from .hybrid_run import evaluate_hybrid, is_hybrid, open_hybrid, predict_with
+from .prediction_file import check_prediction_file, write_prediction_file
 from .run_folder import CONFIG, METRICS
 from .traced import TracedRun, evaluate_traced, is_traced
 
@@ -276,14 +277,14 @@ def predict_to_file(
     operator: bool = True,
     uplink: NDArray[Any] | None = None,
 ) -> dict[str, tuple[int, ...]]:
-    """What a run's model predicts at new transmitter positions, as an ``.npz`` file.
+    """What a run's model predicts at new transmitter positions, as an ``.npz`` or ``.csv`` file.
 
     Args:
         folder: run folder with one field.
         tx_pos_m: positions [m, 3], metres; NaN where they are not known.
-        out: file to write; keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
+        out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and of a hybrid
-            ``std``.
+            ``std``. ``.csv``, signal strengths alone: see `wrf_mi.report.prediction_file.write_prediction_file`.
         tx_heading_rad: how the transmitter is turned, [m]; only a hybrid and baselines for signal strengths use it.
         scheduler: what computes parts of the positions; None: this process. Its workers must see the run folder, and
             the data set and scene of a traced or hybrid run, under the same names.
@@ -291,13 +292,14 @@ def predict_to_file(
         uplink: uplink channels [m, antennas, subcarriers], for a baseline that predicts from them.
 
     Returns:
-        Shape of each array in the file.
+        Shape of each array that ``.npz`` has.
 
     Raises:
-        InputError: a run over several blocks, positions that are not known, or headings or an uplink for a model
-            without.
+        InputError: a run over several blocks, positions that are not known, headings or an uplink for a model
+            without, or a file name with another suffix or of a form that does not hold what the run predicts.
     """
     path, asked = Path(folder), Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink)
+    check_prediction_file(Path(out), path)
     if not is_baseline(path):
         if tx_heading_rad is not None and not is_hybrid(path):
             raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
@@ -320,7 +322,8 @@ def predict_to_file(
     }
     if stds[0] is not None:
         arrays["std"] = np.concatenate(stds, axis=1).astype(np.float32)
-    return {key: value.shape for key, value in write_predictions(Path(out), arrays).items()}
+    written = write_prediction_file(Path(out), arrays, tx_heading_rad)
+    return {key: value.shape for key, value in written.items()}
 
 
 def open_run(folder: Path, operator: bool = True) -> Callable[[Inputs, int], Estimates]:
