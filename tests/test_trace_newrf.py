@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from traced_rooms import SHOEBOX, receiver, room
+import trimesh
+from traced_rooms import FREQUENCY_HZ, SHOEBOX, WAVELENGTH_M, inside, receiver, room
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.report.bench_trace import confirm_paths, image_method_agreement, match_paths
@@ -30,6 +31,36 @@ def test_the_paths_of_another_ray_tracer_are_found(name: str):
     assert found["cea_db_where_matlab_lacks_none"]["p10"] >= CEA_DB
     # What MATLAB lacks is there, by brute force in float64.
     assert found["of_these_confirmed"] == found["paths_matlab_lacks"]
+
+
+@pytest.mark.parametrize("reference", ["line of sight alone", "no path"])
+def test_a_reference_that_lacks_a_path_at_every_position_is_compared(tmp_path: Path, reference: str):
+    mesh = trimesh.util.concatenate([part for _, part in SHOEBOX.values()])
+    mesh.export(tmp_path / "room.stl")
+    moving, fixed, k = inside(3), np.array([4.4, 3.1, 1.7]), 2 * np.pi / WAVELENGTH_M
+    count = len(moving) if reference == "line of sight alone" else 0
+    length = np.linalg.norm(moving - fixed, axis=1)[:count]
+    gain = (WAVELENGTH_M / (4 * np.pi * length) * np.exp(-1j * k * length)).astype(complex)
+    np.savez(
+        tmp_path / "room.npz",
+        tx_pos=fixed,
+        rx_pos=moving,
+        frequency_hz=FREQUENCY_HZ,
+        csi=gain if count else np.zeros(len(moving), complex),
+        line_of_sight=np.full(len(moving), count > 0),
+        path_offsets=np.arange(len(moving) + 1) if count else np.zeros(len(moving) + 1, np.int64),
+        path_gain=gain,
+        path_last_point=np.tile(fixed, (count, 1)),
+    )
+    found = image_method_agreement(tmp_path / "room.npz", rays=1 << 12)
+    assert found["receivers_matlab_lacks_paths"] == found["receivers"] == 3
+    assert found["of_these_confirmed"] == found["paths_matlab_lacks"] > 50
+    assert found["cea_db_where_matlab_lacks_none"] is None
+    if count:
+        assert found["share_found"] == 1
+        assert found["cea_db"]["median"] < 10
+    else:
+        assert found["share_found"] is found["cea_db"] is None
 
 
 def test_matching_is_one_to_one():

@@ -49,8 +49,9 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
         seed: of the rays.
 
     Returns:
-        Counts and shares of paths, errors in metres, ``cea_db`` over all receivers and over those where MATLAB lacks no
-        path, seconds, and the process's memory.
+        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers that MATLAB has a
+        channel for and over those of them where MATLAB lacks no path, seconds, and the process's memory. Quantiles
+        of no receiver and the share of no path are None.
 
     Raises:
         InputError: the room's files are missing or damaged.
@@ -85,23 +86,25 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
         n_tx=paths.n_tx,
         n_rx=paths.n_rx,
     )
-    error = csi(free_space, frequency_hz)[0, :, 0] - data["csi"]
-    cea = -20 * np.log10(np.abs(error) / np.abs(data["csi"]))
-    complete = ~np.isin(np.arange(paths.n_tx), paths.tx[extra])
+    # An error relative to a channel that is zero, as where MATLAB has no path, is not defined.
+    reached = np.flatnonzero(data["csi"])
+    error = csi(free_space, frequency_hz)[0, reached, 0] - data["csi"][reached]
+    cea = -20 * np.log10(np.abs(error) / np.abs(data["csi"][reached]))
+    incomplete = np.unique(paths.tx[extra])
     return {
         "room": file.stem,
         "receivers": paths.n_tx,
         "rays": trace.rays,
         "paths_matlab": len(row),
         "paths_found": len(theirs),
-        "share_found": len(theirs) / len(row),
+        "share_found": len(theirs) / len(row) if len(row) else None,
         "length_error_m": float(np.abs(paths.length_m[ours] - length[theirs]).max(initial=0)),
         "missing_within_1cm_of_receiver": int((last < SHORTEST_M).sum()),
         "paths_matlab_lacks": len(extra),
         "of_these_confirmed": int(confirmed.sum()),
-        "receivers_matlab_lacks_paths": int((~complete).sum()),
+        "receivers_matlab_lacks_paths": len(incomplete),
         "cea_db": _quantiles(cea),
-        "cea_db_where_matlab_lacks_none": _quantiles(cea[complete]),
+        "cea_db_where_matlab_lacks_none": _quantiles(cea[~np.isin(reached, incomplete)]),
         "seconds": seconds,
         "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
@@ -191,7 +194,10 @@ def _mirrors(before: FloatArray, at: FloatArray, after: FloatArray, triangles: F
     return bool((np.abs(n[holds] @ half) > 1 - MIRRORED).any())
 
 
-def _quantiles(values: FloatArray) -> dict[str, float]:
+def _quantiles(values: FloatArray) -> dict[str, float] | None:
+    """Median, mean, 10th and 90th percentile; None of no values."""
+    if not len(values):
+        return None
     p10, median, p90 = np.percentile(values, [10, 50, 90])
     return {"median": float(median), "mean": float(values.mean()), "p10": float(p10), "p90": float(p90)}
 
