@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import InputError, Record
 from wrf_mi.measure import load
+from wrf_mi.report import traced
 from wrf_mi.report.compare import compare
 from wrf_mi.report.run_folder import read_run
 from wrf_mi.report.runs import evaluate_run, predict_to_file
@@ -77,17 +79,85 @@ def test_scoring_again_needs_no_tracing_and_says_the_same(run: Path, monkeypatch
 
 
 def test_saved_paths_are_those_of_the_record(flat_folder: Path, run: Path) -> None:
-    traced = load_trace(run / "paths.npz")
+    stored = load_trace(run / "paths.npz")
     record = load(flat_folder)
-    np.testing.assert_array_equal(traced.tx_pos_m, record.tx_pos_m)
-    assert traced.paths.n_rx == len(record.receivers)
-    assert traced.options == TraceOptions(reflection=False, max_depth=0)
+    np.testing.assert_array_equal(stored.tx_pos_m, record.tx_pos_m)
+    assert stored.paths.n_rx == len(record.receivers)
+    assert stored.options == TraceOptions(reflection=False, max_depth=0)
 
 
-def test_calibration_is_kept_and_scores_again_and_predicts(
-    flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.fixture(scope="module")
+def calibrated(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trace_run(room, flat_folder, tmp_path_factory.mktemp("runs") / "calibrated", DIRECT, calibration="patterns")
+
+
+def asked_rows(run: Path, record: Record, file: Path, heading: np.ndarray | None) -> Path:
+    """The run's test rows as a file of `wrf-mi predict`, CSV or npz by its name."""
+    tx_pos = record.tx_pos_m[read_run(run).row]
+    if file.suffix == ".npz":
+        np.savez(file, tx_pos=tx_pos, **({} if heading is None else {"heading_rad": heading}))
+        return file
+    table = tx_pos if heading is None else np.column_stack([tx_pos, heading])
+    header = "x,y,z" if heading is None else "x,y,z,heading_rad"
+    np.savetxt(file, table, "%.17g", ",", header=header, comments="")
+    return file
+
+
+@pytest.mark.parametrize(("option", "name"), [("--tx", "tx.csv"), ("--input", "tx.npz")])
+def test_calibrated_run_reproduces_its_predictions_from_positions_and_headings(
+    option: str, name: str, flat_folder: Path, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = trace_run(room, flat_folder, tmp_path / "run", DIRECT, calibration="patterns")
+    record, read = load(flat_folder), read_run(calibrated)
+    assert record.tx_heading_rad is not None
+    heading, out = record.tx_heading_rad[read.row], tmp_path / "p.npz"
+    asked = asked_rows(calibrated, record, tmp_path / name, heading)
+    status, _, err = call(["predict", calibrated, option, asked, "--out", out], capsys)
+    assert status == 0, err
+    with np.load(out) as stored:
+        assert stored["prediction"] == pytest.approx(read.prediction, abs=FLOAT32_DB)
+    # The pattern turns with the heading.
+    predict_to_file(calibrated, record.tx_pos_m[read.row], out, heading + 1.0)
+    with np.load(out) as stored:
+        assert not np.allclose(stored["prediction"], read.prediction, atol=0.1)
+
+
+def test_headings_are_refused_where_unused_and_demanded_where_used(
+    flat_folder: Path, run: Path, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record, out = load(flat_folder), tmp_path / "p.npz"
+    heading = np.zeros(len(read_run(run).row))
+    for folder, headings, message in [
+        (calibrated, None, "calibrated with the transmitter's headings; give heading_rad"),
+        (run, heading, "does not know how the transmitter is turned; leave heading_rad away"),
+    ]:
+        asked = asked_rows(folder, record, tmp_path / "tx.csv", headings)
+        status, _, err = call(["predict", folder, "--tx", asked, "--out", out], capsys)
+        assert (status, err.count("\n")) == (2, 1)
+        assert message in err
+        assert not out.exists()
+    with pytest.raises(InputError, match=r"6 positions and headings \(5,\); give one finite heading for each"):
+        predict_to_file(calibrated, record.tx_pos_m[:6], out, heading[:5])
+
+
+def test_calibrated_run_of_data_without_headings_predicts_without(
+    flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its pattern is fitted in the frame of the world."""
+    record = replace(load(flat_folder), tx_heading_rad=None)
+    monkeypatch.setattr(traced, "load_record", lambda name: record)
+    run = trace_run(room, record, tmp_path / "run", DIRECT, calibration="patterns")
+    read = read_run(run)
+    predict_to_file(run, record.tx_pos_m[read.row], tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as stored:
+        assert stored["prediction"] == pytest.approx(read.prediction, abs=FLOAT32_DB)
+    with pytest.raises(InputError, match="leave heading_rad away"):
+        predict_to_file(run, record.tx_pos_m[:2], tmp_path / "q.npz", np.zeros(2))
+
+
+def test_calibration_is_kept_and_scores_again(
+    flat_folder: Path, room: Path, run: Path, calibrated: Path, tmp_path: Path
+) -> None:
+    out = calibrated
     read = read_run(out)
     assert read.metrics["calibration"] == "patterns"
     assert read.metrics["train_seconds"] > 0
@@ -95,13 +165,8 @@ def test_calibration_is_kept_and_scores_again_and_predicts(
     assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
     with pytest.raises(InputError, match="calibrated on the training rows of official"):
         evaluate_run(out, "random")
-    positions = tmp_path / "tx.csv"
-    positions.write_text("x,y,z\n1,1,1.3\n")
-    status, _, err = call(["predict", out, "--tx", positions, "--out", tmp_path / "p.npz"], capsys)
-    assert status == 0, err
-    for wrong, scene, message in (("everything", room, "unknown; choose from patterns, all"),):
-        with pytest.raises(InputError, match=message):
-            trace_run(scene, flat_folder, tmp_path / "other", DIRECT, calibration=wrong)
+    with pytest.raises(InputError, match="unknown; choose from patterns, all"):
+        trace_run(room, flat_folder, tmp_path / "other", DIRECT, calibration="everything")
 
 
 def test_rays_are_counted_once_for_a_run(

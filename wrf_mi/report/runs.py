@@ -39,7 +39,7 @@ from .evaluate import Predict, evaluate, pool, stored_metrics, write_results
 from .hybrid_run import evaluate_hybrid, is_hybrid, open_hybrid, predict_with
 from .prediction_file import check_prediction_file, write_prediction_file
 from .run_folder import CONFIG, METRICS
-from .traced import TracedRun, evaluate_traced, is_traced
+from .traced import UNUSED_HEADING, TracedRun, evaluate_traced, is_traced
 
 Listen = Callable[[str, int, Progress], None]
 """Hears of progress: name of the fold ("" where there is one split), steps in all, and the progress."""
@@ -285,7 +285,8 @@ def predict_to_file(
         out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and of a hybrid
             ``std``. ``.csv``, signal strengths alone: see `wrf_mi.report.prediction_file.write_prediction_file`.
-        tx_heading_rad: how the transmitter is turned, [m]; only a hybrid and baselines for signal strengths use it.
+        tx_heading_rad: yaw of the transmitter's body [m], radians; only a hybrid, calibrated ray tracing and baselines
+            for signal strengths use it.
         scheduler: what computes parts of the positions; None: this process. Its workers must see the run folder, and
             the data set and scene of a traced or hybrid run, under the same names.
         operator: a learned field alone predicts by operator where it can.
@@ -296,13 +297,14 @@ def predict_to_file(
 
     Raises:
         InputError: a run over several blocks, positions that are not known, headings or an uplink for a model
-            without, or a file name with another suffix or of a form that does not hold what the run predicts.
+            without, no headings for a model that needs them, or a file name with another suffix or of a form that
+            does not hold what the run predicts.
     """
     path, asked = Path(folder), Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink)
     check_prediction_file(Path(out), path)
     if not is_baseline(path):
-        if tx_heading_rad is not None and not is_hybrid(path):
-            raise InputError(f"{path}: its model does not know how the transmitter is turned; leave heading_rad away")
+        if tx_heading_rad is not None and not is_hybrid(path) and not is_traced(path):
+            raise InputError(f"{path}: {UNUSED_HEADING}")
         if uplink is not None:
             raise InputError(f"{path}: its model does not predict from the uplink; leave uplink away")
     parts: list[Estimates]
@@ -337,7 +339,11 @@ def open_run(folder: Path, operator: bool = True) -> Callable[[Inputs, int], Est
         return lambda asked, first: predict_with(model, asked.tx_pos_m, asked.tx_heading_rad)
     if is_traced(folder):
         traced = TracedRun(folder)
-        return lambda asked, first: (traced.predict(asked.tx_pos_m, first), None, traced.names)
+        return lambda asked, first: (
+            traced.predict(asked.tx_pos_m, asked.tx_heading_rad, first),
+            None,
+            traced.names,
+        )
     if is_baseline(folder):
         baseline = open_baseline(folder)
         return lambda asked, first: _of_receivers(partial(baseline.predict_inputs, asked), baseline.receivers)

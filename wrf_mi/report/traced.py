@@ -51,6 +51,8 @@ TIMED = 3
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Positions of one part at least, for a scheduler: candidates of fewer are made no faster. Where rays go out from the
 receivers alone, a part of any size costs as much as a few hundred positions, and the parts for a worker may be two."""
+UNUSED_HEADING = "its model does not know how the transmitter is turned; leave heading_rad away"
+"""What is wrong with headings for a model that does not use them."""
 CALIBRATIONS = {"patterns": CalibrationOptions(materials=False), "all": CalibrationOptions()}
 """What can be fitted beside offsets."""
 
@@ -267,6 +269,8 @@ class TracedRun:
 
     Attributes:
         names: of the receivers.
+        uses_heading: whether predictions depend on the transmitter's heading: a calibrated pattern of the transmitter,
+            fitted to rows with headings, turns with it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -276,6 +280,7 @@ class TracedRun:
             InputError: not a traced run, or one over several splits whose offsets differ.
         """
         config = read_trace_config(folder)
+        self._folder, self.uses_heading = folder, False
         self._record = record = config.record()
         self._instrument = instrument = instrument_of(record)
         traced = load_trace(folder / PATHS)
@@ -290,28 +295,46 @@ class TracedRun:
         self._rows = load_rows(folder, record)
         if config.calibration is not None:
             self._calibration = load_calibration(folder / CALIBRATION)
+            self.uses_heading = record.tx_heading_rad is not None and self._calibration.tx_pattern_db.size > 0
             return
         known = self._rows.all_train
         self._offsets = fit_offsets(instrument.observe(traced.paths)[:, known], record.observation[:, known])
 
-    def predict(self, tx_pos_m: FloatArray, first_row: int = 0) -> NDArray[Any]:
+    def predict(
+        self, tx_pos_m: FloatArray, tx_heading_rad: FloatArray | None = None, first_row: int = 0
+    ) -> NDArray[Any]:
         """What the receivers report of new transmitter positions.
 
         Args:
             tx_pos_m: positions [m, 3], metres.
+            tx_heading_rad: yaw of the transmitter's body [m], radians, if and only if ``uses_heading``.
             first_row: what errors call the first of them.
 
         Returns:
             Observations [n_rx, m, ...].
 
         Raises:
-            InputError: a position inside a solid object.
+            InputError: a position inside a solid object, headings missing or of another shape, or headings for a run
+                that does not use them.
         """
+        self._check_heading(len(tx_pos_m), tx_heading_rad)
         new = self._tracer.trace(tx_pos_m, first_row=first_row)
         if self._calibration is not None:
-            return _with_floor(calibrated_rssi(self._calibration, new, self._tracer.scene), self._record, self._rows)
+            values = calibrated_rssi(self._calibration, new, self._tracer.scene, tx_heading_rad)
+            return _with_floor(values, self._record, self._rows)
         observed = self._instrument.observe(new.paths)
         return observed if self._offsets is None else self._offsets(observed)
+
+    def _check_heading(self, count: int, tx_heading_rad: FloatArray | None) -> None:
+        if not self.uses_heading:
+            if tx_heading_rad is not None:
+                raise InputError(f"{self._folder}: {UNUSED_HEADING}")
+        elif tx_heading_rad is None:
+            text = "calibrated with the transmitter's headings; give heading_rad, or trace without --calibrate"
+            raise InputError(f"{self._folder}: {text}")
+        elif tx_heading_rad.shape != (count,) or not np.isfinite(tx_heading_rad).all():
+            text = f"{count} positions and headings {tx_heading_rad.shape}; give one finite heading for each"
+            raise InputError(f"{self._folder}: {text}")
 
 
 def _tracer_of(config: TraceConfig, traced: TraceResult, instrument: Instrument) -> RayTracer:

@@ -110,7 +110,8 @@ def calibrated_rssi(
         calibration: from `wrf_mi.trace.calibrate`.
         trace: paths, with any materials.
         scene: they are of; it keeps its own materials.
-        tx_heading_rad: yaw of each transmitter's body, shape [n_tx]; None: 0.
+        tx_heading_rad: yaw of each transmitter's body, shape [n_tx]; None: 0, which is right only where the fit had no
+            headings either.
 
     Returns:
         dBm [n_rx, n_tx], NaN where no path arrives.
