@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from operator import attrgetter
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -194,9 +195,22 @@ def test_values_out_of_range(setting: str) -> None:
         with_settings(TrainConfig(), [setting])
 
 
-def test_ends_of_ranges_are_accepted() -> None:
-    ends = ["hold_out=0", "hold_out=1", "encoding.tx_octaves=0", "density.every=0", "optimiser.averaging=0", "seed=0"]
-    with_settings(TrainConfig(), ends)
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("hold_out", 0.0),
+        ("hold_out", 1.0),
+        ("encoding.tx_octaves", 0),
+        ("density.every", 0),
+        ("optimiser.averaging", 0.0),
+        ("seed", 0),
+    ],
+)
+def test_ends_of_ranges_are_accepted(setting: str, value: float) -> None:
+    other = with_settings(TrainConfig(), ["hold_out=0.5", "seed=7"])
+    config = with_settings(other, [f"{setting}={value}"])
+    assert attrgetter(setting)(config) == value
+    assert config != other
 
 
 @pytest.mark.parametrize(

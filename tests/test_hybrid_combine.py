@@ -20,7 +20,7 @@ from wrf_mi.core import pixel_directions, unit_vectors
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.field import Gaussians
 from wrf_mi.hybrid.combine import Ports, magnitude, path_sum, power, scaled, solid_angles
-from wrf_mi.hybrid.learned import sphere_directions
+from wrf_mi.hybrid.learned import hemisphere_pair
 from wrf_mi.project.footprint import Pose
 from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale
 from wrf_mi.splat.tiles import perception_plane
@@ -128,7 +128,7 @@ def test_power_receiver(how: Any) -> None:
     """The integral of a constant over the full sphere is 4 pi."""
     model = PowerReceiver(45, 60, (FREQUENCY_HZ,), how)
     made, found = paths()
-    count = len(sphere_directions(45, 60))
+    count = len(hemisphere_pair(45, 60))
     field = dr.full(Float64, 0.3, 2 * count), dr.full(Float64, -0.1, 2 * count)
     h = [signals(found, np.zeros((1, 3)))[:, 0], 4 * np.pi * (0.3 - 0.1j)]
     total = np.abs(h[0] + h[1]) ** 2 if how == "coherent" else np.abs(h[0]) ** 2 + np.abs(h[1]) ** 2
@@ -201,7 +201,7 @@ def test_without_sides() -> None:
 def test_the_full_sphere_sees_what_is_below() -> None:
     """One Gaussian below the horizon: on the pixel of its direction, dark in the upper half."""
     target = (HEIGHT * WIDTH) + 5 * WIDTH + 13
-    directions = sphere_directions(HEIGHT, WIDTH)
+    directions = hemisphere_pair(HEIGHT, WIDTH)
     assert directions.shape == (2 * HEIGHT * WIDTH, 3)
     assert directions[target, 2] < 0
     at = directions[target] * 4

@@ -23,7 +23,7 @@ from wrf_mi_plugins.shape import gaussian_shape, shape_parameters  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, pixel_directions  # noqa: E402
-from wrf_mi.core.angles import sphere_directions  # noqa: E402
+from wrf_mi.core.angles import equirectangular_sphere  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
 from wrf_mi.report import bench_traced  # noqa: E402
 
@@ -92,7 +92,7 @@ def test_image_is_the_definition(blending: str, coverage: str) -> None:
     tensor = mi.render(scene)
     assert tensor.shape == (45, 90, 2)
     image = complex_image(tensor)
-    directions = {"hemisphere": pixel_directions, "sphere": sphere_directions}[coverage](45, 90)
+    directions = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](45, 90)
     expected = blended(field, blending, directions)
     off = np.abs(image - expected) > 1e-3 * np.abs(expected).max()
     assert off.mean() < 2e-3  # on a cut-off, a ray may fall to either side in float32

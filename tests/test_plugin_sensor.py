@@ -18,7 +18,7 @@ import wrf_mi_plugins  # noqa: E402
 from wrf_mi_plugins.sensor import receiver_to_world  # noqa: E402
 
 from wrf_mi.core import InputError, azimuth_elevation, pixel_directions, rotation_matrix  # noqa: E402
-from wrf_mi.core.angles import sphere_directions  # noqa: E402
+from wrf_mi.core.angles import equirectangular_sphere  # noqa: E402
 
 FLOAT32 = 2e-6
 """Unit vectors and metres in float32 after a rotation."""
@@ -56,12 +56,12 @@ def rays(sensor: Any, height: int, width: int) -> np.ndarray:
 def test_rays_go_through_points(coverage: str) -> None:
     """Wherever in a pixel the sample lies: the one direction of `core.angles`, turned by the quaternion."""
     sensor = mi.load_dict(plane(9, 36, coverage=coverage))
-    expected = {"hemisphere": pixel_directions, "sphere": sphere_directions}[coverage](9, 36)
+    expected = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](9, 36)
     np.testing.assert_allclose(rays(sensor, 9, 36), expected @ TURN.T, atol=FLOAT32)
 
 
 def test_rows_of_the_sphere() -> None:
-    azimuth, elevation = azimuth_elevation(sphere_directions(18, 36))
+    azimuth, elevation = azimuth_elevation(equirectangular_sphere(18, 36))
     np.testing.assert_allclose(np.degrees(elevation[:, 5]), -90 + 10 * np.arange(18), atol=1e-6)
     np.testing.assert_allclose(np.degrees(azimuth[3]), 10 * np.arange(36), atol=1e-6)
 
@@ -115,7 +115,7 @@ def test_xml_and_depth(tmp_path: Path) -> None:
     )
     image = mi.render(mi.load_file(str(tmp_path / "scene.xml"))).numpy()[..., 0]
     # |(1, 0, 0) + t d| = 3; x is the axis of rotation, so d_x is as in the receiver's frame.
-    x = sphere_directions(12, 24)[..., 0]
+    x = equirectangular_sphere(12, 24)[..., 0]
     np.testing.assert_allclose(image, -x + np.sqrt(x * x + 8), rtol=1e-5)
 
 

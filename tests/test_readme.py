@@ -142,7 +142,9 @@ def test_results_page_names_every_case() -> None:
 
 
 def test_notebooks_are_stored_without_output() -> None:
-    for path in (CHECKOUT / "notebooks").glob("*.ipynb"):
+    paths = list((CHECKOUT / "notebooks").glob("*.ipynb"))
+    assert paths
+    for path in paths:
         for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
             assert not cell.get("outputs"), path.name
             assert cell.get("execution_count") is None, path.name

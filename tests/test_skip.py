@@ -84,22 +84,46 @@ def test_skips_stay_within_their_bounds(seed: int, product: bool, contribution: 
     assert error.max() <= skip.error + ROUNDING
 
 
-@pytest.mark.parametrize("product", [False, True])
-def test_early_end_ends_early(product: bool) -> None:
-    """Behind an opaque wall of Gaussians nothing is walked: what it hides may be anything that is not a number."""
+def walled(product: bool) -> tuple[Gaussians, Any]:
+    """Gaussians whose nearer half covers the whole sphere, several times over, and which these are, [batch * n]."""
     gaussians = fields(3, product, 0.99, 0.999)
     depth = project(gaussians, POSE).depth
     n, far = gaussians.count, np.argsort(depth.numpy())[COUNT // 2 :]
     front = np.ones(BATCH * n, bool)
     for b in range(BATCH):
         front[b * n + far] = False
-    # The front half covers the whole sphere, several times over.
-    gaussians.scale = [dr.select(dr.mask_t(Float64)(front), 40.0, s) for s in gaussians.scale]
+    wall = dr.mask_t(Float64)(front)
+    gaussians.scale = [dr.select(wall, 40.0, s) for s in gaussians.scale]
     if product:
         assert gaussians.attenuation is not None
         gaussians.attenuation = [0.02 * d for d in gaussians.attenuation]
+    return gaussians, wall
+
+
+@pytest.mark.parametrize("product", [False, True])
+def test_early_end_evaluates_nothing_behind_an_opaque_wall(product: bool) -> None:
+    """Opacities and attenuations that are not numbers do not reach the image from there."""
+    gaussians, wall = walled(product)
     exact, early = image(gaussians, Skip()), image(gaussians, Skip(rest=1e-3))
     assert 0 < np.abs(exact - early).max() <= 1e-3
+    if product:
+        assert gaussians.attenuation is not None
+        gaussians.attenuation = [dr.select(wall, d, np.nan) for d in gaussians.attenuation]
+    else:
+        gaussians.opacity = dr.select(wall, gaussians.opacity, np.nan)
+    assert np.isnan(image(gaussians, Skip())).all()
+    np.testing.assert_array_equal(image(gaussians, Skip(rest=1e-3)), early)
+
+
+@pytest.mark.parametrize("product", [False, True])
+@pytest.mark.parametrize("skip", [Skip(rest=1e-3), Skip(contribution=1e-3)])
+def test_skips_hide_no_signal_that_is_not_a_number(product: bool, skip: Skip) -> None:
+    """What it can change has no bound, so that neither skip may leave it out."""
+    gaussians, wall = walled(product)
+    gaussians.signal = [dr.select(wall, s, np.nan) for s in gaussians.signal]
+    exact = np.isfinite(image(gaussians, Skip()))
+    assert not exact.any()
+    np.testing.assert_array_equal(np.isfinite(image(gaussians, skip)), exact)
 
 
 def test_early_end_gives_no_gradients() -> None:

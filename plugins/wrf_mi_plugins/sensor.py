@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike  # noqa: E402
 
 from wrf_mi.backend.device import to_vectors  # noqa: E402
 from wrf_mi.core import InputError, pixel_directions, rotation_matrix  # noqa: E402
-from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, sphere_directions  # noqa: E402
+from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, equirectangular_sphere  # noqa: E402
 from wrf_mi.project.footprint import Pose  # noqa: E402
 
-DIRECTIONS = {"hemisphere": pixel_directions, "sphere": sphere_directions}
+DIRECTIONS = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}
 """Functions of (height, width) that give the unit vector of every pixel."""
 
 RIGID_TOLERANCE = 1e-4

@@ -56,8 +56,11 @@ def pixel_directions(height: int, width: int) -> FloatArray:
     return unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None])
 
 
-def sphere_directions(height: int, width: int) -> FloatArray:
-    """Unit vector of every pixel of ``height`` x ``width`` over the full sphere, shape [height, width, 3]."""
+def equirectangular_sphere(height: int, width: int) -> FloatArray:
+    """Unit vector of every pixel of an equirectangular grid over the full sphere, shape [height, width, 3].
+
+    Elevations rise from -90 degrees (row 0), azimuths from 0 (column 0).
+    """
     return unit_vectors(azimuth_rad(width)[None, :], sphere_elevation_rad(height)[:, None])
 
 

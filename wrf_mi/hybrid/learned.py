@@ -39,7 +39,7 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
 
     Returns:
         Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
-        hemisphere, then those of the lower one, see `sphere_directions`.
+        hemisphere, then those of the lower one, see `hemisphere_pair`.
     """
     upper = splat(gaussians, pose, plane)
     if not sphere:
@@ -55,7 +55,11 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
     return re, im
 
 
-def sphere_directions(height: int, width: int) -> FloatArray:
-    """Unit vectors [2 * height * width, 3] of the upper, then the lower hemisphere, receiver's frame."""
+def hemisphere_pair(height: int, width: int) -> FloatArray:
+    """Unit vectors [2 * height * width, 3] of the pixels of the upper, then the lower hemisphere, receiver's frame.
+
+    The lower hemisphere is the upper one after half a turn about x, in the order of `wrf_mi.core.pixel_directions`; for
+    one grid over the full sphere see `wrf_mi.core.angles.equirectangular_sphere`.
+    """
     upper = pixel_directions(height, width).reshape(-1, 3)
     return np.concatenate([upper, upper * [1, -1, -1]])

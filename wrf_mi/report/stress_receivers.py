@@ -25,7 +25,7 @@ from ..core.arrays import planar_array
 from ..field.gaussians import Gaussians
 from ..hybrid import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from ..hybrid.combine import DARK, LEAST_POWER
-from ..hybrid.learned import learned_field, sphere_directions
+from ..hybrid.learned import hemisphere_pair, learned_field
 from ..project.footprint import Pose
 from ..receive import Array, Pattern, array_response, bartlett_spectrum, minmax_scale
 from ..receive.operator import ArrayOperator, SectorOperator, port_matrix
@@ -133,7 +133,7 @@ def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray
 def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray, field: Field) -> dict[str, float]:
     """Errors of the operators, built once and applied to the signals."""
     plane, half, array = perception_plane(*SIZE, mi.Float), seen.size // 2, _array()
-    directions, weight = sphere_directions(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
+    directions, weight = hemisphere_pair(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
     ports = array.response(directions[:half]).T * weight[:half]
     operator = ArrayOperator(port_matrix(gaussians, pose(mi.Float), plane, ports), array, *SIZE)
     h = ports @ seen[:half]

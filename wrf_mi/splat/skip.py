@@ -31,7 +31,9 @@ class Skip:
         boxes: leave out footprints that reach no pixel of a tile, those below the horizon among them. Changes nothing.
         contribution: leave out Gaussians whose removal changes no pixel by more than this in sum; 0: none.
         rest: stop a pixel's walk from near to far once what is behind cannot change it by more than this; 0: never.
-            Only without gradients: those of what is behind are not bounded by it.
+            Only without gradients: those of what is behind are not bounded by it. What is behind is then not evaluated,
+            but for the magnitudes of its signals, which bound it; a signal that is not finite has no bound, so no walk
+            ends before it.
     """
 
     boxes: bool = True
@@ -60,7 +62,8 @@ def behind(signal: list[Any], visible: Any, order: Any, batch: int, product: boo
     """
     n = dr.width(order)
     strength = dr.select(visible, dr.sqrt(signal[0] * signal[0] + signal[1] * signal[1]), 0)
-    strength = dr.detach(strength)
+    # A maximum would pass over NaN, and so hide it; what it can change has no bound.
+    strength = dr.detach(dr.select(dr.isfinite(strength), strength, dr.inf))
     lane = dr.arange(type(order), batch * n)
     place = (lane // n) * n + dr.tile(order, batch)
     dr.eval(strength, place)
