@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_flat import write_flat
 
-from wrf_mi.core import InputError
+from wrf_mi.core import Antenna, InputError
 from wrf_mi.measure import load, make_splits, read_ble_folder
 
 DATA = os.environ.get("WRF_MI_DATA")
@@ -231,3 +232,33 @@ def test_the_real_data():
     assert not missing.all(axis=0).any()
     for split in make_splits(record, "blocked"):
         assert len(split.test) > 400
+
+
+def with_columns(folder: Path, **columns: list[str]) -> Path:
+    """Add columns to ``anchors.csv``."""
+    lines = (folder / "anchors.csv").read_text().splitlines()
+    rows = [",".join([line, *words]) for line, *words in zip(lines[1:], *columns.values(), strict=True)]
+    (folder / "anchors.csv").write_text("\n".join([",".join([lines[0], *columns]), *rows]) + "\n")
+    return folder
+
+
+def test_antennas_are_read(tmp_path: Path):
+    plain = read_ble_folder(write_flat(tmp_path / "plain"))
+    assert {one.antenna for one in plain.receivers} | {plain.tx_antenna} == {Antenna()}
+    own: dict[str, list[str]] = {"pattern": ["dipole", ""], "polarization": ["", "H"], "tx_polarization": ["H", "H"]}
+    record = read_ble_folder(with_columns(write_flat(tmp_path / "own"), **own))
+    assert [one.antenna for one in record.receivers] == [Antenna("dipole"), Antenna("iso", "H")]
+    assert record.tx_antenna == Antenna("iso", "H")
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"pattern": ["iso", "horn"]}, "row 2: antenna: pattern is 'horn'; choose from"),
+        ({"polarization": ["vertical", "V"]}, "row 1: antenna: polarization is 'vertical'; choose from V, H"),
+        ({"tx_pattern": ["dipole", "iso"]}, "row 2: tx_pattern or tx_polarization differs from row 1"),
+    ],
+)
+def test_wrong_antennas_are_refused(tmp_path: Path, columns: dict[str, list[str]], message: str):
+    with pytest.raises(InputError, match=rf"anchors\.csv: {message}"):
+        read_ble_folder(with_columns(write_flat(tmp_path / "flat"), **columns))

@@ -4,7 +4,9 @@ Format (M. Kolakowski, "Automated calibration of RSS fingerprinting based system
 learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.5457591):
 
 - ``anchors.csv``: header ``id,x,y,z``; the receivers, metres. An id is a whole number or a name. The receiver of id 3
-  is called ``anchor3``, that of id ``kitchen`` is called ``kitchen``.
+  is called ``anchor3``, that of id ``kitchen`` is called ``kitchen``. Optional: ``pattern`` and ``polarization`` of each
+  receiver's antenna, ``tx_pattern`` and ``tx_polarization`` of the transmitter's, the same in every row, in Sionna RT's
+  terms (see `wrf_mi.core.Antenna`); an empty field is the default, isotropic and vertical.
 - ``calibration_df.csv``: one row per measurement: ``x``, ``y`` of the transmitter in metres, ``rssi_<id>`` at each
   receiver in dBm, empty where nothing was received. These rows train.
   Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Other columns
@@ -26,11 +28,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.files import one_line
 from .csv_table import CsvTable, read_csv
-from .folder_files import shown
+from .folder_files import TX_ANTENNA_WORDS, read_antenna, shown
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +42,7 @@ TAG_HEIGHT_M = 1.3
 CARRIER_HZ = 2.44e9
 """The data are means over BLE's three advertising channels, 2402, 2426 and 2480 MHz (Bluetooth Core Specification,
 volume 6, part A): the middle of that band."""
-RSSI = "rssi_"
+RSSI, TX = "rssi_", "tx_"
 WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
 """A whole number, also as pandas writes it in a column of floats: ``3``, ``3.0``."""
 NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
@@ -64,7 +66,8 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder; give one that holds {ANCHORS}, {TRAINING} and {TEST}")
-    ids, anchors_m = _read_anchors(folder / ANCHORS)
+    anchors = read_csv(folder / ANCHORS)
+    ids, anchors_m = _read_anchors(anchors)
     tables = [read_csv(folder / file) for file in (TRAINING, TEST)]
     n_train, n_test = (len(table.rows) for table in tables)
     height = _in_both("z", tables)
@@ -82,29 +85,48 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         task="rssi",
         tx_pos_m=np.stack([x, y, height], axis=-1),
         receivers=tuple(
-            Receiver(_name(anchor), position, np.array([0.0, 0.0, 0.0, 1.0]))
-            for anchor, position in zip(ids, anchors_m, strict=True)
+            Receiver(_name(anchor), position, np.array([0.0, 0.0, 0.0, 1.0]), antenna)
+            for anchor, position, antenna in zip(ids, anchors_m, _antennas(anchors, ""), strict=True)
         ),
         observation=strength,
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=_in_both("heading", tables),
+        tx_antenna=_tx_antenna(anchors),
         source=str(folder),
     )
 
 
-def _read_anchors(path: Path) -> tuple[list[str], FloatArray]:
+def _read_anchors(table: CsvTable) -> tuple[list[str], FloatArray]:
     """Ids and positions [anchors, 3]."""
-    table = read_csv(path)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         found = _id(text)
         if wrong := _wrong_id(found, ids):
             raise InputError(
-                f"{path}: row {row}: id {shown(text)} {wrong}; give each anchor a number or a name of its own"
+                f"{table.path}: row {row}: id {shown(text)} {wrong}; give each anchor a number or a name of its own"
             )
         ids.append(found)
     return ids, np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
+
+
+def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
+    """The antenna of each row; an empty field, like a column that is not there, is the default."""
+    stated = {key: table.texts(prefix + key) for key in TX_ANTENNA_WORDS if prefix + key in table.header}
+    antennas = []
+    for row in range(len(table.rows)):
+        own = {key: texts[row].strip() for key, texts in stated.items() if texts[row].strip()}
+        antennas.append(read_antenna(table.path, f"row {row + 1}", own))
+    return antennas
+
+
+def _tx_antenna(table: CsvTable) -> Antenna:
+    antennas = _antennas(table, TX)
+    for row, antenna in enumerate(antennas, start=1):
+        if antenna != antennas[0]:
+            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
+            raise InputError(f"{table.path}: {text}; there is one transmitter: state the same in every row")
+    return antennas[0]
 
 
 def _id(text: str) -> str:
