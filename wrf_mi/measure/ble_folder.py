@@ -4,9 +4,9 @@ Format (M. Kolakowski, "Automated calibration of RSS fingerprinting based system
 learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.5457591):
 
 - ``anchors.csv``: header ``id,x,y,z``; the receivers, metres. An id is a whole number or a name. The receiver of id 3
-  is called ``anchor3``, that of id ``kitchen`` is called ``kitchen``. Optional: ``pattern`` and ``polarization`` of each
-  receiver's antenna, ``tx_pattern`` and ``tx_polarization`` of the transmitter's, the same in every row, in Sionna RT's
-  terms (see `wrf_mi.core.Antenna`); an empty field is the default, isotropic and vertical.
+  is called ``anchor3``, that of id ``kitchen`` is called ``kitchen``. Optional: ``pattern`` and ``polarization`` of the
+  receiver's antenna, and of the transmitter's ``tx_pattern`` and ``tx_polarization``, the same in every row, in Sionna
+  RT's terms (see `wrf_mi.core.Antenna`); an empty field is the default, isotropic and vertical.
 - ``calibration_df.csv``: one row per measurement: ``x``, ``y`` of the transmitter in metres, ``rssi_<id>`` at each
   receiver in dBm, empty where nothing was received. These rows train.
   Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Other columns
