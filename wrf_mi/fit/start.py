@@ -35,7 +35,8 @@ def initial_gaussians(
     """
     if config.paths:
         if Path(config.paths).suffix.lower() in MESHES:
-            remedy = f"make a scene of it (wrf-mi scene), or start on its surfaces: initial.mesh={config.paths}"
+            remedy = f"make a scene of it (wrf-mi mesh {config.paths} --out DIR) and name that folder, "
+            remedy += f"or start on its surfaces: initial.mesh={config.paths}"
             raise InputError(f"setting initial.paths: {config.paths} is a mesh without radio materials; {remedy}")
         if record.frequencies_hz is None:
             raise InputError(f"setting initial.paths: {record.name} states no carrier frequency; start otherwise")

@@ -136,11 +136,13 @@ def register_pairs(
     scale = float((b * (a @ rotation.T)).sum() / (a * a).sum())
     rms = float(np.sqrt(np.mean(error**2)))
     if rms > largest_rms_m:
-        raise InputError(
-            f"{name}: the pairs disagree by {rms:.2f} m rms (at most {largest_rms_m} m), "
-            f"pair {int(np.argmax(error)) + 1} by {error.max():.2f} m; lengths times {scale:.3f} would fit better: "
-            "check the pairs, units and axes"
-        )
+        text = f"{name}: the pairs disagree by {rms:.2f} m rms (at most {largest_rms_m} m), "
+        text += f"pair {int(np.argmax(error)) + 1} by {error.max():.2f} m"
+        scaled = float(np.sqrt(np.mean(((scale * a @ rotation.T - b) ** 2).sum(axis=1))))
+        if scaled < rms / 2:
+            better = f"lengths times {scale:.3f} would fit better ({scaled:.2f} m rms)"
+            raise InputError(f"{text}; {better}: check units and resolution")
+        raise InputError(f"{text}: check this pair and the axes")
     return Registration(_motion(rotation, shift), rms, float(np.median(error)), 1.0, 1.0, n, scale)
 
 
@@ -201,11 +203,16 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
             "give the other row_0 of a grid (--row-0), or change the sign of one axis"
         )
     if best.score < LEAST_AGREEMENT:
-        scale = best_scale(points, best, walls)
-        raise InputError(
+        scale, agreement = best_scale(points, best, walls)
+        text = (
             f"{name}: it does not fit the walls: agreement {best.score:.2f} (at least {LEAST_AGREEMENT}), {share:.0%} "
-            f"within {NEAR_M} m; lengths times {scale:.2f} would fit better: check resolution and units, or give pairs"
         )
+        text += f"within {NEAR_M} m"
+        if agreement > best.score + CLEAR_LEAD:
+            better = f"lengths times {scale:.2f} would fit better (agreement {agreement:.2f})"
+            raise InputError(f"{text}; {better}: check resolution and units, or give pairs")
+        remedy = "check that the walls are of this place, and its units, or give pairs"
+        raise InputError(f"{text}, and slightly other lengths fit no better: {remedy}")
     for other in fits[1:]:
         apart = np.linalg.norm(moved(points, best.pose) - moved(points, other.pose), axis=1)
         if np.sqrt(np.mean(apart**2)) > SAME_M and other.score > best.score - CLEAR_LEAD:
@@ -220,5 +227,5 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
         share,
         best.score,
         len(points),
-        best_scale(points, best, walls),
+        best_scale(points, best, walls)[0],
     )

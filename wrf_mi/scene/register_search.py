@@ -140,12 +140,15 @@ def _image(cells: FloatArray, shape: IntArray) -> FloatArray:
     return image
 
 
-def best_scale(points: FloatArray, best: Fit, walls: FloatArray) -> float:
-    """The factor on lengths, 1/2 to 2, that fits best near a pose."""
+def best_scale(points: FloatArray, best: Fit, walls: FloatArray) -> tuple[float, float]:
+    """The factor on lengths, 1/2 to 2, that fits best near a pose, and how well points and walls agree with it."""
     middle = points.mean(axis=0)
 
+    def placed(pose_and_scale: FloatArray) -> FloatArray:
+        return moved(pose_and_scale[3] * (points - middle), pose_and_scale[:3])
+
     def misfit(pose_and_scale: FloatArray) -> FloatArray:
-        return distance_to_walls(moved(pose_and_scale[3] * (points - middle), pose_and_scale[:3]), walls)
+        return distance_to_walls(placed(pose_and_scale), walls)
 
     fit = optimize.least_squares(
         misfit,
@@ -155,4 +158,4 @@ def best_scale(points: FloatArray, best: Fit, walls: FloatArray) -> float:
         f_scale=NEAR_M / 2,
         max_nfev=100,
     )
-    return float(fit.x[3])
+    return float(fit.x[3]), _score(placed(fit.x), sample_walls(walls), walls)
