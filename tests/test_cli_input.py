@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -156,11 +160,49 @@ def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], mes
         read_inputs(None, tmp_path / "tx.npz")
 
 
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "a.npz"), "a.npz: No space left on device; free some space"),
+        (OSError(errno.EACCES, "Permission denied", "a.npz"), "a.npz: Permission denied; change its permissions"),
+        (OSError(errno.EROFS, "Read-only file system"), "Read-only file system; choose a place that can be written"),
+        (
+            OSError(errno.EISDIR, "Is a directory", "part", None, "a"),
+            "a: Is a directory; choose another place",
+        ),
+        (OSError(errno.ENOENT, "No such file or directory", "a"), "a: No such file or directory; check the name"),
+        (OSError("a damaged\nfile"), "a damaged file"),
+    ],
+)
+def test_what_the_system_refused_is_named_with_its_own_remedy(
+    error: OSError, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr("wrf_mi.cli._data_list", fails)
+    refused(["data", "list"], f"^wrf-mi: {re.escape(line)}", capsys)
+
+
+def test_a_reader_that_has_gone_ends_the_command_silently() -> None:
+    """As ``head`` does; all output goes to a pipe that nobody reads."""
+    code = "import sys; sys.stdin.read(1); from wrf_mi.cli import main; sys.exit(main(['data', 'list']))"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, stderr=-1) as command:
+        assert command.stdin
+        assert command.stdout
+        assert command.stderr
+        command.stdout.close()
+        command.stdin.close()
+        assert command.stderr.read() == b""
+    assert command.returncode == 141
+
+
 def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
     good, out = ["--tx", tmp_path / "tx.csv"], ["--out", tmp_path / "out.npz"]
     refused(["predict", run, "--tx", tmp_path / "no.csv", *out], "no.csv: no such file", capsys)
     refused(["predict", tmp_path, *good, *out], "no config.yaml, so not a run folder", capsys)
-    (tmp_path / "folder.npz").mkdir()
-    refused(["predict", run, *good, "--out", tmp_path / "folder.npz"], "choose another place", capsys)
-    refused(["predict", run, *good, "--out", tmp_path / "tx.csv" / "out.npz"], "choose another place", capsys)
+    folder = tmp_path / "folder.npz"
+    folder.mkdir()
+    refused(["predict", run, *good, "--out", folder], f"{folder}: Is a directory; choose another place", capsys)
+    refused(["predict", run, *good, "--out", tmp_path / "tx.csv" / "a.npz"], "choose another place: a file", capsys)

@@ -22,6 +22,7 @@ from wrf_mi.scene.materials import Materials, read_materials
 from wrf_mi.scene.scan import simulate_scan
 from wrf_mi.scene.surfaces import Surface, number_names
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
+from wrf_mi.trace.materials import perfect_reflector
 
 FREQUENCY_HZ = 2.4e9
 
@@ -85,10 +86,31 @@ def test_editing_the_materials_changes_the_scene(folder: Path) -> None:
     assert (folder / "scene.xml").stat().st_mtime_ns == before
 
 
+def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> None:
+    """As ``--material perfect`` is of a bare mesh; Sionna RT opens the scene file by itself, too."""
+    facts = yaml.safe_load((folder / "materials.yml").read_text())
+    facts["rules"]["floor"] = facts["surfaces"]["table"] = "perfect"
+    facts["thickness_m"] = {"perfect": 0.3}
+    (folder / "materials.yml").write_text(yaml.safe_dump(facts))
+    scene = open_scene(folder, FREQUENCY_HZ)
+    of = {name: one.radio_material for name, one in scene.objects.items()}
+    assert [of[name].name for name in ("floor", "table", "ceiling")] == ["perfect", "perfect", "itu_ceiling_board"]
+    expected = perfect_reflector()
+    for key in ("relative_permittivity", "conductivity"):
+        assert float(getattr(of["floor"], key)[0]) == float(getattr(expected, key)[0])
+    assert float(of["floor"].thickness[0]) == pytest.approx(0.3)
+    from sionna import rt
+
+    assert len(rt.load_scene(str(folder / "scene.xml"), merge_shapes=False).objects) == 3
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("rules: {floor: marble}", r"rules: floor: unknown material 'marble'; known are itu_vacuum, .*itu_wet_ground"),
+        (
+            "rules: {floor: marble}",
+            r"floor: unknown material 'marble'; known are itu_vacuum, .*itu_wet_ground, perfect",
+        ),
         ("rules: {roof: itu_wood}", r"rules: no kind 'roof'; known are floor, ceiling, wall, other"),
         ("surfaces: {table: iron}", r"surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
         ("thickness_m: {itu_wood: -1}", r"thickness_m: itu_wood is -1; give metres above 0"),

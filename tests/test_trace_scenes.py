@@ -1,6 +1,7 @@
 """Scenes of every kind, and one clear line for each that cannot be used."""
 
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,22 @@ def test_wrong_scenes(tmp_path: Path):
     mesh = sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0))
     mesh.vertices[0] = np.nan
     refused("invalid vertex position", write_xml(tmp_path / "nan", {"floor": ("itu_concrete", mesh)}))
+
+
+def test_the_remedy_for_an_unknown_frequency_opens_the_scene(tmp_path: Path):
+    """Brick ends at 40 GHz; the constants that the line asks for are put into the file as it says."""
+    xml = write_xml(tmp_path, {name: ("itu_brick", part) for name, (_, part) in SHOEBOX.items()})
+    with pytest.raises(InputError, match="itu_brick: not known at 47 GHz") as caught:
+        open_scene(xml, 47e9)
+    (bsdf,) = re.findall("<bsdf.*</bsdf>", str(caught.value))
+    for value in ("3.9", "0.7"):
+        bsdf = bsdf.replace("...", value, 1)
+    text = xml.read_text().replace("mat-itu_brick", "mat-my_brick")
+    xml.write_text(text.replace('<bsdf type="diffuse" id="mat-my_brick"/>', bsdf))
+    scene = open_scene(xml, 47e9)
+    (material,) = {one.radio_material.name: one.radio_material for one in scene.objects.values()}.values()
+    assert float(material.relative_permittivity[0]) == pytest.approx(3.9)
+    assert float(material.conductivity[0]) == pytest.approx(0.7)
 
 
 def in_a_room(tmp_path: Path, *parts: trimesh.Trimesh) -> Any:

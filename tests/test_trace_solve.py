@@ -23,6 +23,7 @@ from traced_rooms import (
     room,
 )
 from wrf_mi_scenes.build_laboratory import sheet
+from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from wrf_mi import backend
 from wrf_mi.core import InputError, Paths
@@ -30,7 +31,7 @@ from wrf_mi.trace import TraceOptions, recompute, trace_paths
 from wrf_mi.trace import images as images_module
 from wrf_mi.trace import search as search_module
 from wrf_mi.trace import solve as solve_module
-from wrf_mi.trace.materials import PERFECT, perfect_reflector
+from wrf_mi.trace.materials import perfect_reflector
 
 SINGLE = 2e-4
 """Relative; Sionna RT's gains are single precision."""

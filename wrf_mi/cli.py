@@ -1,8 +1,11 @@
-"""The command ``wrf-mi``. Exit status 0 on success, 1 on failure, 2 with one line on bad input, 130 when stopped."""
+"""The command ``wrf-mi``. Exit status 0 on success, 1 on failure, 2 with one line on bad input, 130 when stopped,
+141 when the reader of its output has gone.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -15,6 +18,7 @@ from .cli_bench import bench_command
 from .cli_train import print_json, progress_bar, show_metrics, sweep_command, trace_command, train_command
 from .core import BackendError, InputError
 from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
+from .core.files import os_failure
 
 Arguments = argparse.Namespace
 
@@ -347,13 +351,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     a = _parser().parse_args(arguments)
     try:
-        return a.call(a)
+        done: int = a.call(a)
+        sys.stdout.flush()
+        return done
     except InputError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        # Whoever read the output has gone, as head does; Python flushes again on exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except OSError as error:
-        # A file or folder that cannot be written, in nearly all cases one that was named on the command line.
-        print(f"wrf-mi: {error}; choose another place", file=sys.stderr)
+        print(f"wrf-mi: {os_failure(error)}", file=sys.stderr)
         return 2
     except BackendError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)

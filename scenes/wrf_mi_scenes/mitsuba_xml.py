@@ -46,19 +46,36 @@ COLOURS: Mapping[str, str] = MappingProxyType(
 
 OTHER_COLOUR = "0.60 0.60 0.60"
 
+PERFECT = "perfect"
+"""Name of a perfect conductor, which reflects without loss and lets nothing pass: what image-method tracers without
+materials assume, but for the sign of the field."""
+PERFECT_CONDUCTIVITY = 1e13
+"""Siemens per metre: so high that the reflection coefficients are -1 and +1 to single precision."""
+PERFECT_THICKNESS_M = 0.1
+
 
 def scene_xml(materials: Mapping[str, str]) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
 
     The BSDF names ``mat-itu_*`` are what Sionna RT turns into its ITU radio materials; Mitsuba itself sees
-    plain two-sided diffuse ones.
+    plain two-sided diffuse ones. `PERFECT` is no material of ITU-R P.2040, so it is Sionna RT's own BSDF with explicit
+    constants, which Mitsuba knows after ``import sionna.rt``.
 
     Args:
-        materials: radio material (``itu_*``) of each part, by the part's name.
+        materials: radio material (``itu_*`` or `PERFECT`) of each part, by the part's name.
     """
     lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
     for material in dict.fromkeys(materials.values()):
         colour = COLOURS.get(material, OTHER_COLOUR)
+        if material == PERFECT:
+            lines += [
+                f'    <bsdf type="radio-material" id="mat-{PERFECT}">',
+                '        <float name="relative_permittivity" value="1"/>',
+                f'        <float name="conductivity" value="{PERFECT_CONDUCTIVITY:g}"/>',
+                f'        <float name="thickness" value="{PERFECT_THICKNESS_M:g}"/>',
+                "    </bsdf>",
+            ]
+            continue
         lines += [
             f'    <bsdf type="twosided" id="mat-{material}">',
             f'        <bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/></bsdf>',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,43 @@ def one_line(error: object) -> str:
     return " ".join(str(error).split())
 
 
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another disk",
+    errno.EDQUOT: "free some of the quota or choose another disk",
+    errno.EFBIG: "choose a file system that takes larger files",
+    errno.EROFS: "choose a place that can be written",
+    errno.EACCES: "change its permissions or choose another place",
+    errno.EPERM: "change its permissions or choose another place",
+    errno.EISDIR: "choose another place, or a file in it",
+    errno.ENOTDIR: "choose another place: a file is where a folder is needed",
+    errno.EEXIST: "choose another place: a file is where a folder is needed",
+    errno.ENOTEMPTY: "empty the folder or choose another one",
+    errno.ENOENT: "check the name",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "correct its symbolic links",
+    errno.EXDEV: "choose a place on one file system",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "close other programs: the system has too many open files",
+    errno.ENOMEM: "free some memory",
+    errno.EIO: "check the disk or the network drive",
+    errno.ESTALE: "check the disk or the network drive",
+    errno.ETIMEDOUT: "check the address and the network",
+    errno.ECONNREFUSED: "check the address, and that the server runs",
+    errno.ECONNRESET: "check that the server runs",
+    errno.EADDRINUSE: "choose another port or end the program that uses it",
+}
+
+
+def os_failure(error: OSError) -> str:
+    """What the operating system refused, of which file, and the remedy for that, in one line."""
+    file = error.filename2 if error.filename2 is not None else error.filename
+    text = one_line(error.strerror or error)
+    if isinstance(file, str | bytes | os.PathLike):
+        text = f"{os.fsdecode(file)}: {text}"
+    remedy = _REMEDIES.get(error.errno or 0)
+    return f"{text}; {remedy}" if remedy else text
+
+
 def text_lines(path: Path) -> list[str]:
     """The lines of a UTF-8 text file without line ends, trailing blank lines left out.
 
@@ -30,7 +68,9 @@ def text_lines(path: Path) -> list[str]:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path}: missing; the folder is not complete") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise InputError(os_failure(error)) from None
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read ({one_line(error)}); give a UTF-8 text file") from None
     return text.rstrip().splitlines()
 
@@ -94,7 +134,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({one_line(error)}); choose another folder") from None
+        raise InputError(os_failure(error)) from None
     try:
         yield part
         if replace and path.exists():

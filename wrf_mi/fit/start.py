@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from ..core import InputError, Record
 from ..core.types import IntArray
@@ -13,7 +14,6 @@ from ..field import InitialGaussians, gaussians_from_points, random_gaussians
 from ..field.initial_paths import gaussians_from_mesh, gaussians_from_paths
 from ..scene.points import read_points
 from ..trace import open_scene, trace_paths
-from ..trace.materials import PERFECT
 from ..trace.scenes import MESHES
 from ..trace.surfaces import scene_surfaces
 from .config import InitialConfig

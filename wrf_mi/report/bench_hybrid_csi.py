@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
+from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from ..baselines.idw import InverseDistance
 from ..baselines.kriging import Kriging
@@ -26,7 +27,6 @@ from ..measure.newrf import read_newrf
 from ..scene.make import make_scene
 from ..scene.scan import RANGE_NOISE_M, simulate_scan
 from ..trace import TraceOptions, open_scene, trace_paths
-from ..trace.materials import PERFECT
 from ..trace.surfaces import scene_surfaces
 from .bench_scene import CLEAR_M, SCANNER_CLEAR_M, SCANNER_HEIGHTS_M, _clearance, spread
 from .bench_trace import room_file

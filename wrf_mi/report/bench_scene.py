@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import psutil
 from scipy.optimize import linear_sum_assignment
+from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray
@@ -21,7 +22,6 @@ from ..scene.make import make_scene
 from ..scene.packages import lidar_package
 from ..scene.scan import OUTLIERS, RANGE_NOISE_M, RAYS_PER_POSE, simulate_scan
 from ..trace import TraceOptions, open_scene, trace_paths
-from ..trace.materials import PERFECT
 from ..trace.surfaces import scene_surfaces
 from .bench_trace import ROOMS, room_file
 

@@ -12,6 +12,7 @@ import psutil
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.optimize import linear_sum_assignment
+from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray
@@ -20,7 +21,6 @@ from ..measure.newrf import KEYS, read_arrays
 from ..measure.registry import locate
 from ..receive import csi
 from ..trace import TraceOptions, open_scene, trace_paths
-from ..trace.materials import PERFECT
 from ..trace.surfaces import scene_surfaces
 
 ROOMS = ("conference", "office")

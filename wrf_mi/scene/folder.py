@@ -157,7 +157,8 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         try:
             write_atomically(xml, _xml(full))
         except OSError as error:
-            raise InputError(f"{xml}: cannot be written ({one_line(error)}); copy the folder and open that") from None
+            text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
+            raise InputError(f"{text}; copy the folder and open the copy") from None
     registration = facts.get("registration")
     return SceneFolder(
         folder=folder,

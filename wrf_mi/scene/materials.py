@@ -1,7 +1,7 @@
 """Which radio material each surface is of, kept in one file that a person may edit.
 
 A scan tells geometry, not what a wall is made of. Rules give each kind of surface a material of ITU-R P.2040, and
-single surfaces may depart from them:
+single surfaces may depart from them; ``perfect`` is a perfect conductor:
 
     rules: {floor: itu_concrete, ceiling: itu_ceiling_board, wall: itu_plasterboard, other: itu_wood}
     surfaces: {floor: floor, wall_01: wall, wall_02: itu_glass}
@@ -17,13 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
+from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_THICKNESS_M
+from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 
 from ..core import InputError
 from ..core.files import one_line, text_lines
 from .surfaces import KINDS
 
 FILE = "materials.yml"
+THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
+"""Slab thickness of every material that a surface may be of, metres, where the file gives none."""
 RULES: Mapping[str, str] = {
     "floor": "itu_concrete",
     "ceiling": "itu_ceiling_board",
@@ -38,7 +41,7 @@ class Materials:
     """Radio materials of a scene.
 
     Attributes:
-        rules: kind of surface -> material ``itu_*``; kinds left out take those of `RULES`.
+        rules: kind of surface -> material ``itu_*`` or ``perfect``; kinds left out take those of `RULES`.
         surfaces: name of a surface -> its kind, or a material of its own.
         thickness_m: material -> slab thickness in metres; those left out take ordinary building practice.
     """
@@ -97,7 +100,7 @@ def read_materials(path: str | Path) -> Materials:
 
 
 def check_material(name: Any, where: str, also: Sequence[str] = ()) -> str:
-    """A material's name, if it is one that Sionna RT knows.
+    """A material's name, if it is one of ITU-R P.2040 that Sionna RT knows, or the perfect conductor.
 
     Raises:
         InputError: it is not; the message begins with ``where`` and lists the known ones.
@@ -115,7 +118,7 @@ def materials_text(materials: Materials) -> str:
         "thickness_m": dict(materials.thickness_m),
     }
     head = (
-        "# Radio materials (ITU-R P.2040) of this scene. rules: of each kind of surface; surfaces: the kind of each,\n"
-        "# or a material of its own. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# Radio materials of this scene (of ITU-R P.2040, or perfect). rules: of each kind of surface; surfaces: the\n"
+        "# kind of each, or a material of its own. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

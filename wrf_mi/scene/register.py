@@ -204,10 +204,8 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
         )
     if best.score < LEAST_AGREEMENT:
         scale, agreement = best_scale(points, best, walls)
-        text = (
-            f"{name}: it does not fit the walls: agreement {best.score:.2f} (at least {LEAST_AGREEMENT}), {share:.0%} "
-        )
-        text += f"within {NEAR_M} m"
+        text = f"{name}: it does not fit the walls: agreement {best.score:.2f} (at least {LEAST_AGREEMENT}), "
+        text += f"{share:.0%} within {NEAR_M} m"
         if agreement > best.score + CLEAR_LEAD:
             better = f"lengths times {scale:.2f} would fit better (agreement {agreement:.2f})"
             raise InputError(f"{text}; {better}: check resolution and units, or give pairs")

@@ -11,6 +11,8 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M
+
 from ..core import InputError
 
 logger = logging.getLogger(__name__)
@@ -30,19 +32,23 @@ BELOW_1_GHZ: Mapping[str, tuple[float, float]] = {
 """Relative permittivity and conductivity in S/m for 0.3 to 1 GHz: the values of ITU-R P.2040 at 1 GHz, where its range
 begins. Its permittivities do not change with frequency, and its conductivities by 12 % or less down to 0.87 GHz."""
 
+CONSTANTS_XML = (
+    '<bsdf type="radio-material" id="{}"><float name="relative_permittivity" value="..."/>'
+    '<float name="conductivity" value="..."/></bsdf>'
+)
+"""A material of Sionna RT with constants; its name must not begin with itu."""
+
 CONSTANTS_FROM_HZ = 0.3e9
 """Where the constants end: below, the conductivity would be off by more than a factor of three."""
-
-PERFECT = "perfect"
-"""Name of a perfect conductor, which reflects without loss and lets nothing pass: what image-method tracers without
-materials assume, but for the sign of the field."""
 
 
 def perfect_reflector() -> Any:
     """A radio material of so high a conductivity that its reflection coefficients are -1 and +1 to single precision."""
     from sionna import rt
 
-    return rt.RadioMaterial(PERFECT, thickness=0.1, relative_permittivity=1.0, conductivity=1e13)
+    return rt.RadioMaterial(
+        PERFECT, thickness=PERFECT_THICKNESS_M, relative_permittivity=1.0, conductivity=PERFECT_CONDUCTIVITY
+    )
 
 
 def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, float] | None = None) -> None:
@@ -71,7 +77,9 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
         if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
             where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in sorted(ranges_ghz))
             text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
-            raise InputError(f"{text}; choose another material or give it explicit constants")
+            own = f"mat-my_{itu_type}"
+            way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {CONSTANTS_XML.format(own)}"
+            raise InputError(f"{text}; choose another material, or {way}")
         material.frequency_update_callback = _constants(*BELOW_1_GHZ[itu_type])
         constant.append(itu_type)
     if constant:

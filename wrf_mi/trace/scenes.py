@@ -10,14 +10,14 @@ from typing import Any
 import trimesh
 import yaml
 from wrf_mi_scenes import scenes
-from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
+from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
 from .. import backend
 from ..core import InputError
 from ..core.files import one_line
 from ..scene.folder import FACTS_FILE, read_scene_folder
 from ..scene.materials import FILE as MATERIALS_FILE
-from .materials import PERFECT, perfect_reflector, set_frequency
+from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
 HIGHEST_M = 500.0
