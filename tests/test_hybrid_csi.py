@@ -289,6 +289,8 @@ def test_what_cannot_be_fitted_is_refused(measured: Record, fitted: CsiHybrid) -
         fit_csi(replace(measured, task="rssi"), np.arange(5), None)
     with pytest.raises(InputError, match="no receiver 1"):
         fitted.predict(measured.tx_pos_m, 1)
+    few, name = measured.tx_pos_m[:2], measured.receivers[0].name
+    np.testing.assert_array_equal(fitted.predict(few, name).mean, fitted.predict(few, 0).mean)
     with pytest.raises(InputError, match="give finite"):
         fitted.predict([[0.0, np.nan, 0.0]], 0)
     with pytest.raises(InputError, match="ridge"):

@@ -187,6 +187,8 @@ def test_two_receivers_batches_and_another_loss(truth: Truth) -> None:
     assert set(heard) == {2}
     assert fit.predict(view=1).shape == (count,)
     assert fit.learned(view=1).shape == (count, 2 * 10 * 20)
+    np.testing.assert_array_equal(fit.predict(view=second.name), fit.predict(view=1))
+    np.testing.assert_array_equal(fit.learned(view=second.name), fit.learned(view=1))
     assert fit.predict(truth.positions[:3]).shape == (3, ROWS, COLUMNS)
     rows = np.concatenate([fit._next_rows() for _ in range(5)])
     assert np.bincount(rows, minlength=count).min() >= 1

@@ -279,7 +279,9 @@ def test_rows_that_one_receiver_missed_are_left_out_there(record: Record) -> Non
     quick = MeasuredSpectrumSettings(directions=20, lengths=2)
     model = fit_measured_spectrum(replace(record, observation=observed), rows, quick)
     assert [len(side.nearby.tx_pos_m) for side in model.sides] == [24, 20]
-    assert np.isfinite(model.predict(record.tx_pos_m[rows[:4]], 1).mean).all()
+    missed = model.predict(record.tx_pos_m[rows[:4]], 1).mean
+    assert np.isfinite(missed).all()
+    np.testing.assert_array_equal(model.predict(record.tx_pos_m[rows[:4]], record.receivers[1].name).mean, missed)
     observed[1, rows[: 25 - LEAST_ROWS]] = np.nan
     with pytest.raises(InputError, match=f"receiver two: {LEAST_ROWS - 1} training rows without a mesh; give"):
         fit_measured_spectrum(replace(record, observation=observed), rows, quick)

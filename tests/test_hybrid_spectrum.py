@@ -274,6 +274,11 @@ def test_bad_input_is_refused(bare: SpectrumModel) -> None:
     for wrong in ([1.0, 2.0, 3.0], [[np.nan, 0, 0]]):
         with pytest.raises(InputError, match="transmitters"):
             hybrid.predict(wrong, 0)
+    for unknown in ("sensor10", 1, -1):
+        with pytest.raises(InputError, match=f"no receiver .*; give one of {record.receivers[0].name}, or its number"):
+            hybrid.predict(record.tx_pos_m, unknown)
+    named = hybrid.predict(record.tx_pos_m, record.receivers[0].name).mean
+    np.testing.assert_array_equal(named, hybrid.predict(record.tx_pos_m, 0).mean)
     for setting in ({"steps": -1}, {"scale_m": 0.0}, {"validation": 1.0}):
         with pytest.raises(InputError, match="setting"):
             SpectrumSettings(**setting)

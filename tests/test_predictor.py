@@ -53,6 +53,7 @@ def test_predictor_of_other_receivers_and_sizes() -> None:
     for r, receiver in enumerate(RECEIVERS):
         alone = Predictor(field, params, [receiver], *SIZE)(tx)
         np.testing.assert_array_equal(both(tx, r), alone)
+        np.testing.assert_array_equal(both(tx, receiver.name), alone)
         # Pixels are points: twice the size has the same directions at every other pixel.
         double = Predictor(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
         np.testing.assert_allclose(double[:, ::2, ::2], alone, atol=FLOAT32_TOLERANCE)

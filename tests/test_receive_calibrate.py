@@ -175,6 +175,8 @@ def test_records_that_tell_nothing_are_refused(faulty):
         fit_array(replace(record, array_m=None), np.arange(50))
     with pytest.raises(InputError, match="4 rows to calibrate by"):
         fit_array(record, np.arange(4))
+    with pytest.raises(InputError, match=f"no receiver 'sensor10'; give one of {record.receivers[0].name}, or its"):
+        fit_array(record, np.arange(50), "sensor10")
 
 
 @needs_data

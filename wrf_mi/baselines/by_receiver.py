@@ -48,10 +48,8 @@ class ByReceiver:
         """What a receiver observes, [m, ...].
 
         Raises:
-            InputError: no such receiver, positions that are not known, or no headings for a model that was given some.
+            InputError: positions that are not known, or no headings for a model that was given some.
         """
-        if not 0 <= receiver < len(self.models):
-            raise InputError(f"{self.name}: no receiver {receiver}; give 0 to {len(self.models) - 1}")
         if not np.isfinite(inputs.tx_pos_m).all():
             raise InputError(f"{self.name}: predicts from positions; give finite x, y, z in metres for every row")
         if not self.heading:

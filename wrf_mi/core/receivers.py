@@ -1,7 +1,9 @@
-"""Receivers as plain arrays, as every file that holds some stores them."""
+"""Receivers as a user names them, and as every file that holds some stores them."""
 
 from __future__ import annotations
 
+import operator
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from typing import Any
@@ -10,9 +12,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .antenna import Antenna
+from .errors import InputError
+from .files import one_line
 from .types import Receiver
 
+SHOWN = 20
+"""Names that an error lists at most."""
+NUMBER = re.compile(r"[0-9]{1,9}")
+"""A string that may stand for a number."""
 KEYS = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw", "receiver_antenna")
+
+
+def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
+    """Index of a receiver that is given by its name or by its number.
+
+    Args:
+        receivers: in the record's order.
+        receiver: its name, or its number from 0. A string is a name first: where no receiver bears it, ``"2"`` is
+            number 2.
+
+    Raises:
+        InputError: no such receiver, or several of that name.
+
+    >>> import numpy as np
+    >>> both = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in ("kitchen", "0")]
+    >>> receiver_index(both, "kitchen"), receiver_index(both, 0), receiver_index(both, "0"), receiver_index(both, "1")
+    (0, 0, 1, 1)
+    """
+    names = [one.name for one in receivers]
+    if isinstance(receiver, str):
+        if names.count(receiver) > 1:
+            numbers = ", ".join(str(index) for index, name in enumerate(names) if name == receiver)
+            raise InputError(f"receiver {receiver!r}: name of several; give one's number, of {numbers}")
+        if receiver in names:
+            return names.index(receiver)
+        index = int(receiver) if NUMBER.fullmatch(receiver) else -1
+    else:
+        try:
+            index = operator.index(receiver)
+        except TypeError:
+            index = -1
+    if not 0 <= index < len(names):
+        listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+        text = f"no receiver {one_line(repr(receiver))}; give one of {one_line(listed)}"
+        raise InputError(f"{text}, or its number from 0 to {len(names) - 1}")
+    return index
 
 
 def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..backend.device import to_tensor
 from ..core import InputError, Receiver
+from ..core.receivers import receiver_index
 from ..field.gaussians import Gaussians
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
@@ -76,19 +77,20 @@ class Predictor:
             self._still = StillField(self._field, params, self.receivers, *size, self._store)
         return self._still
 
-    def __call__(self, tx_pos_m: ArrayLike, receiver: int = 0) -> NDArray[np.float32]:
+    def __call__(self, tx_pos_m: ArrayLike, receiver: int | str = 0) -> NDArray[np.float32]:
         """Spectra of transmitters at one receiver.
 
         Args:
             tx_pos_m: positions [m, 3], world frame, metres.
-            receiver: index into ``receivers``.
+            receiver: name, or number from 0, of one of ``receivers``.
 
         Returns:
             Greys [m, height, width].
 
         Raises:
-            InputError: positions of another shape or not finite.
+            InputError: positions of another shape or not finite, or no such receiver.
         """
+        index = receiver_index(self.receivers, receiver)
         positions = np.asarray(tx_pos_m, np.float32)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
@@ -97,7 +99,7 @@ class Predictor:
             raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
         if self._by_operator:
             try:
-                return self.still()(positions, receiver)
+                return self.still()(positions, index)
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
@@ -105,7 +107,5 @@ class Predictor:
         out = np.empty((len(positions), height, width), np.float32)
         for image, position in zip(out, positions, strict=True):
             tx = to_tensor(position[:, None])
-            image[:] = (
-                self._predict(self._params, tx, self._poses[receiver], self._plane).numpy().reshape(height, width)
-            )
+            image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)
         return out

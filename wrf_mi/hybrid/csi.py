@@ -26,6 +26,7 @@ from scipy.constants import speed_of_light
 
 from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, prior_sd, seen_by_rows
 from .csi_paths import MOUNTED_M, images_of
@@ -73,8 +74,10 @@ class CsiHybrid:
         self.receivers, self.model, self.visibility, self.rest = receivers, model, visibility, rest
         self.sharpness, self.covariance, self._facts = sharpness, covariance, dict(facts)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
         """Channels [m, subcarriers] from transmitters [m, 3] to one receiver; antennas are isotropic: no heading.
+
+        The receiver is given by its name, or by its number from 0.
 
         Raises:
             InputError: positions of another shape, or no such receiver.
@@ -82,10 +85,9 @@ class CsiHybrid:
         position = np.atleast_2d(np.asarray(tx_pos_m, float))
         if position.ndim != 2 or position.shape[1] != 3 or not np.isfinite(position).all():
             raise InputError(f"predict: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [m, 3]")
-        if not 0 <= receiver < len(self.receivers):
-            raise InputError(f"predict: no receiver {receiver}; give 0 to {len(self.receivers) - 1}")
+        index = receiver_index(self.receivers, receiver)
         first = range(0, max(len(position), 1), AT_ONCE)
-        mean, std = zip(*(self._part(position[begin : begin + AT_ONCE], receiver) for begin in first), strict=True)
+        mean, std = zip(*(self._part(position[begin : begin + AT_ONCE], index) for begin in first), strict=True)
         return Estimate(np.concatenate(mean), np.concatenate(std))
 
     def _part(self, position: FloatArray, receiver: int) -> tuple[Complex, FloatArray]:

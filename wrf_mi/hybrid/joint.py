@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.device import on_device, to_tensor
 from ..core import Receiver
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..field import InitialGaussians
 from ..field.recorded import Recorded
 from ..splat.tiles import perception_plane
@@ -262,14 +263,17 @@ class JointFit:
         last = self.losses[len(self.losses) - max(steps // 10, 1) :]
         return float(np.mean(last)) if steps else float("nan")
 
-    def predict(self, tx_pos_m: ArrayLike | None = None, view: int = 0) -> NDArray[np.float64]:
+    def predict(self, tx_pos_m: ArrayLike | None = None, view: int | str = 0) -> NDArray[np.float64]:
         """What a receiver reports, [n, *shape], with the present parameters.
 
         Args:
             tx_pos_m: transmitters [n, 3], metres; None: those of the fit.
-            view: number of the receiver.
+            view: name of the receiver, or its number from 0.
+
+        Raises:
+            InputError: no such receiver.
         """
-        own, parameters = self.views[view], self.parameters
+        own, parameters = self._view(view), self.parameters
         positions = self.tx_pos_m if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
         traced = own.traced
         with dr.suspend_grad():
@@ -280,19 +284,23 @@ class JointFit:
             report = self._report(own, parameters, rows, self._on_device(positions), traced)
             return np.asarray(report.numpy(), float).reshape(len(positions), *own.model.shape)
 
-    def learned(self, tx_pos_m: ArrayLike | None = None, view: int = 0) -> NDArray[np.complex128]:
+    def learned(self, tx_pos_m: ArrayLike | None = None, view: int | str = 0) -> NDArray[np.complex128]:
         """The learned signal R on the receiver's directions, [n, directions] (see `learned_field`).
 
         Raises:
+            InputError: no such receiver.
             ValueError: no learned side.
         """
-        own = self.views[view]
+        own = self._view(view)
         positions = self.tx_pos_m if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
         with dr.suspend_grad():
             signal = self._learned(own, self.parameters, self._on_device(positions))
         if signal is None:
             raise ValueError("learned: this fit has no learned side")
         return (signal[0].numpy() + 1j * signal[1].numpy().astype(float)).reshape(len(positions), -1)
+
+    def _view(self, view: int | str) -> View:
+        return self.views[receiver_index([one.receiver for one in self.views], view)]
 
     @staticmethod
     def _on_device(tx_pos_m: FloatArray) -> Any:

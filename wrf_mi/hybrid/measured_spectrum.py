@@ -26,6 +26,7 @@ from scipy.spatial.distance import cdist
 
 from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..receive.lags import Lags
 from ..receive.retrieve import retrieve_signals, unscale
@@ -129,23 +130,25 @@ class MeasuredSpectrumHybrid:
         self.elements_m, self.frequency_hz, self.shape = elements_m, frequency_hz, shape
         self._report = SpectrumReport(elements_m, frequency_hz, *shape)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int = 0, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(
+        self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
+    ) -> Estimate:
         """Expected spectra at positions [q, 3], metres, and their standard deviation, [q, height, width].
 
         Args:
             tx_pos_m: metres, world frame.
-            receiver: its number.
+            receiver: name, or number from 0.
             tx_heading_rad: not used: a spectrum has no scale that the transmitter's pattern could change.
 
         Raises:
-            InputError: positions of another shape or not finite.
+            InputError: positions of another shape or not finite, or no such receiver.
         """
         positions = np.atleast_2d(np.asarray(tx_pos_m, float))
         if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
             raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
         mean = np.zeros((len(positions), *self.shape), np.float32)
         std = np.zeros_like(mean)
-        side = self.sides[receiver]
+        side = self.sides[receiver_index(self.receivers, receiver)]
         for start in range(0, len(positions), PREDICTED_AT_ONCE):
             part = slice(start, start + PREDICTED_AT_ONCE)
             posterior = side.signals.predict(positions[part])

@@ -28,8 +28,14 @@ class HybridModel(Protocol):
         """Whose observations it predicts."""
         ...
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int, tx_heading_rad: ArrayLike | None = None) -> Estimate:
-        """What a receiver observes of transmitters at [q, 3], metres, turned by [q] rad, and how sure that is."""
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+        """What a receiver observes of transmitters at [q, 3], metres, turned by [q] rad, and how sure that is.
+
+        The receiver is given by its name, or by its number from 0.
+
+        Raises:
+            InputError: positions of another shape or not finite, or no such receiver.
+        """
         ...
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from .estimate import Estimate
 from .rssi_fit import Base, Field, Fit, Knobs, Measured, shift_of, stopper, widening
@@ -159,12 +160,12 @@ class RssiHybrid:
         self.receivers, self._field, self._stops = receivers, field, stops
         self._shift_db, self._widen, self._facts = shift_db, widen, dict(facts)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
         """Signal strengths in dBm, [m], with the standard deviation of a single report.
 
         Args:
             tx_pos_m: transmitters, [m, 3], metres.
-            receiver: number of the receiver.
+            receiver: name, or number from 0.
             tx_heading_rad: yaw of the transmitter's body, [m]; None where the fit knew headings: the average over all.
 
         Raises:
@@ -173,8 +174,7 @@ class RssiHybrid:
         position = np.atleast_2d(np.asarray(tx_pos_m, float))
         if position.ndim != 2 or position.shape[1] != 3 or not np.isfinite(position).all():
             raise InputError(f"predict: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [m, 3]")
-        if not 0 <= receiver < len(self.receivers):
-            raise InputError(f"predict: no receiver {receiver}; give 0 to {len(self.receivers) - 1}")
+        index = receiver_index(self.receivers, receiver)
         heading = None
         if tx_heading_rad is not None:
             heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
@@ -188,10 +188,10 @@ class RssiHybrid:
             headings = [np.full(len(position), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
         means, variances = [], []
         for own in headings:
-            parts = [self._part(position, own, receiver, first) for first in range(0, len(position), AT_ONCE)]
+            parts = [self._part(position, own, index, first) for first in range(0, len(position), AT_ONCE)]
             means.append(np.concatenate([part[0] for part in parts]) if parts else np.zeros(0))
             variances.append(np.concatenate([part[1] for part in parts]) if parts else np.zeros(0))
-        variance = np.mean(variances, axis=0) * self._widen[receiver] ** 2 + np.var(means, axis=0)
+        variance = np.mean(variances, axis=0) * self._widen[index] ** 2 + np.var(means, axis=0)
         return Estimate(np.mean(means, axis=0) + self._shift_db, np.sqrt(variance))
 
     def _part(

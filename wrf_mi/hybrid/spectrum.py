@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import Antenna, InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from .estimate import Estimate
 from .spectrum_fit import Constants, Maps
@@ -105,19 +106,21 @@ class SpectrumHybrid:
         """That report."""
         return tuple(model.instrument.receiver for model in self.models)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
         """Spectra of transmitters [m, 3] (metres) at one receiver, grey in 0..1: [m, height, width].
 
+        The receiver is given by its name, or by its number from 0.
         The antenna is isotropic, so a heading changes nothing. The deviation of a pixel is that of validation rows;
         where nothing was fitted, that of the predicted spectrum itself; an array of it is read-only.
 
         Raises:
-            InputError: positions of another shape or not finite.
+            InputError: positions of another shape or not finite, or no such receiver.
         """
         positions = np.asarray(tx_pos_m, float)
         if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
             raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
-        model, one = self.models[receiver], self.models[receiver].instrument
+        model = self.models[receiver_index(self.receivers, receiver)]
+        one = model.instrument
         mean = np.empty((len(positions), one.height, one.width), np.float32)
         # The same for all transmitters, or for all pixels of one: held once, not for each.
         error = np.empty((len(positions), 1, 1)) if model.error is None else model.error.astype(float)

@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 
 from ..core import InputError, Record, pixel_directions
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from .antenna import Array
 from .gains import SelfCalibration, self_calibrate
@@ -106,13 +107,13 @@ class ArrayFit:
         }
 
 
-def fit_array(record: Record, rows: ArrayLike, receiver: int = 0, waves: int = 3, seed: int = 0) -> ArrayFit:
+def fit_array(record: Record, rows: ArrayLike, receiver: int | str = 0, waves: int = 3, seed: int = 0) -> ArrayFit:
     """Calibrate a receiver's array by its own spectra.
 
     Args:
         record: of spectra that an array scaled to their own minimum and maximum; with its stated array and carrier.
         rows: training rows.
-        receiver: which one.
+        receiver: name, or number from 0.
         waves: plane waves in each row, see `wrf_mi.receive.gains`.
         seed: of the draws of rows and of starts.
 
@@ -120,8 +121,9 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int = 0, waves: int = 3
         The fit; 20 s of one core for 160 spectra of 90 x 360, most of it for the grid.
 
     Raises:
-        InputError: a record of another task or without its array and carrier; too few rows.
+        InputError: a record of another task or without its array and carrier; too few rows; no such receiver.
     """
+    index = receiver_index(record.receivers, receiver)
     if record.task != "spectrum" or record.array_m is None or record.frequencies_hz is None:
         raise InputError(
             f"{record.name}: calibration needs spectra with their array and carrier; give them in the data"
@@ -130,7 +132,7 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int = 0, waves: int = 3
     chosen = np.asarray(rows, np.int64)
     if len(chosen) < 2 * GEOMETRY_PARTS:
         raise InputError(f"{record.name}: {len(chosen)} rows to calibrate by; give {2 * GEOMETRY_PARTS} or more")
-    grey = np.asarray(record.observation[receiver, chosen], float)
+    grey = np.asarray(record.observation[index, chosen], float)
     height, width = grey.shape[1:]
     spacing, row_offset, column_offset = _grid(grey, elements, frequency_hz, seed)
     if abs(spacing.value - 1) > spacing.half:
@@ -141,7 +143,7 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int = 0, waves: int = 3
     unscaled = unscale(grey, lags, cut=cut)
     retrieved = retrieve_signals(unscaled, lags, seed)
     signals = align_signals(retrieved.signals, record.tx_pos_m[chosen], elements)
-    pose = record.receivers[receiver]
+    pose = record.receivers[index]
     sight = (record.tx_pos_m[chosen] - pose.position_m) @ pose.to_world
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     groups = _groups(record, chosen)

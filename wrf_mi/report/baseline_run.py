@@ -17,6 +17,7 @@ from ..baselines.method import Fitted, Inputs, Listen, Method, inputs_of
 from ..baselines.models import METHODS
 from ..core import InputError, Receiver, Record, Split
 from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..fit.config import settings_from, with_settings
 from ..fit.folder import CONFIG, check_new, stated_config
@@ -109,7 +110,7 @@ class Baseline:
     def predict(
         self,
         tx_pos_m: ArrayLike | None = None,
-        receiver: int = 0,
+        receiver: int | str = 0,
         tx_heading_rad: ArrayLike | None = None,
         uplink: ArrayLike | None = None,
     ) -> NDArray[Any]:
@@ -117,7 +118,7 @@ class Baseline:
 
         Args:
             tx_pos_m: positions [m, 3], metres; None: unknown.
-            receiver: its index.
+            receiver: name, or number from 0.
             tx_heading_rad: how the transmitter is turned, [m]; None: unknown.
             uplink: uplink channels [m, antennas, subcarriers]; None: unknown.
 
@@ -125,13 +126,14 @@ class Baseline:
             Observations [m, ...] as in `wrf_mi.core.Record`.
 
         Raises:
-            InputError: not what the method predicts from.
+            InputError: not what the method predicts from, or no such receiver.
         """
+        index = receiver_index(self.receivers, receiver)
         up = None if uplink is None else np.asarray(uplink)
         unknown = np.full((0 if up is None else len(up), 3), np.nan)
         positions = unknown if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
         heading = None if tx_heading_rad is None else np.atleast_1d(np.asarray(tx_heading_rad, float))
-        return self.predict_inputs(Inputs(positions, heading, up), receiver)
+        return self.predict_inputs(Inputs(positions, heading, up), index)
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The same."""
