@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.hybrid.gaussian_process import Part, fit_pooled
 from wrf_mi.hybrid.rssi import RssiHybrid, RssiSettings, fit_rssi
 from wrf_mi.hybrid.rssi_fit import Measured, shift_of, widening
-from wrf_mi.hybrid.rssi_map import PowerMap
+from wrf_mi.hybrid.rssi_map import PowerMap, trace_map
 from wrf_mi.hybrid.rssi_terms import Covariance, Places, stops_of
 
 FREQUENCY_HZ = 2.44e9
@@ -244,8 +247,6 @@ def test_bad_input() -> None:
 
 def test_a_wall_is_seen_without_a_measurement(tmp_path) -> None:  # type: ignore[no-untyped-def]
     """A room with a metal wall across it: the mesh alone tells that behind it less arrives."""
-    import trimesh
-
     from wrf_mi.trace import open_scene
 
     wall = trimesh.creation.box((0.1, 6.0, 3.0), trimesh.transformations.translation_matrix((3.0, 3.0, 1.5)))
@@ -262,6 +263,26 @@ def test_a_wall_is_seen_without_a_measurement(tmp_path) -> None:  # type: ignore
     assert (std > 8).all()
     again = RssiHybrid.from_arrays(model.arrays())
     np.testing.assert_array_equal(again.predict(record.tx_pos_m, 0).mean, model.predict(record.tx_pos_m, 0).mean)
+
+
+def test_a_map_leaves_out_what_is_inside_a_closed_solid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A column of 0.9 m holds points of the map's grid, whose antennas nobody has stated: no error and no warning."""
+    from wrf_mi.trace import open_scene
+
+    column = box((2.6, 2.4, 0), (3.5, 3.3, 3.0))
+    trimesh.util.concatenate([sheet(2, 0.0, (0.0, 6.0), (0.0, 6.0)), column]).export(tmp_path / "room.ply")
+    scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
+    record = made(3, noise_db=1.0)
+    for smooth_m in (0.0, 0.3):
+        traced = trace_map(scene, record, 0.25, smooth_m, 1, 1)
+        x, y = np.meshgrid(traced.x_m, traced.y_m, indexing="ij")
+        within = (np.abs(x - 3.05) < 0.45) & (np.abs(y - 2.85) < 0.45)
+        around = (np.abs(x - 3.05) < 0.9) & (np.abs(y - 2.85) < 0.9) & ~within
+        assert within.sum() >= 9
+        for power in traced.power_dbm[..., 0]:
+            # What is inside continues what is outside; it is no hole of the map, whose least value is its floor.
+            assert power[around].min() <= power[within].min() <= power[within].max() <= power[around].max()
+    assert not caplog.records
 
 
 @pytest.mark.skipif("WRF_MI_DATA" not in os.environ, reason="needs the measured flat")

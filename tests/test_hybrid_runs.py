@@ -16,8 +16,9 @@ from calling import call, refused
 from made_waves import SIZE, wave_record
 from traced_rooms import FREQUENCY_HZ, inside, write_xml
 from traced_rooms import SHOEBOX as ROOM
+from wrf_mi_scenes.build_laboratory import box
 
-from wrf_mi.core import InputError, Receiver
+from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.report.compare import compare
 from wrf_mi.report.hybrid_run import HybridRun, evaluate_hybrid, open_hybrid, train_hybrid
@@ -278,6 +279,40 @@ def test_mesh_alone_predicts_spectra(tmp_path: Path) -> None:
         assert evaluate_hybrid(out)["ssim"] == read_run(out).metrics["ssim"]
         found.append(stored(out)["prediction"])
     assert np.abs(found[0] - found[1]).mean() > 0.02
+
+
+def test_antennas_are_checked_once_and_as_the_ray_tracer_does(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Five folds warn once; a receiver or a transmitter in a column is refused in the words of `wrf-mi trace`."""
+    record = wave_record(40, 10, receivers=1)
+    record = replace(
+        record, tx_pos_m=record.tx_pos_m + np.array([2.0, 2.0, 1.2]), receivers=(_at([4.4, 3.1, -2e-3], record),)
+    )
+    scene = write_xml(tmp_path / "hall", {**ROOM, "column": ("itu_concrete", box((4.8, 3.6, 0), (5.3, 4.1, 3)))})
+    plain = ("rays=1024", "reflections=1", "surfaces=0", "amplitudes=false", "rest=false", "steps=1")
+    folder = write_spectrum_folder(tmp_path / "waves", record)
+    train_hybrid(folder, tmp_path / "run", scene, split="blocked", settings=plain)
+    said = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    assert [text.partition(" (first: receiver one)")[0] for text in said] == [
+        "1 of 1 antennas lie up to 1 cm behind an outer wall",
+        "1 of 1 antennas stand within 1 cm of a surface",
+    ]
+    moved = record.tx_pos_m.copy()
+    moved[7] = [5.0, 4.0, 1.0]
+    for name, wrong, antenna in (
+        ("rx", replace(record, receivers=(_at([5.0, 4.0, 1.0], record),)), "receiver one"),
+        ("tx", replace(record, tx_pos_m=moved), "transmitter 8"),
+    ):
+        data = write_spectrum_folder(tmp_path / name, wrong)
+        message = rf"{antenna} at \(5.00, 4.00, 1.00\) m is inside the solid 'column'; move one of them"
+        for command in (["train", data, "--model", "hybrid", "--scene", scene], ["trace", scene, data]):
+            refused([*command, "--out", tmp_path / "out"], message, capsys)
+            assert not (tmp_path / "out").exists()
+
+
+def _at(position: Any, record: Record) -> Receiver:
+    return replace(record.receivers[0], position_m=np.array(position, float))
 
 
 def test_channels_are_predicted_from_a_mesh(tmp_path: Path) -> None:

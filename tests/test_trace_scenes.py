@@ -157,6 +157,23 @@ def test_an_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.
         trace_paths(scene, places[[0, 2]], receiver([1, 1, 2]))
 
 
+def test_a_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path: Path):
+    """Exporters number shapes: such an id tells nobody what to look for."""
+    column = {"column": ("itu_concrete", box((2, 2, 0), (2.5, 2.5, 2.8)))}
+    xml = write_xml(tmp_path, {**SHOEBOX, **column})
+    text = xml.read_text()
+    inside_it = np.array([[2.2, 2.3, 1.0]])
+    for number, stated in enumerate(('id="mesh-elm__3"', "")):
+        xml.write_text(text.replace('id="column"', stated))
+        scene = open_scene(xml, FREQUENCY_HZ)
+        called = ("'elm__3' ", "'no-name-1' ")[number] + r"\(column.ply\); move one of them"
+        with pytest.raises(InputError, match=f"^transmitter 1 at .* is inside the solid {called}"):
+            trace_paths(scene, inside_it, receiver([1, 1, 2]))
+    column["column"][1].export(tmp_path / "pillar.stl")
+    with pytest.raises(InputError, match="is inside the solid 'pillar'; move one of them"):
+        trace_paths(open_scene(tmp_path / "pillar.stl", FREQUENCY_HZ, material="wood"), inside_it, receiver([1, 1, 2]))
+
+
 def test_winding_number():
     sphere = trimesh.creation.icosphere(subdivisions=2)
     inside = np.random.default_rng(0).normal(size=(50, 3))

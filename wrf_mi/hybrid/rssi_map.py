@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
@@ -21,6 +22,8 @@ MOST_POINTS = 6000
 LAYER_M = 0.5
 """Layers of the grid are at most that far apart over the heights that the transmitter takes."""
 SAME_HEIGHT_M = 0.02
+LEAST_SHARE = 1e-3
+"""Share of a neighbourhood outside of solids below which the nearest point that has more counts."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,9 @@ def trace_map(
 ) -> PowerMap:
     """Trace a scene on a grid over all of it and all of a record's positions.
 
+    Points of the grid inside closed solids (`wrf_mi.trace.devices.solids`) are not traced: means over a neighbourhood
+    leave them out, and they take the mean of the points outside, or the value of the nearest of these.
+
     Args:
         scene: from `wrf_mi.trace.open_scene`.
         record: whose receivers and heights count.
@@ -66,6 +72,8 @@ def trace_map(
     """
     from ..receive import rssi_dbm
     from ..trace import TraceOptions, trace_paths
+    from ..trace.devices import solid_around
+    from ..trace.solve import Prepared
 
     box = scene.mi_scene.bbox()
     low = np.minimum([box.min.x, box.min.y], record.tx_pos_m[:, :2].min(axis=0))
@@ -77,15 +85,32 @@ def trace_map(
     x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
     options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
-    found = trace_paths(scene, grid.reshape(-1, 3), record.receivers, options, tx_antenna=record.tx_antenna)
-    traced = rssi_dbm(found.paths)
+    points, prepared = grid.reshape(-1, 3), Prepared(scene)
+    outside = solid_around(prepared.surfaces, points) < 0
+    if not outside.any():
+        raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
+    traced = np.full((len(record.receivers), len(points)), np.nan)
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
+    found = trace_paths(scene, points[outside], record.receivers, options, **how)
+    traced[:, outside] = rssi_dbm(found.paths)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers: a floor apart is another place, and they lie wider than the neighbourhood.
     sigma = (0, smooth_m / steps[0], smooth_m / steps[1], 0)
-    power = gaussian_filter(power, sigma, mode="nearest")
+    power = _means_outside(power, outside.reshape(grid.shape[:3]), sigma, steps)
     for receiver, own in zip(record.receivers, power, strict=True):
         if not (own > 0).any():
             raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or max_depth")
         own[own <= 0] = own[own > 0].min()
     return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
+
+
+def _means_outside(
+    power: FloatArray, outside: NDArray[np.bool_], sigma: tuple[float, ...], steps_m: list[float]
+) -> FloatArray:
+    """Local means of power [n_rx, x, y, z] over the points outside of solids; the nearest such where there is none."""
+    share = gaussian_filter(outside[None].astype(float), sigma, mode="nearest")
+    mean = gaussian_filter(power, sigma, mode="nearest") / np.maximum(share, LEAST_SHARE)
+    sampling = [step if np.isfinite(step) else 1.0 for step in steps_m]
+    nearest = distance_transform_edt(share[0] < LEAST_SHARE, sampling, return_distances=False, return_indices=True)
+    return np.asarray(mean[:, *nearest])

@@ -25,6 +25,7 @@ from ..fit.folder import check_new, stated_config
 from ..hybrid.models import HybridModel, kind_of
 from ..measure import make_splits
 from ..trace import load_record, open_scene
+from ..trace.solve import Prepared
 from ..trace.tracer import instrument_of
 from .fitted_run import FittedConfig, FittedRun, opened
 from .run_folder import stated_model
@@ -94,6 +95,15 @@ class HybridRun(FittedRun[HybridConfig, HybridModel]):
         """
         config = read_hybrid_config(folder)
         return cls(folder, config, load_record(config.dataset))
+
+    def check_antennas(self) -> None:
+        """Refuse antennas inside the scene's solids and warn of those near surfaces, as `wrf-mi trace` does.
+
+        Raises:
+            InputError: naming the transmitter or receiver, and the solid.
+        """
+        if self._scene is not None:
+            Prepared(self._scene).check(np.asarray(self.record.tx_pos_m, float), self.record.receivers)
 
     def fit(self, rows: Split, listen: Listen) -> HybridModel:
         """Fit it to all training rows."""
@@ -185,6 +195,7 @@ def train_hybrid(
         source, split, n_train, seed, place, material, settings, antennas=antennas, deterministic=deterministic
     )
     run = HybridRun(Path(out), config, record)
+    run.check_antennas()
     # Without training rows the split keeps them for the references beside the model, which need some.
     splits = make_splits(record, split, seed, None if n_train == 0 else n_train)
     for rows in splits:

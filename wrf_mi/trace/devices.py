@@ -41,14 +41,12 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     Raises:
         InputError: naming the first such antenna.
     """
-    thing = np.full(len(positions_m), -1)
-    for face in solids(surfaces):
-        thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
+    thing = solid_around(surfaces, positions_m)
     if (thing >= 0).any():
         first = int(np.argmax(thing >= 0))
         place = ", ".join(f"{x:.2f}" for x in positions_m[first])
-        what = surfaces.names[thing[first]]
-        raise InputError(f"{names[first]} at ({place}) m is inside the solid {what!r}; move one of them")
+        what = surfaces.called(int(thing[first]))
+        raise InputError(f"{names[first]} at ({place}) m is inside the solid {what}; move one of them")
     near = np.flatnonzero(_near(surfaces, positions_m))
     if len(near):
         text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
@@ -86,6 +84,14 @@ def tell_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str
     if len(changed):
         text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
         logger.warning(text, len(changed), len(moved_m), names[changed[0]])
+
+
+def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
+    """Object of the solid that each position [n, 3] is inside of, -1 for none; see `solids`."""
+    thing = np.full(len(positions_m), -1)
+    for face in solids(surfaces):
+        thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
+    return thing
 
 
 def solids(surfaces: Surfaces) -> list[IntArray]:

@@ -114,9 +114,9 @@ def _from_mesh(path: Path, material: str) -> Any:
         objects = []
         for index, part in enumerate(parts):
             # Corners and faces alone: Mitsuba warns of attributes that it does not know.
-            file = Path(folder) / f"{index}.ply"
-            trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)
             name = path.stem if len(parts) == 1 else f"{path.stem}_{index}"
+            file = Path(folder) / f"{name}.ply"
+            trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)
             objects.append(rt.SceneObject(fname=str(file), name=name, radio_material=radio_material))
         if objects:
             scene.edit(add=objects)

@@ -49,6 +49,27 @@ class Prepared:
         self._scene = scene
         self._found: dict[tuple[bytes, TraceOptions, int], Any] = {}
         self._rays: dict[TraceOptions, int] = {}
+        self._checked: set[bytes] = set()
+
+    def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
+        """Refuse antennas inside solids and warn of those near surfaces, each place once.
+
+        Args:
+            tx_pos_m: transmitters as stated [n, 3], metres.
+            receivers: as stated.
+            first_row: what errors call the first transmitter.
+
+        Raises:
+            InputError: see `wrf_mi.trace.devices.check_devices`.
+        """
+        placed, moved = self.placed(tx_pos_m, receivers)
+        ends = (tx_pos_m, placed), tuple(np.stack([one.position_m for one in each]) for each in (receivers, moved))
+        names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
+        for (stated, traced), called in zip(ends, (names, [f"receiver {one.name}" for one in receivers]), strict=True):
+            new = [row for row, place in enumerate(stated) if place.tobytes() not in self._checked]
+            tell_moved(stated[new], traced[new], [called[row] for row in new])
+            check_devices(self.surfaces, traced[new], [called[row] for row in new])
+            self._checked.update(place.tobytes() for place in stated)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
         """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.trace.devices.before_walls`."""
@@ -81,6 +102,7 @@ def trace_paths(
     prepared: Prepared | None = None,
     first_row: int = 0,
     tx_antenna: Antenna = ANTENNA,
+    check: bool = True,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
@@ -102,6 +124,7 @@ def trace_paths(
             these, and only the first time.
         first_row: what errors call the first transmitter, where one traces in parts.
         tx_antenna: antenna of the transmitters; the receivers state theirs.
+        check: refuse antennas inside solids, warn of those near surfaces; False for places that are a model's own.
 
     Returns:
         The paths, the same for the same seed whatever the parts. Lengths and directions are float64: a float32 length
@@ -119,14 +142,9 @@ def trace_paths(
         raise InputError(f"trace_paths: {len(positions)} transmitters and {len(everyone)} receivers; give one at least")
     kept = prepared or Prepared(scene)
     surfaces = kept.surfaces
-    names = [f"transmitter {first_row + row + 1}" for row in range(len(positions))]
-    own = [f"receiver {one.name}" for one in everyone]
-    stated = positions, np.stack([one.position_m for one in everyone])
+    if check:
+        kept.check(positions, everyone, first_row)
     positions, everyone = kept.placed(positions, everyone)
-    traced = positions, np.stack([one.position_m for one in everyone])
-    for before, after, called in zip(stated, traced, (names, own), strict=True):
-        tell_moved(before, after, called)
-        check_devices(surfaces, after, called)
     swap = (prepared is not None or len(everyone) <= len(positions)) and not keeps_direction(options)
     transmitters, its_receivers = device_ends(positions, everyone, tx_antenna)
     ends = (its_receivers, transmitters) if swap else (transmitters, its_receivers)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,8 @@ COPLANAR_COS = 0.99
 """... and its normal within 8 degrees, which a sliver's rounded normal needs and a thin object's rim has not."""
 MERGED_M2 = 0.01
 """Planes of less area are not looked for among rounded normals."""
+MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)
+"""Where Mitsuba's description of a mesh states its file: no attribute has it."""
 MERGED_COUNT = 1000
 """Largest planes that take in others' faces: bounds the time for meshes without planes."""
 
@@ -36,6 +40,7 @@ class Surfaces:
         face: largest face of each plane, shape [q].
         axes: two unit vectors in each plane [q, 2, 3].
         low, high: bounds of the plane's faces along ``axes``, shape [q, 2], metres.
+        files: name of each object's mesh file, empty where it has none; none at all where objects are not of a file.
     """
 
     names: tuple[str, ...]
@@ -49,6 +54,12 @@ class Surfaces:
     axes: FloatArray
     low: FloatArray
     high: FloatArray
+    files: tuple[str, ...] = ()
+
+    def called(self, thing: int) -> str:
+        """What errors call an object: its name, and its mesh file where that is called otherwise."""
+        name, file = self.names[thing], self.files[thing] if self.files else ""
+        return repr(name) if Path(file).stem in ("", name) else f"{name!r} ({file})"
 
     def object_of(self, face: IntArray) -> IntArray:
         """Object of each face."""
@@ -61,7 +72,7 @@ def scene_surfaces(scene: Any) -> Surfaces:
     import mitsuba as mi
 
     names = tuple(scene.objects)
-    ids, triangles = [], [np.zeros((0, 3, 3))]
+    ids, files, triangles = [], [], [np.zeros((0, 3, 3))]
     for name in names:
         mesh = scene.objects[name].mi_mesh
         parameters = mi.traverse(mesh)
@@ -69,8 +80,11 @@ def scene_surfaces(scene: Any) -> Surfaces:
         triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
         pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mesh))
         ids.append(int(pointer[0]))
+        stated = MESH_FILE.search(str(mesh))
+        files.append(stated[1] if stated else "")
     first = np.cumsum([len(part) for part in triangles])
-    return find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
+    found = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
+    return replace(found, files=tuple(files))
 
 
 def find_planes(
