@@ -22,7 +22,7 @@ from wrf_mi.core import InputError, Record
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.parallel import Scheduler, open_scheduler
 from wrf_mi.report import traced
-from wrf_mi.report.bench import BenchFailed, bench
+from wrf_mi.report.bench import BenchFailed, bench, case_folder
 from wrf_mi.report.hybrid_run import train_hybrid
 from wrf_mi.report.runs import predict_to_file, train
 from wrf_mi.report.traced import trace_run
@@ -182,15 +182,16 @@ def test_bench_writes_what_workers_measured_and_says_why_one_failed(
 ) -> None:
     """A check that was measured before, and a run that cannot go on."""
     runs, out = tmp_path / "runs", tmp_path / "out"
-    (runs / "flat-plan").mkdir(parents=True)
+    folder = case_folder(runs, "flat-plan")
+    folder.mkdir(parents=True)
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
-    (runs / "flat-plan" / "check.json").write_text(json.dumps({"figures": figures}))
+    (folder / "check.json").write_text(json.dumps({"figures": figures}))
     rows = bench(["flat-plan"], out, runs, two)
     assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
     assert rows[0]["figures"] == figures
     assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
     assert "cases that share a machine" in capsys.readouterr().err
-    (runs / "demo").mkdir()
-    (runs / "demo" / "config.yaml").write_text("nonsense")
+    case_folder(runs, "demo").mkdir()
+    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
     with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
         bench(["flat-plan", "demo"], out, runs, two)

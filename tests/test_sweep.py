@@ -171,6 +171,33 @@ def test_finished_runs_are_kept_and_others_added_or_done_again(
     refused([*command[:-2], folder], "holds no sweep", capsys)
 
 
+def test_sweep_goes_on_with_the_same_data_and_versions_alone(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = shutil.copytree(folder, tmp_path / "data")
+    monkeypatch.setattr(module, "run_module", lambda *call: (1, "not run"))
+
+    def again(*values: str) -> list[str]:
+        plan = plan_sweep(tmp_path / "sweep", ["seed=0,1", *values], {"dataset": str(data)})
+        return [row["status"] for row in run_sweep(plan)]
+
+    assert again() == again() == ["not run"] * 2
+    original = (data / "gateway_info.yml").read_bytes()
+    (data / "gateway_info.yml").write_bytes(original + b"\n")
+    with pytest.raises(InputError, match=rf"holds a sweep with other content of {data}; choose another --out"):
+        again()
+    (data / "gateway_info.yml").write_bytes(original)
+    versions = module.package_versions()
+    monkeypatch.setattr(module, "package_versions", lambda: versions | {"drjit": "0.1"})
+    with pytest.raises(InputError, match="holds a sweep by other versions of drjit; choose another --out"):
+        again()
+    path = tmp_path / "sweep" / "sweep.json"
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in stored.items() if key != "versions"}))
+    with pytest.raises(InputError, match="by other versions of what it does not state"):
+        again()
+
+
 def test_failed_run_is_told_and_the_others_go_on(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,7 @@ def made_row(row: Row, median: float) -> dict:
         "share": row.share,
         "seed": row.seed,
         "command": row.command,
+        "versions": tables.package_versions(),
         "n_train": 10,
         "n_test": 5,
         "train_seconds": 3.0,
@@ -104,6 +105,36 @@ def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, mo
     path.write_text(path.read_text().replace("--model fire", "--model fire --set training.steps=1"))
     tables.tables(tmp_path, tmp_path / "runs")
     assert asked == [short_plan[0].name]
+
+
+def test_a_row_of_other_data_is_measured_again_and_one_of_other_versions_is_told(
+    short_plan, monkeypatch, tmp_path, capsys
+):
+    data = tmp_path / "data"
+    data.mkdir()
+    monkeypatch.setattr(tables, "dataset_files", lambda name: [data])
+    asked = []
+
+    def measure(runs, row):
+        asked.append(row.name)
+        return made_row(row, 5.0) | {"data": tables.content_digest([data]), "versions": tables.package_versions()}
+
+    monkeypatch.setattr(tables, "measure", measure)
+    tables.tables(tmp_path, tmp_path / "runs")
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert len(asked) == 3
+    assert "stored rows" not in capsys.readouterr().err
+    for row, change in zip(short_plan, ({"data": "other"}, {"versions": {"numpy": "0.1"}}, {}), strict=True):
+        path = tmp_path / "tables" / f"{row.name}.json"
+        stored = json.loads(path.read_text()) | change
+        if not change:
+            del stored["data"]
+        path.write_text(json.dumps(stored))
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert asked[3:] == [short_plan[0].name]
+    err = capsys.readouterr().err
+    assert "1 of 2 stored rows were measured by other versions of packages and are kept" in err
+    assert "1 of 2 stored rows do not state their data and are kept" in err
 
 
 def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_path):

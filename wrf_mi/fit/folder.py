@@ -64,14 +64,21 @@ class RunConfig:
     settings: TrainConfig
 
 
-def versions() -> dict[str, str]:
-    """Versions of what computes."""
+def package_versions() -> dict[str, str]:
+    """Versions of this package, of those that compute for it, and of Python."""
     packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image", "scikit-learn")
-    backend = init()
     return {
         "wrf-mi": __version__,
         **{name: importlib.metadata.version(name) for name in packages},
         "python": platform.python_version(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes: packages, backend and device."""
+    backend = init()
+    return {
+        **package_versions(),
         "backend": f"{backend.name} {backend.llvm_version or ''}".strip(),
         "device": backend.device,
     }

@@ -25,7 +25,11 @@ from ..core import InputError
 from ..core.files import write_atomically
 from ..fit.folder import versions
 from ..parallel import Scheduler, SerialScheduler, run_module, worker_threads
+from .fit_key import dataset_files, fit_key
 from .run_folder import CONFIG, METRICS
+
+RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
+"""Data sets that are measured elsewhere; all others are made on this machine."""
 
 
 class BenchFailed(RuntimeError):
@@ -41,10 +45,12 @@ class Case:
     Attributes:
         title: for the table.
         arguments: of ``wrf-mi``, without ``--out``.
+        data: data sets that it reads.
     """
 
     title: str
     arguments: tuple[str, ...]
+    data: tuple[str, ...] = (RFID,)
 
 
 @dataclass(frozen=True)
@@ -57,11 +63,17 @@ class Check:
             dictionaries ``what``, ``value`` (text with its unit) and ``asked``, beside whatever else it measured.
         quick: likewise, the same with few cases, for `quick_checks`; it raises `BenchFailed` where a bound is not held.
             Empty: there is none.
+        data: data sets that it reads where they are on this machine.
     """
 
     title: str
     function: str
     quick: str = ""
+    data: tuple[str, ...] = ()
+
+
+MEASURED, STORED_CHECK = "bench.json", "check.json"
+"""In the folder of a case that is finished, and of a check."""
 
 
 SHORT = ("--set", "steps=3000", "--set", "hold_out=0")
@@ -73,7 +85,7 @@ LONG = ("--set", "steps=15000")
 
 
 def _train(*arguments: str) -> tuple[str, ...]:
-    return ("train", "rfid-lab", *arguments)
+    return ("train", RFID, *arguments)
 
 
 CASES: Mapping[str, Case] = {
@@ -87,31 +99,31 @@ CASES: Mapping[str, Case] = {
     "wrf-gs+-paper": Case("WRF-GS+, L = 9 as the paper", _train("--model", "wrf-gs+", "--preset", "paper", *LONG)),
     "wrf-gs+-blocked": Case("WRF-GS+, blocked", _train("--model", "wrf-gs+", "--split", "blocked", *SHORT)),
     "wrf-gs-blocked": Case("WRF-GS, blocked", _train("--model", "wrf-gs", "--split", "blocked", *SHORT)),
-    "demo": Case("the demo (WRF-GS+, short)", ("demo",)),
+    "demo": Case("the demo (WRF-GS+, short)", ("demo",), (RFID, FLAT)),
 }
 
 
 CHECKS: Mapping[str, Check] = {
     "traced-and-splatted": Check("Mitsuba integrator", "bench_traced:main"),
-    "image-method": Check("Sionna RT against MATLAB", "bench_trace:newrf"),
-    "scan-to-paths": Check("mesh from a scan", "bench_scene:scans"),
-    "large-scan": Check("mesh from a scan", "bench_scene:large_scan"),
-    "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan"),
-    "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat"),
+    "image-method": Check("Sionna RT against MATLAB", "bench_trace:newrf", data=(CONFERENCE, OFFICE)),
+    "scan-to-paths": Check("mesh from a scan", "bench_scene:scans", data=(CONFERENCE, OFFICE)),
+    "large-scan": Check("mesh from a scan", "bench_scene:large_scan", data=(OFFICE,)),
+    "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan", data=(FLAT,)),
+    "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat", data=(FLAT,)),
     "stress": Check("numbers under stress", "bench_stress:main", "bench_stress:quick"),
-    "determinism": Check("the same again", "bench_determinism:main"),
-    "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab"),
-    "hybrid-flat": Check("hybrid, flat-ble", "bench_hybrid_rssi:all_rows"),
-    "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows"),
-    "hybrid-conference": Check("hybrid, newrf", "bench_hybrid_csi:conference"),
-    "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office"),
+    "determinism": Check("the same again", "bench_determinism:main", data=(RFID, FLAT, CONFERENCE)),
+    "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab", data=(RFID,)),
+    "hybrid-flat": Check("hybrid, flat-ble", "bench_hybrid_rssi:all_rows", data=(FLAT,)),
+    "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows", data=(FLAT,)),
+    "hybrid-conference": Check("hybrid, newrf", "bench_hybrid_csi:conference", data=(CONFERENCE,)),
+    "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office", data=(OFFICE,)),
     "hybrid-room": Check("hybrid, traced room", "bench_hybrid_room:main"),
     "hybrid-starts": Check("WRF-GS+, traced room", "bench_starts:main"),
     "pareto": Check("traced room", "bench_pareto:main"),
     "scaling": Check("cost against work", "bench_scaling:main"),
     "operator": Check("prediction by operator", "bench_operator:main"),
-    "budgets": Check("fields at budgets", "bench_budget:main"),
-    "training": Check("training", "bench_training:main"),
+    "budgets": Check("fields at budgets", "bench_budget:main", data=(RFID,)),
+    "training": Check("training", "bench_training:main", data=(RFID,)),
 }
 
 
@@ -124,7 +136,8 @@ SHARED_NOTE = (
 def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
     """Measure cases one after the other, each as a process of its own, and write the table.
 
-    A case whose run folder is finished is only written down again; one that was stopped goes on.
+    A case that is finished for the same arguments, data and versions is only written down again; one that was stopped
+    goes on.
 
     Args:
         names: keys of `CASES` and `CHECKS`.
@@ -186,13 +199,23 @@ def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _case(runs: Path, name: str) -> dict[str, Any]:
-    return _check(name, runs / name) if name in CHECKS else _measure(name, runs / name)
+    folder = case_folder(runs, name)
+    if (folder / (STORED_CHECK if name in CHECKS else MEASURED)).exists():
+        print(f"{name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
+    return _check(name, folder) if name in CHECKS else _measure(name, folder)
+
+
+def case_folder(runs: Path, name: str) -> Path:
+    """Folder of a case or check: its name and a key of arguments, data and versions (`wrf_mi.report.fit_key`)."""
+    made: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
+    what = made.function if isinstance(made, Check) else made.arguments
+    return runs / f"{name}-{fit_key(what, [dataset_files(one) for one in made.data])}"
 
 
 def _measure(name: str, folder: Path) -> dict[str, Any]:
     case = CASES[name]
     arguments = [*case.arguments, "--out", str(folder)]
-    if not (folder / METRICS).exists() or not (folder / "bench.json").exists():
+    if not (folder / METRICS).exists() or not (folder / MEASURED).exists():
         resumed = (folder / CONFIG).exists()
         call = ["train", "--resume", str(folder)] if resumed else arguments
         start = time.perf_counter()
@@ -203,13 +226,13 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
         wall = None if resumed else time.perf_counter() - start
         # Written when it is measured: the table may be made again elsewhere.
         measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine(), **threads()}
-        write_atomically(folder / "bench.json", json.dumps(measured))
+        write_atomically(folder / MEASURED, json.dumps(measured))
     config = yaml.safe_load((folder / CONFIG).read_text())
     return {
         "case": name,
         "title": case.title,
         "command": "wrf-mi " + " ".join(arguments),
-        **json.loads((folder / "bench.json").read_text()),
+        **json.loads((folder / MEASURED).read_text()),
         "versions": config["versions"],
         "metrics": json.loads((folder / METRICS).read_text()),
     }
@@ -217,7 +240,7 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
 
 def _check(name: str, folder: Path) -> dict[str, Any]:
     """The stored result of a check, measured now if there is none; in a process of its own, as it states its memory."""
-    stored = folder / "check.json"
+    stored = folder / STORED_CHECK
     if not stored.exists():
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()

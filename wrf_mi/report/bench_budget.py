@@ -5,16 +5,19 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ..core import Record
 from ..fit.compress import Compression
 from ..fit.config import TrainConfig, with_settings
-from ..fit.folder import load_predictor, load_rows
+from ..fit.folder import load_predictor
+from ..measure import make_splits
 from ..trace import load_record
 from .compressed import compress_run, plain_size, spectrum_times
-from .run_folder import METRICS, read_run
+from .fit_key import fit_key, fit_once
+from .run_folder import read_run
 from .runs import train
 
 BEST = "WRF-GS+"
@@ -67,7 +70,7 @@ def budgets(
 
     Args:
         record: of spectra, with an official split.
-        work: folder for the runs; one that is finished there is used again.
+        work: folder for the runs; a finished one with the same key (`wrf_mi.report.fit_key`) is used again.
         schedule: settings of every fit.
         seed: of every fit.
         given: by name; the first is what the others are compared with. What another starts by stands before it.
@@ -76,20 +79,19 @@ def budgets(
         By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
         `wrf_mi.report.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
     """
-    folders = {}
+    rows, whole_fits, folders = make_splits(record, "official", seed)[0], dict[str, Path](), dict[str, Path]()
     for name, budget in given.items():
-        fitted = work / _folder_name(budget.of or name)
-        if not budget.of and not (fitted / METRICS).exists():
+        if not budget.of:
             config = with_settings(TrainConfig(seed=seed), [*schedule, *budget.settings])
-            train(record, fitted, config)
-        folders[name] = fitted
+            fitted = work / f"{_folder_name(name)}-{fit_key(record, rows, config)}"
+            whole_fits[name] = fit_once(fitted, partial(train, record, fitted, config))
+        folders[name] = source = whole_fits[budget.of or name]
         if budget.how is not None:
-            folders[name] = work / f"{_folder_name(name)}-{budget.how.precision}"
-            if not (folders[name] / METRICS).exists():
-                compress_run(fitted, folders[name], budget.how, record)
+            small = work / f"{_folder_name(name)}-compressed-{fit_key(source.name, budget.how)}"
+            folders[name] = fit_once(small, partial(compress_run, source, small, budget.how, record))
     first = folders[next(iter(folders))]
     predictors = {name: load_predictor(folder) for name, folder in folders.items()}
-    times = spectrum_times(predictors, record.tx_pos_m[load_rows(first, record).all_train], REPEATS)
+    times = spectrum_times(predictors, record.tx_pos_m[rows.all_train], REPEATS)
     found, whole = {}, read_run(first).metrics["ssim"]["median"]
     for name, folder in folders.items():
         metrics, size = read_run(folder).metrics, plain_size(folder)

@@ -18,7 +18,7 @@ REFERENCE = "volprim_rf_basic, WRF-GS+, 270"
 PICTURE = Path("docs/images/pareto.png")
 """Written where the command is called in a checkout of the project, and only there."""
 FITS = Path("runs/bench/pareto/fits")
-"""Fitted models below the working directory; what is there already is used again."""
+"""Fitted models below the working directory; a finished one with the same key is used again, which the log says."""
 
 
 def main() -> dict[str, Any]:

@@ -23,11 +23,12 @@ from ..core.angles import FloatArray
 from ..fit.config import TrainConfig, with_settings
 from ..fit.folder import load_predictor, read_checkpoint
 from ..fit.trainer import final_params
+from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..trace import TraceOptions
 from ..trace.tracer import RayTracer, instrument_of
+from .fit_key import fit_key, fit_once, scene_files
 from .hybrid_run import FITTED, open_hybrid, train_hybrid
-from .run_folder import METRICS
 from .runs import Run, train
 from .stock import StockRenderer, rgb_variant
 from .timing import Call, Within
@@ -46,7 +47,7 @@ class Place:
     Attributes:
         record: spectra of one receiver.
         scene: mesh of the place.
-        folder: for runs; one that is there already is used again.
+        folder: for runs; a finished one with the same key (`wrf_mi.report.fit_key`) is used again.
         rows: number of training rows; None: all.
         steps: of each learned field.
         seed: of subset and fits.
@@ -124,14 +125,12 @@ def _kriging(place: Place) -> Ready:
 
 
 def field_run(place: Place, model: str, gaussians: int) -> Run:
-    """A field of a fixed number of Gaussians, trained with the place's short schedule unless it was before."""
-    folder = place.folder / f"{model}-{gaussians}"
+    """A field of a fixed number of Gaussians, trained with the place's short schedule or used again."""
     settings = [f"model={model}", f"steps={place.steps}", f"initial.gaussians={gaussians}"]
     settings += ["hold_out=0", "density.every=0", f"validate_every={place.steps}"]
-    if not (folder / METRICS).exists():
-        config = with_settings(TrainConfig(seed=place.seed), settings)
-        return train(place.record, folder, config, n_train=place.rows)
-    return Run(folder)
+    config = with_settings(TrainConfig(seed=place.seed), settings)
+    folder = place.folder / f"{model}-{gaussians}-{fit_key(place.record, place.split, config)}"
+    return Run(fit_once(folder, lambda: train(place.record, folder, config, n_train=place.rows)))
 
 
 def _field(place: Place, model: str, gaussians: int) -> Ready:
@@ -156,9 +155,10 @@ def _stock(place: Place, gaussians: int) -> Ready:
 
 
 def _hybrid(place: Place) -> Ready:
-    folder = place.folder / "hybrid"
-    if not (folder / METRICS).exists():
-        train_hybrid(place.record, folder, place.scene, n_train=place.rows, seed=place.seed)
+    settings = kind_of(place.record, True).settings()
+    key = fit_key(place.record, place.split, scene_files(place.scene), settings, place.seed)
+    folder = place.folder / f"hybrid-{key}"
+    fit_once(folder, lambda: train_hybrid(place.record, folder, place.scene, n_train=place.rows, seed=place.seed))
     model, facts = open_hybrid(folder), Run(folder).metrics
     size = (folder / FITTED).stat().st_size / 1e6
     return Ready(lambda tx_pos_m: model.predict(tx_pos_m, 0).mean, size, facts["train_seconds"])

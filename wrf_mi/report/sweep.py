@@ -1,11 +1,12 @@
 """A sweep: one run for each combination of settings, and a table of their scores.
 
-    OUT/sweep.json                              what all runs share
+    OUT/sweep.json                              what all runs share: options, settings, versions, digests of the data
     OUT/seed=0,initial.gaussians=150/           a run folder for each combination, named after what varies
     OUT/scores.csv, scores.md, scores.json      the table
 
 Each run is ``wrf-mi train`` in a process of its own, one after the other or several on the workers of a scheduler. A
-finished one is not run again, one that was stopped goes on from its checkpoint.
+finished one is not run again, one that was stopped goes on from its checkpoint; with other content of the data or
+scenes, or with other versions of packages, the folder is refused, so that all runs of a table are comparable.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 from ..core import AntennaOptions, InputError, Split
 from ..core.files import one_line, write_atomically
 from ..fit.config import TrainConfig, with_settings
+from ..fit.folder import package_versions
 from ..fit.schedule import plan
 from ..fit.start import initial_gaussians
 from ..hybrid.models import kind_of
@@ -37,6 +39,7 @@ from ..trace import TraceOptions, load_record, open_scene
 from ..trace.tracer import instrument_of
 from .baseline_run import check_baseline
 from .evaluate import stored_metrics
+from .fit_key import content_digest, dataset_files, scene_files
 from .metrics import TASKS
 from .run_folder import CONFIG, METRICS
 from .traced import is_traced
@@ -58,6 +61,8 @@ OPTIONS = (
     *(one.name.replace("_", "-") for one in fields(AntennaOptions)),
 )
 """What may vary beside settings: DATASET and the options of ``wrf-mi train``."""
+FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
+"""Options and settings that may name a file or folder, beside the data set."""
 SHARED = "sweep.json"
 SCORES = ("median", "mean", "p10", "p90")
 HEADINGS = {
@@ -95,7 +100,7 @@ class Sweep:
 
     Attributes:
         folder: of the sweep.
-        shared: what all runs have in common, as kept in ``sweep.json``.
+        shared: options and settings that all runs have in common, as kept in ``sweep.json``.
         runs: one for each combination.
     """
 
@@ -275,6 +280,8 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
 def _claim(sweep: Sweep) -> None:
     """Make the folder, or see that it belongs to the same sweep, perhaps with other values."""
     folder, path = sweep.folder, sweep.folder / SHARED
+    content = {name: content_digest(places) for name, places in _files(sweep).items()}
+    made_of: dict[str, dict[str, str]] = {"versions": package_versions(), "content": content}
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; choose another --out")
     if path.exists():
@@ -282,12 +289,32 @@ def _claim(sweep: Sweep) -> None:
             before = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: not readable ({one_line(error)}); choose another --out") from None
-        if before != sweep.shared:
+        if not isinstance(before, dict) or {key: before.get(key) for key in sweep.shared} != sweep.shared:
             raise InputError(f"{folder}: holds a sweep with other settings than this one; choose another --out")
+        for key, what in (("versions", "by other versions of"), ("content", "with other content of")):
+            known = before.get(key, {})
+            changed = [name for name, now in made_of[key].items() if known.get(name, now) != now]
+            if changed or key not in before:
+                named = ", ".join(changed or ["what it does not state"])
+                raise InputError(f"{folder}: holds a sweep {what} {named}; choose another --out")
+            made_of[key] = known | made_of[key]
     elif folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: exists, is not empty and holds no sweep; choose another --out")
-    else:
-        write_atomically(path, json.dumps(sweep.shared, indent=1) + "\n")
+    write_atomically(path, json.dumps({**sweep.shared, **made_of}, indent=1) + "\n")
+
+
+def _files(sweep: Sweep) -> dict[str, list[Path]]:
+    """Files of data sets, scenes and settings that name some, by what the command calls them."""
+    found: dict[str, list[Path]] = {}
+    for run in sweep.runs:
+        words = run.arguments[1:]
+        for before, word in itertools.pairwise(("dataset", *words)):
+            key, _, value = word.partition("=") if before == "--set" else (before.removeprefix("--"), "", word)
+            if key == "dataset" and not word.startswith("--"):
+                found[value] = dataset_files(value)
+            elif key in FILES:
+                found[value] = scene_files(value)
+    return {name: places for name, places in found.items() if places}
 
 
 def _run(run: SweepRun) -> dict[str, Any]:

@@ -2,8 +2,10 @@
 
 Each row is a run of ``wrf-mi train`` in a process of its own. It is written down the moment it is done, as a JSON file
 among the results, so an interrupted measurement goes on where it stopped, on another machine too. A row is measured
-again where the plan has other arguments for it by now, or where its file and the folder of its run are deleted. The
-rows of `wrf_mi.report.table_plan` are in an order that makes tables whole early.
+again where the plan has other arguments for it by now, where the data set has other content than the row states, or
+where its file is deleted; a stored row that other versions of packages measured is kept and said. The folder of a run
+has a key of command, data, scene and versions in its name (`wrf_mi.report.fit_key`), so a finished run is used again
+only for the same fit. The rows of `wrf_mi.report.table_plan` are in an order that makes tables whole early.
 """
 
 from __future__ import annotations
@@ -12,8 +14,7 @@ import json
 import shutil
 import sys
 import time
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from wrf_mi_scenes.furnished import write_scene
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_atomically
-from ..fit.folder import versions
+from ..fit.folder import package_versions, versions
 from ..measure.registry import locate
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..scene.make import make_scene
@@ -34,6 +35,7 @@ from ..trace.furnished import traced_room
 from ..trace.walked import MEASURED
 from .bench import BenchFailed, machine, threads
 from .bench_hybrid_csi import SCANNED, scanned_scene
+from .fit_key import content_digest, dataset_files, fit_key, scene_files
 from .metrics import summary
 from .run_folder import CONFIG, METRICS, read_run
 from .table_pages import read_rows, write_tables
@@ -59,7 +61,7 @@ def scene_of(part: Part, folder: Path) -> list[str]:
         InputError: data that are not on this machine.
     """
     if part.scene == "open":
-        return ["--scene", str(_once(folder / "open", _open_scene))]
+        return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
     if part.scene == "room":
         return ["--scene", str(traced_room()[1])]
     if part.scene == "floor":
@@ -70,13 +72,15 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     if part.scene == "floor":
         return ["--scene", str(place / MEASURED)]
     if part.scene == "flat":
-        made = folder / "flat"
+        layout = place / "layout.csv"
+        made = folder / f"flat-{fit_key(layout, FLAT_HEIGHT_M)}"
         if not made.exists():
-            make_scene(place / "layout.csv", made, height_m=FLAT_HEIGHT_M)  # whole, or not at all
+            make_scene(layout, made, height_m=FLAT_HEIGHT_M)  # whole, or not at all
         return ["--scene", str(made)]
     # The room's own mesh is what the data were computed with: a model is given one made from a scan, as on site.
     paths = place / f"{part.dataset.removeprefix('newrf-')}.npz"
-    scanned = _once(folder / part.dataset, lambda made: scanned_scene(paths, made, SCAN_SEED))
+    place = folder / f"{part.dataset}-{fit_key(place, SCAN_SEED)}"
+    scanned = _once(place, lambda made: scanned_scene(paths, made, SCAN_SEED))
     return ["--scene", str(scanned / SCANNED)]
 
 
@@ -98,16 +102,20 @@ def _scene(part: Part, runs: Path) -> list[str]:
 
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
-    """One row: the run, unless its folder is there, and its figures.
+    """One row: the run, unless the same one is finished, and its figures.
 
     Raises:
         BenchFailed: the command ended with an error.
+        InputError: data or a scene that are not on this machine.
     """
-    # A run that other arguments made is another run.
-    folder = runs / f"{row.name}-{zlib.crc32(row.command.encode()):08x}"
-    arguments = row.arguments(_scene(row.part, runs) if NAMED in row.entry.arguments else [])
+    scene = _scene(row.part, runs) if NAMED in row.entry.arguments else []
+    data = _data_digest(row.part.dataset)
+    folder = runs / f"{row.name}-{fit_key(row.command, data, [scene_files(place) for place in scene[1:]])}"
+    arguments = row.arguments(scene)
     wall = None
-    if not (folder / METRICS).exists():
+    if (folder / METRICS).exists():
+        print(f"tables: {row.name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
+    else:
         # Tracing takes seconds and has nothing to go on from.
         resumed = (folder / CONFIG).exists() and row.method != "ray-tracing"
         if folder.exists() and not resumed:
@@ -129,6 +137,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine(),
         "versions": versions(),
+        "data": data,
         "wall_seconds": wall,
         **threads(),
         **{key: run.metrics[key] for key in KEPT},
@@ -163,9 +172,10 @@ def tables(
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:
         print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
-    stored = {one["row"]: one["command"] for one in read_rows(place)}
-    left = [row for row in rows if available(row.part) and stored.get(row.name) != row.command]
+    stored, digests = {one["row"]: one for one in read_rows(place)}, dict[str, str]()
+    left = [row for row in rows if available(row.part) and not _holds(stored.get(row.name), row, digests)]
     print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
+    _tell_versions([stored[row.name] for row in rows if row.name in stored and row not in left])
     begun = time.perf_counter()
     failures: list[str] = []
 
@@ -191,6 +201,46 @@ def tables(
     if failures:
         raise BenchFailed(f"tables: {len(failures)} rows did not finish: {failures[0]}")
     return read_rows(place)
+
+
+def _data_digest(dataset: str) -> str:
+    """Digest of the content of a data set, which is made where it can be and is not there.
+
+    Raises:
+        InputError: it is not on this machine.
+    """
+    if not dataset_files(dataset):
+        load_record(dataset)
+    return content_digest(dataset_files(dataset))
+
+
+def _holds(stored: Mapping[str, Any] | None, row: Row, digests: dict[str, str]) -> bool:
+    """Whether a stored row is what would be measured; rows that do not state their data hold for any.
+
+    Args:
+        stored: content of its file, or None.
+        row: as planned.
+        digests: of data sets, filled as they are asked for.
+    """
+    if stored is None or stored["command"] != row.command:
+        return False
+    dataset = row.part.dataset
+    if "data" not in stored or not dataset_files(dataset):
+        return True
+    if dataset not in digests:
+        digests[dataset] = _data_digest(dataset)
+    return stored["data"] == digests[dataset]
+
+
+def _tell_versions(kept: Sequence[Mapping[str, Any]]) -> None:
+    """Say how many rows that are kept were measured by other versions of packages, or do not state their data."""
+    now = package_versions()
+    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in kept)
+    silent = sum("data" not in row for row in kept)
+    for count, what in ((others, "were measured by other versions of packages"), (silent, "do not state their data")):
+        if count:
+            text = f"tables: {count} of {len(kept)} stored rows {what} and are kept; delete their files to measure them"
+            print(text, file=sys.stderr)
 
 
 def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:
