@@ -175,11 +175,15 @@ def test_blend_is_drawn_once_for_the_same_rows(tmp_path, monkeypatch):
 
 
 def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
-    calls = captured(monkeypatch, "spectrum_table")
+    calls, pictures = captured(monkeypatch, "score_cdf"), captured(monkeypatch, "spectrum_table")
     run = make_run(tmp_path / "two", receivers=2)
-    assert read_run(run).score.shape == (2, 6)
+    score = read_run(run).score
+    assert score.shape == (2, 6)
     compare([run], tmp_path / "out")
-    assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in calls[-1][0])
+    np.testing.assert_array_equal(np.sort(np.ravel(calls[-1][0]["two"])), np.sort(score.ravel()))
+    found = rows_of(tmp_path / "out" / "compare.csv")[0]
+    assert float(found["median"]) == pytest.approx(np.median(score), abs=1e-3)
+    assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 
 def test_runs_of_the_same_name_are_told_apart(tmp_path):

@@ -216,7 +216,9 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
 def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
     field, params = made("factorised")
     tmp_path.chmod(0o500)
-    assert StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0).shape == (3, *SIZE)
+    found = StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
+    np.testing.assert_array_equal(found, StillField(field, params, RECEIVERS[:1], *SIZE)(TX, 0))
+    assert not any(tmp_path.iterdir())
 
 
 def test_too_large_is_splatted(monkeypatch: pytest.MonkeyPatch) -> None:

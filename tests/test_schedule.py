@@ -157,5 +157,7 @@ def test_too_few_rows(train: int, validation: int, settings: list[str], message:
 
 
 def test_rows_that_join_at_once_count() -> None:
-    schedule = plan_of(split_of(0, 4), 1, steps=10, batch=4, hold_out=0.0)
+    split = split_of(0, 4)
+    schedule = plan_of(split, 1, steps=10, batch=4, hold_out=0.0)
     assert schedule.rows.shape == (10, 4)
+    np.testing.assert_array_equal(np.sort(schedule.rows, axis=1), np.tile(split.validation, (10, 1)))
