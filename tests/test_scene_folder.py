@@ -188,8 +188,10 @@ def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path: Path) -> None:
 def test_a_mesh_becomes_a_folder(tmp_path: Path) -> None:
     closed_box()[0].export(tmp_path / "room.stl")
     made = make_scene(tmp_path / "room.stl", tmp_path / "out")
-    assert made.counts == {"surfaces": 1, "faces": 12}
-    assert made.materials.surfaces == {"mesh": "other"}
+    assert made.counts == {"surfaces": 6, "faces": 12}
+    assert made.materials.surfaces == {"floor": "floor", "ceiling": "ceiling"} | {
+        f"wall_0{i}": "wall" for i in range(1, 5)
+    }
 
 
 def test_a_layout_becomes_a_folder(tmp_path: Path) -> None:

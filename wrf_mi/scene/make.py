@@ -118,6 +118,7 @@ def _surfaces(
 ) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
     """The surfaces of a source, its points if it is a scan, and its cells if it is an occupancy grid."""
     from .cloud import surfaces_from_points
+    from .mesh_planes import planes_of_mesh
     from .plan import plan_surfaces
 
     if is_plan(file):
@@ -131,7 +132,7 @@ def _surfaces(
     if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if _has_faces(file):
-        return read_mesh(file, units), None, None
+        return planes_of_mesh(read_mesh(file, units)), None, None
     points = read_points(file, units)
     check_extent(points, file)
     return surfaces_from_points(points), points, None

@@ -109,7 +109,8 @@ def _rims(axes: Any, surfaces: Sequence[Surface]) -> None:
         edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         edge, count = np.unique(edges, axis=0, return_counts=True)
         rims.append(surface.vertices_m[edge[count == 1]])
-    if rims:
+    # Closed bodies have no free edge.
+    if any(len(lines) for lines in rims):
         axes.add_collection3d(
             Line3DCollection(np.concatenate(rims), colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3)
         )
