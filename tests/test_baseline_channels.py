@@ -224,7 +224,7 @@ PLACED = {
     "task": ({}, "turned", ": holds rssi; turned serves csi"),
     "receiver": ({"at": (1, slice(24)), "value": np.nan}, "mri", ", receiver anchor2: received none of 24 training"),
     "row": ({"at": (1, 23), "value": np.inf}, "mri", ", receiver anchor2, row 23: 1 of 1 values are not finite"),
-    "last row": ({"at": (0, 29), "value": -np.inf}, "mri", ", receiver anchor1, row 29: 1 of 1 values"),
+    "first row": ({"at": (0, 0), "value": -np.inf}, "mri", ", receiver anchor1, row 0: 1 of 1 values are not finite"),
 }
 
 
@@ -233,7 +233,7 @@ def test_data_that_were_read_are_named_by_their_place(
     what: str, turned: None, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, method, message = PLACED[what]
-    monkeypatch.setattr("wrf_mi.baselines.checks.ROWS_AT_ONCE", 7)  # the rows come in parts
+    monkeypatch.setattr("wrf_mi.measure.observations.ROWS_AT_ONCE", 7)  # the rows come in parts
     record = load(flat_folder)
     observation = record.observation.copy()
     if change:

@@ -20,6 +20,7 @@ init()
 import drjit as dr  # noqa: E402
 
 from wrf_mi.core import InputError, Record, Split  # noqa: E402
+from wrf_mi.fit import trainer  # noqa: E402
 from wrf_mi.fit.config import TrainConfig  # noqa: E402
 from wrf_mi.fit.folder import load_predictor, read_checkpoint  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
@@ -116,17 +117,26 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
         np.testing.assert_array_equal(arrays_of(tmp_path / "killed")[name], values, err_msg=name)
 
 
-def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(folder: Path, tmp_path: Path) -> None:
-    """One row's truth is not a number; with that mended, the run goes on as if nothing had been."""
+def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss of one row is not a number; with that mended, the run goes on as if nothing had been."""
+    paper = trainer._paper_loss
+
+    def loss(prediction: Any, truth: Any, *shape: int, eta: float) -> Any:
+        return dr.select(dr.max(truth) > 1.5, np.nan, paper(prediction, truth, *shape, eta=eta))
+
     config = settings("steps=20", "checkpoint_every=2", "log_every=20", "validate_every=20", "deterministic=true")
     broken = load(folder)  # keeps its source, which is what a resumed run reads
     split = official(broken)
     reached = Trainer(broken, split, config).schedule.rows[:, 0].tolist()
     row = next(r for r in reached if reached.index(r) % 2 == 0 and reached.index(r) > 8)
     step = reached.index(row) + 1
-    broken.observation[0, row, 4, 5] = np.nan
+    broken.observation[0, row, 4, 5] = 2
+    monkeypatch.setattr(trainer, "_paper_loss", loss)
     with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
         train(broken, tmp_path / "broken", config)
+    monkeypatch.undo()
     assert int(read_checkpoint(tmp_path / "broken")["step"]) == step - 1
     resume(tmp_path / "broken")
     train(folder, tmp_path / "whole", config)

@@ -24,6 +24,7 @@ from wrf_mi.field import FIELDS, random_gaussians  # noqa: E402
 from wrf_mi.fit.predictor import Predictor  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
+from wrf_mi.loss.spectrum import spectrum_loss  # noqa: E402
 from wrf_mi.report.metrics import ssim  # noqa: E402
 
 FLOAT32_TOLERANCE = 1e-4
@@ -95,12 +96,15 @@ def test_opacity_reset_within_a_run(one_gateway: Record) -> None:
     np.testing.assert_allclose(opacity, 0.05, rtol=1e-5)
 
 
-def test_a_truth_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
-    broken = replace(one_gateway, observation=one_gateway.observation.copy())
-    split = official(broken)
+def test_a_loss_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
+    def loss(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return dr.select(dr.max(truth) > 1.5, np.nan, spectrum_loss(prediction, truth, batch, height, width)[0])
+
+    marked = replace(one_gateway, observation=one_gateway.observation.copy())
+    split = official(marked)
     row = split.train[0]
-    broken.observation[0, row, 4, 5] = np.nan
-    trainer = Trainer(broken, split, settings("steps=40"))
+    marked.observation[0, row, 4, 5] = 2
+    trainer = Trainer(marked, split, settings("steps=40"), loss=loss)
     with pytest.raises(NumericsError, match="not finite") as caught:
         trainer.run()
     assert "\n" not in str(caught.value)

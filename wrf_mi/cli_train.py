@@ -255,6 +255,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     named += [(f"{words} ({key})", held[key]) for key, words in task.references.items() if key in held]
     for name, block in named:
         print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    if metrics.get("n_not_scored"):
+        print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     if "inside_90" in metrics:
         print(f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals")
     print(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .checks import check_record, check_rows
+from ..measure.observations import check_observations
+from .checks import check_record
 from .method import Inputs, Method
 
 FLAT = 0.01
@@ -97,10 +98,11 @@ def training_rows(method: Method, record: Record, split: Split) -> tuple[IntArra
     Without the former, the latter are learned from.
 
     Raises:
-        InputError: as `wrf_mi.baselines.checks`; several receivers, no axis of antennas, or fewer than two rows.
+        InputError: as `check_record` and `check_observations`; several receivers, no axis of antennas, or fewer than
+            two rows.
     """
     check_record(method, record)
-    check_rows(record, split)
+    check_observations(record, split)
     shape = record.observation.shape
     if len(shape) != 4 or shape[0] != 1:
         raise InputError(

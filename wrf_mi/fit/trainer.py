@@ -22,6 +22,7 @@ from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
 from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
+from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from .config import TrainConfig
 from .predictor import Predictor
@@ -150,6 +151,7 @@ class Trainer:
             what = f"{record.name}: task {record.task!r}; learned fields are fitted to spectra"
             raise InputError(f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
         check_rows(split, record, f"split {split.name}")
+        check_observations(record, split, complete=True)
         config = config.resolved(record.tx_pos_m[split.all_train])
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])

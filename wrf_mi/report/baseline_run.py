@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..baselines.checks import check_inputs, check_record, check_rows
+from ..baselines.checks import check_inputs, check_record
 from ..baselines.method import Fitted, Inputs, Listen, Method, inputs_of
 from ..baselines.models import METHODS
 from ..core import InputError, Receiver, Record, Split
@@ -22,6 +22,7 @@ from ..core.types import IntArray
 from ..fit.config import settings_from, with_settings
 from ..fit.folder import CONFIG, check_new, stated_config
 from ..measure import make_splits
+from ..measure.observations import check_observations
 from ..trace import load_record
 from .fitted_run import FittedConfig, FittedRun, opened
 from .run_folder import stated_model
@@ -189,7 +190,7 @@ def check_baseline(
     check_record(method, record, METHODS.values())
     splits = make_splits(record, split, seed, n_train)
     for rows in splits:
-        check_rows(record, rows)
+        check_observations(record, rows)
     return chosen, splits
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
+from ..measure.observations import scorable
 from .metrics import TASKS, TaskScore, summary
 from .references import reference_predictions
 from .run_folder import METRICS, PREDICTIONS, reference_key
@@ -23,6 +24,8 @@ Predict = Callable[[IntArray, int], NDArray[Any]]
 coefficients [m, subcarriers] or [m, antennas, subcarriers]. Rows, and not positions, because a method may use how the
 transmitter was turned, or the uplink."""
 
+NOT_SCORED = "n_not_scored"
+"""Key of the number of observations of test rows that are not finite, though the receiver received something."""
 REPEATS = 20
 """Single predictions that are timed at most; the median is stated."""
 TIMED_S = 10.0
@@ -51,16 +54,19 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
-        receivers ``receivers``, ``n_train``, ``n_test``, ``ms_per_sample``), and the arrays of ``predictions.npz``.
+        receivers ``receivers``, ``n_train``, ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of
+        ``predictions.npz``. An observation that is not finite is not scored: the truth has NaN there.
 
     Raises:
-        InputError: no test rows, predictions of another shape or not finite, or a receiver that received no training
-            row.
+        InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
+            received no training row.
     """
     rows, known = split.test, split.all_train
     if len(rows) == 0:
         raise InputError(f"split {split.name}: no test rows to score; use another split")
-    truth = record.scored[:, rows]
+    truth, broken = scorable(record.scored[:, rows])
+    if np.isnan(truth).all():
+        raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
     arrays = {
         "row": rows,
         "prediction": np.stack([predict(rows, r) for r in range(len(truth))]).astype(truth.dtype),
@@ -70,6 +76,7 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
     metrics = score(arrays, record.task) | {
+        NOT_SCORED: broken,
         "n_train": len(known),
         "ms_per_sample": milliseconds_per_sample(predict, rows),
     }
@@ -118,6 +125,7 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
         arrays[key] = np.concatenate([a[key] for a in every], axis=1)
     arrays["receiver_name"] = every[0]["receiver_name"]
     metrics = score(arrays, task) | {
+        NOT_SCORED: sum(m[NOT_SCORED] for m in blocks),
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }

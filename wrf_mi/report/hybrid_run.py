@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..baselines.checks import check_rows
 from ..baselines.method import Listen
 from ..core import Antenna, AntennaOptions, InputError, Record, Split
 from ..core.angles import FloatArray
@@ -24,6 +23,7 @@ from ..fit.config import with_settings
 from ..fit.folder import check_new, stated_config
 from ..hybrid.models import HybridModel, kind_of
 from ..measure import make_splits
+from ..measure.observations import check_observations
 from ..trace import load_record, open_scene
 from ..trace.solve import Prepared
 from ..trace.tracer import instrument_of
@@ -199,7 +199,7 @@ def train_hybrid(
     # Without training rows the split keeps them for the references beside the model, which need some.
     splits = make_splits(record, split, seed, None if n_train == 0 else n_train)
     for rows in splits:
-        check_rows(record, rows)
+        check_observations(record, rows)
     return run.train(splits, listen)
 
 

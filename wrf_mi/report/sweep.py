@@ -34,6 +34,7 @@ from ..fit.schedule import plan
 from ..fit.start import initial_gaussians
 from ..hybrid.models import kind_of
 from ..measure import make_splits
+from ..measure.observations import check_observations
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..trace import TraceOptions, load_record, open_scene
 from ..trace.tracer import instrument_of
@@ -207,9 +208,12 @@ def check_fit(
         if record.task != "spectrum":
             raise InputError(f"{record.name}: task {record.task!r}; learned fields are fitted to spectra")
         for one in rows:
+            check_observations(record, one, complete=True)
             plan(settings, one, len(record.receivers))
             initial_gaussians(settings.initial, record, one.train, np.random.default_rng([settings.seed, 0]))
         return
+    for one in rows:
+        check_observations(record, one)
     if isinstance(settings, tuple):
         with_settings(kind_of(record, scene is not None).settings(), settings)
         if split[2] == 0 and scene is None:

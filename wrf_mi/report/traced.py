@@ -22,7 +22,6 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..baselines.checks import check_rows
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
@@ -31,6 +30,7 @@ from ..core.types import IntArray
 from ..fit.folder import CONFIG, SPLIT, check_new, load_rows, part_folders, stated_config, stored_parts, versions
 from ..fit.trainer import peak_memory_mb
 from ..measure import make_splits, save_split
+from ..measure.observations import check_observations
 from ..parallel import Scheduler, row_parts
 from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_trace
 from ..trace.calibrate import CalibrationOptions, calibrate
@@ -169,7 +169,7 @@ def trace_run(
     if calibration is not None and record.task != "rssi":
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     for rows in splits:
-        check_rows(record, rows)
+        check_observations(record, rows)
     given = options or TraceOptions()
     config = TraceConfig(source, str(scene), material, split, n_train, seed, given, calibration, antennas)
     tracer = RayTracer(scene, instrument_of(record), config.options, material)
