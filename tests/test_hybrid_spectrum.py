@@ -11,14 +11,16 @@ import pytest
 from traced_rooms import PARTITION, SHOEBOX, write_xml
 from wrf_mi_scenes.build_laboratory import sheet
 
+from wrf_mi.baselines.kriging import Kriging
 from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.hybrid import spectrum, spectrum_rays
 from wrf_mi.hybrid.spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
+from wrf_mi.hybrid.spectrum_few import groups
 from wrf_mi.hybrid.spectrum_fit import Constants, fit_constants, fit_maps, map_places, scan_offsets
 from wrf_mi.hybrid.spectrum_loss import Grid
 from wrf_mi.hybrid.spectrum_model import Chaining, Fit, Spectrometer, SpectrumModel, begin
-from wrf_mi.hybrid.spectrum_rest import NOISE, Rest
+from wrf_mi.hybrid.spectrum_rest import RESIDUALS, Rest, RestKind
 from wrf_mi.hybrid.spectrum_search import Search
 from wrf_mi.hybrid.spectrum_sheets import Known
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
@@ -29,6 +31,7 @@ THICKNESS_M = {"itu_concrete": 0.2, "itu_brick": 0.1, "itu_plasterboard": 0.05, 
 ARRAY = planar_array(4, 4, 0.16)
 # The array looks along -x with its y axis up.
 RECEIVER = Receiver("array", np.array([5.2, 2.4, 1.1]), np.array([0.5, -0.5, -0.5, 0.5]))
+NOISE = RESIDUALS[0].noise
 INSTRUMENT = Spectrometer(RECEIVER, ARRAY, HZ, HEIGHT, WIDTH)
 HOW = Chaining(reflections=2, passed=1, rays=1 << 14, most=1000, seed=1)
 
@@ -307,13 +310,86 @@ def test_a_rest_is_carried_over_to_near_places_only() -> None:
     pattern = rng.standard_normal((2, 9, 12)).astype(np.float32)
     value = np.column_stack([np.sin(tx[:, 0]), np.cos(tx[:, 1])])
     rest = np.tensordot(value, pattern, axes=1).astype(np.float32)
-    kriged = Rest.of(tx[:50], rest[:50], 1.0)
-    near = kriged(tx[50:])
+    rest *= np.float32(0.05)  # so that spectra lie within 0..1
+    room = np.full_like(rest, 0.5)
+    kriged = Rest.of(tx[:50], room[:50] + rest[:50], room[:50], RestKind(1.0, 2.0, NOISE, False), 0.5)
+    near = kriged(tx[50:], room[50:]) - room[50:]
     assert np.square(near - rest[50:]).mean() < 0.3 * np.square(rest[50:]).mean()
-    assert np.abs(kriged(np.array([[30.0, 0, 0]]))).max() < 1e-6
+    far = kriged(np.array([[30.0, 0, 0]]), room[:1])
+    assert np.abs(far - room[:1]).max() < 1e-6
     # Two patterns are two principal images, and the posterior mean is that of the formula.
     covariance = np.exp(-np.linalg.norm(tx[:50, None] - tx[None, :50], axis=-1)) + NOISE * np.eye(50)
     across = np.exp(-np.linalg.norm(tx[50:, None] - tx[None, :50], axis=-1))
     expected = np.tensordot(across @ np.linalg.inv(covariance), rest[:50], axes=1)
     assert len(kriged.image) == 2
     assert np.allclose(near, expected, atol=1e-4)  # images are float32
+
+
+def test_kriging_of_spectra_needs_no_room() -> None:
+    """Share 0, by the formula of ordinary kriging; a room that predicts anything else changes nothing."""
+    rng = np.random.default_rng(1)
+    tx, spectra = rng.uniform(0, 2, (12, 3)), rng.uniform(0.3, 0.7, (12, 5, 6)).astype(np.float32)
+    room = rng.uniform(0, 1, (12, 5, 6)).astype(np.float32)
+    kriged = Rest.of(tx[:9], spectra[:9], room[:9], RestKind(0.0, 3.0, 0.1, True), 0.5)
+    covariance = np.exp(-np.linalg.norm(tx[:9, None] - tx[None, :9], axis=-1) / 1.5) + 0.1 * np.eye(9)
+    across = np.exp(-np.linalg.norm(tx[9:, None] - tx[None, :9], axis=-1) / 1.5)
+    # Unknown mean: the weights of the rows add up to one.
+    system = np.block([[covariance, np.ones((9, 1))], [np.ones((1, 9)), np.zeros((1, 1))]])
+    weight = np.linalg.solve(system, np.vstack([across.T, np.ones((1, 3))]))[:9]
+    expected = np.tensordot(weight.T, spectra[:9], axes=1)
+    assert np.allclose(kriged(tx[9:], room[9:]), expected, atol=1e-5)  # images are float32
+
+
+FEW = SpectrumSettings(reflections=1, rays=1 << 12, steps=4)
+
+
+def mean_error(predicted: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.square(predicted - truth).mean()))
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_few_rows_predict_no_worse_than_the_mesh_or_kriging_alone(bare: SpectrumModel, right: bool) -> None:
+    """In a room whose planes are off by centimetres, and in one that the mesh is not of."""
+    rng = np.random.default_rng(11)
+    tx = np.array([1.2, 2.0, 1.2]) + rng.uniform(-0.3, 0.3, (32, 3)) * [1, 1, 0.5]
+    if right:
+        offset = np.array([0.02, -0.015, 0.01, 0.0, -0.02, 0.015])
+        record = record_of(bare.replaced(constants=replace(bare.constants, offset_m=offset)), tx)
+    else:
+        record = replace(record_of(bare, tx + np.array([2.4, -1.4, 0.9])), tx_pos_m=tx)
+    rows, test, truth = np.arange(12), np.arange(12, 32), record.observation[0, 12:]
+    hybrid = fit_spectrum(record, rows, SCENES[0], FEW)
+    mesh = fit_spectrum(record, rows[:0], SCENES[0], FEW)
+    kriged = Kriging().fit(tx[rows], record.observation[0, rows]).predict(tx[test])
+    estimate = hybrid.predict(tx[test], 0)
+    found, alone = mean_error(estimate.mean, truth), mean_error(mesh.predict(tx[test], 0).mean, truth)
+    best = min(alone, mean_error(kriged, truth))
+    assert found < (0.9 if right else 1.1) * best
+    chosen = hybrid.summary()["array.chosen"]
+    assert chosen != "kriging of spectra" if right else chosen.startswith("kriging")
+    # The stated deviation is that of rows held out.
+    assert 0.5 * found < np.sqrt(np.square(estimate.std).mean()) < 2 * found
+    again = SpectrumHybrid.from_arrays(hybrid.arrays())
+    assert np.array_equal(again.predict(tx[test], 0).mean, estimate.mean)
+
+
+def test_rows_that_cannot_judge_are_left_out_and_the_log_says_so(
+    bare: SpectrumModel, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three rows, or twenty at one place."""
+    tx = np.concatenate([places(3, 12), places(1, 13) + np.random.default_rng(0).uniform(-1e-3, 1e-3, (20, 3))])
+    record = record_of(bare, tx)
+    mesh = fit_spectrum(record, np.zeros(0, np.int64), SCENES[0], FEW).predict(tx, 0).mean
+    assert not caplog.records
+    for rows in (np.arange(3), np.arange(3, 23)):
+        hybrid = fit_spectrum(record, rows, SCENES[0], FEW)
+        assert np.array_equal(hybrid.predict(tx, 0).mean, mesh)
+        assert f"array: {len(rows)} training rows at fewer than 4 places" in caplog.messages[-1]
+        assert caplog.messages[-1].endswith("the room is traced as given")
+
+
+def test_rows_at_one_place_are_held_out_together() -> None:
+    tx = np.repeat(places(7, 14), 3, axis=0) + np.random.default_rng(0).uniform(-2e-3, 2e-3, (21, 3))
+    group = groups(tx, 0.3, 0).reshape(7, 3)
+    assert (group == group[:, :1]).all()
+    assert set(group[:, 0]) == set(range(5))

@@ -4,14 +4,15 @@ Element signals are a coherent sum of specular paths: those of the given mesh, w
 materials (`wrf_mi.hybrid.spectrum_fit`); those of surfaces that the mesh lacks (`wrf_mi.hybrid.spectrum_search`), which
 also hide what is behind them; each times a learned complex amplitude that varies slowly with the transmitter's image.
 All phases come from path lengths, so what is learned holds between and beyond the training rows. What is left of
-spectra near a transmitter is added as kriging would (`wrf_mi.hybrid.spectrum_rest`). Every step has to
-lower the loss of validation rows, which are taken from the training rows; the last fit uses all of these.
+spectra near a transmitter is added as kriging would, or kriging of the spectra takes the room's place
+(`wrf_mi.hybrid.spectrum_rest`). Every step has to lower the loss of validation rows, which are taken from the training
+rows; the last fit uses all of these. Few rows are fitted by `wrf_mi.hybrid.spectrum_few`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from typing import Any, Self
 
@@ -23,6 +24,7 @@ from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from .estimate import Estimate
+from .spectrum_few import FEW_ROWS, fitted_to_few
 from .spectrum_fit import Constants, Maps
 from .spectrum_gains import Slabs
 from .spectrum_model import SEARCHED_ROWS, Chaining, Fit, Room, Spectrometer, SpectrumModel, begin
@@ -34,8 +36,6 @@ FORMAT = 2
 """Version of `SpectrumHybrid.arrays`."""
 AT_ONCE = 256
 """Transmitters that are predicted together: more are no faster each, and all would take three times their spectra."""
-LEAST_ROWS = 20
-"""With fewer training rows nothing is fitted."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SpectrumSettings:
         rounds: of surfaces, planes and materials.
         amplitudes: learn how strong each chain is, and how that varies with the place.
         scale_m: distance over which that varies, metres.
-        rest: add what is left of the training rows near a transmitter.
+        rest: mix predictions of the room with kriging of the training rows.
         steps: of an optimiser.
         validation: share of the training rows that choose.
     """
@@ -160,8 +160,7 @@ class SpectrumHybrid:
                 own["map_scale_m"] = np.array(maps.scale_m)
             if model.rest is not None:
                 rest = model.rest
-                own |= {"rest_place_m": rest.place_m, "rest_weight": rest.weight, "rest_image": rest.image}
-                own["rest_length_m"] = np.array(rest.length_m)
+                own |= {f"rest_{one.name}": np.asarray(getattr(rest, one.name)) for one in fields(Rest)}
             if model.error is not None:
                 own["error"] = model.error
             out |= {f"{index}/{key}": value for key, value in own.items()}
@@ -190,7 +189,8 @@ class SpectrumHybrid:
                 maps = Maps(own["map_chain"], own["map_centre_m"], float(own["map_scale_m"]), own["map_weight"])
             rest = None
             if "rest_image" in own:
-                rest = Rest(own["rest_place_m"], float(own["rest_length_m"]), own["rest_weight"], own["rest_image"])
+                place_m, length_m, weight, image, mean, share = (own[f"rest_{one.name}"] for one in fields(Rest))
+                rest = Rest(place_m, float(length_m), weight, image, mean, float(share))
             constants = Constants(own["offset_m"], Slabs(*own["slabs"]))
             models.append(
                 SpectrumModel(
@@ -225,7 +225,9 @@ def fit_spectrum(
 
     Args:
         record: of spectra, with array and carrier.
-        rows: that train; fewer than `LEAST_ROWS`: the traced room as given.
+        rows: that train. Fewer than `wrf_mi.hybrid.spectrum_few.FEW_ROWS` fit planes, materials and the mix with
+            kriging alone; without rows, or with rows at fewer than `wrf_mi.hybrid.spectrum_few.LEAST_PLACES` places,
+            the room is traced as given.
         scene: opened ``sionna.rt.Scene`` at the carrier, or None: free space and learned surfaces.
         settings: see there.
         seed: of validation rows and of the rays.
@@ -253,9 +255,13 @@ def fit_spectrum(
         how = Chaining(settings.reflections, settings.passed, settings.rays, settings.chains, seed)
         model = begin(instrument, scene, how)
         usable = rows[~np.isnan(record.observation[index, rows]).any(axis=(1, 2))]
-        if len(usable) >= LEAST_ROWS:
+        if len(usable):
             spectra = np.asarray(record.observation[index], np.float32)
-            model, own = _fitted(model, record.tx_pos_m, spectra, usable, settings, how, heard)
+            if len(usable) < FEW_ROWS:
+                limits = settings.offset_sd_m, settings.steps, settings.rest, seed
+                model, own = fitted_to_few(model, record.tx_pos_m, spectra, usable, *limits, heard)
+            else:
+                model, own = _fitted(model, record.tx_pos_m, spectra, usable, settings, how, heard)
             facts |= {f"{receiver.name}.{key}": value for key, value in own.items()}
         models.append(model)
     return SpectrumHybrid(tuple(models), facts)
@@ -300,20 +306,21 @@ def _fitted(
     if settings.amplitudes:
         model, deviation, reflections = fit.amplitudes(model, settings.scale_m)
         note("amplitudes", 0.85)
-    length_m = fit.rest_length_m(model) if settings.rest else 0.0
-    predicted = fit.with_rest(model, fit.rows, length_m).spectra(tx_pos_m[validation])
+    kind = fit.rest_kind(model) if settings.rest else None
+    predicted = fit.with_rest(model, fit.rows, kind).spectra(tx_pos_m[validation])
     error = np.sqrt(np.square(predicted - spectra[validation]).mean(axis=0)).astype(np.float32)
     everyone = np.arange(len(known))
     if deviation:
         model = fit.mapped(model.replaced(maps=None), everyone, settings.scale_m, deviation, reflections)
-    model = fit.with_rest(model, everyone, length_m)
+    model = fit.with_rest(model, everyone, kind)
     facts = {
         "chains": len(model.chain) + 1,
         "surfaces": model.learned,
         "gaussians": 0 if model.maps is None else len(model.maps.chain),
         "amplitude_deviation": deviation,
         "amplitude_reflections": reflections,
-        "rest_length_m": length_m,
+        "rest_length_m": 0.0 if model.rest is None else model.rest.length_m,
+        "traced_share": 1.0 if model.rest is None else model.rest.share,
         "plane_offsets_m": [round(float(x), 4) for x in model.constants.offset_m],
         **{f"loss {what}": round(value, 5) for what, value in losses.items()},
     }

@@ -21,7 +21,7 @@ from .spectrum_fit import Constants, Maps, Waves, fit_constants, fit_maps, map_p
 from .spectrum_gains import Antennas, Slabs
 from .spectrum_loss import Grid
 from .spectrum_rays import ChainTable, Met, Things, find_chains, opened
-from .spectrum_rest import LENGTHS, Rest
+from .spectrum_rest import MIXES, RESIDUALS, Rest, RestKind
 from .spectrum_search import Search
 from .spectrum_sheets import KINDS, Frame, Known, Sheet, frames_of
 
@@ -124,7 +124,7 @@ class SpectrumModel:
         passed: surfaces that a path may pass through at most.
         constants: fitted.
         maps: learned amplitudes, or None.
-        rest: what is added to predictions near training rows, or None.
+        rest: kriging that predictions of the room are mixed with, or None.
         error: root mean square of what predictions missed on rows that the choice was made on [height, width], or None.
     """
 
@@ -166,7 +166,7 @@ class SpectrumModel:
     def spectra(self, tx_pos_m: FloatArray) -> NDArray[np.float32]:
         """What the instrument is predicted to report of transmitters [n, 3], 0..1, [n, height, width]."""
         images = self.instrument.report(self.signals(self.waves(tx_pos_m)))
-        return images if self.rest is None else np.clip(images + self.rest(tx_pos_m), 0, 1)
+        return images if self.rest is None else self.rest(tx_pos_m, images)
 
     def frames(self, tx_pos_m: FloatArray) -> list[Frame]:
         """Families of planes to look for further surfaces in."""
@@ -360,27 +360,24 @@ class Fit:
         )
         return model.replaced(maps=found)
 
-    def rest_length_m(self, model: SpectrumModel) -> float:
-        """Correlation length of the rest with which validation rows are predicted best, metres; 0: none helps."""
-        wavelength_m = speed_of_light / model.instrument.frequency_hz
+    def rest_kind(self, model: SpectrumModel) -> RestKind | None:
+        """The rest with which validation rows are predicted best; None: none helps."""
         truth, place = self._spectra[self.validation], self._tx[self.validation]
-        plain = model.spectra(place)
-        before = np.square(plain - truth).mean(axis=(1, 2))
-        left = self._spectra[self.rows] - model.spectra(self._tx[self.rows])
-        most, best = 0.0, 0.0
-        for length in LENGTHS:
-            added = Rest.of(self._tx[self.rows], left, length * wavelength_m)(place)
-            gain = before - np.square(np.clip(plain + added, 0, 1) - truth).mean(axis=(1, 2))
+        before = np.square(model.spectra(place) - truth).mean(axis=(1, 2))
+        most, best = 0.0, None
+        for kind in (*RESIDUALS, *MIXES.values()):
+            gain = before - np.square(self.with_rest(model, self.rows, kind).spectra(place) - truth).mean(axis=(1, 2))
             if gain.mean() > max(most, gain.std() / np.sqrt(len(gain))):
-                most, best = float(gain.mean()), length * wavelength_m
+                most, best = float(gain.mean()), kind
         return best
 
-    def with_rest(self, model: SpectrumModel, rows: IntArray, length_m: float) -> SpectrumModel:
-        """The model with the rest of some rows; as it is where the length is 0."""
-        if not length_m:
+    def with_rest(self, model: SpectrumModel, rows: IntArray, kind: RestKind | None) -> SpectrumModel:
+        """The model with the rest of some rows; as it is without a kind."""
+        if kind is None:
             return model
-        left = self._spectra[rows] - model.spectra(self._tx[rows])
-        return model.replaced(rest=Rest.of(self._tx[rows], left, length_m))
+        wavelength_m = speed_of_light / model.instrument.frequency_hz
+        place = self._tx[rows]
+        return model.replaced(rest=Rest.of(place, self._spectra[rows], model.spectra(place), kind, wavelength_m))
 
 
 def begin(instrument: Spectrometer, scene: Any | None, how: Chaining) -> SpectrumModel:

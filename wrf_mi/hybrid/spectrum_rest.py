@@ -3,6 +3,10 @@
 Spectra minus predictions are a random field over positions, whose values at one place are alike within a wavelength or
 so: small objects, diffraction and scattering that no surface explains. Their posterior mean (simple kriging with mean
 zero and an exponential covariance) is added to a prediction. Far from all training rows nothing is added.
+
+Where the room explains spectra badly, kriging of the spectra themselves may predict better than the room does. So the
+field may also be what a share of the prediction leaves, about an unknown mean (ordinary kriging): with share 0 it is
+kriging of the spectra, with 1 kriging of residuals, in between a mix. Rows held out choose (`wrf_mi.hybrid.spectrum`).
 """
 
 from __future__ import annotations
@@ -18,10 +22,34 @@ from ..core.angles import FloatArray
 
 COMPONENTS = 64
 """Principal images of the rest that are kept: the square of a 4 x 4 array's spectrum has 49 degrees of freedom."""
-NOISE = 0.5
-"""Variance of what two spectra at one place do not share, as a share of the field's."""
-LENGTHS = (0.6, 1.2, 2.4)
-"""Correlation lengths that validation rows choose from, in wavelengths, beside no rest at all."""
+
+
+@dataclass(frozen=True)
+class RestKind:
+    """Which field is kriged, and how.
+
+    Attributes:
+        share: factor of the room's prediction, whose remainder is the field.
+        wavelengths: correlation length.
+        noise: variance of what two spectra at one place do not share, as a share of the field's.
+        centred: the field has an unknown mean; else its mean is zero.
+    """
+
+    share: float
+    wavelengths: float
+    noise: float
+    centred: bool
+
+
+RESIDUALS = tuple(RestKind(1.0, length, 0.5, False) for length in (0.6, 1.2, 2.4))
+"""Of a room that explains most."""
+MIXES = {
+    "kriging of spectra": RestKind(0.0, 10.0, 0.1, True),
+    "half of room, kriging of what it leaves": RestKind(0.5, 10.0, 0.1, True),
+    "room, kriging of what it leaves": RestKind(1.0, 10.0, 0.1, True),
+}
+"""Where the room explains less, by name. The length is that of whole rooms: interpolation is then nearly linear, and
+needs no length to be fitted to a few rows."""
 
 
 @dataclass(frozen=True)
@@ -31,32 +59,51 @@ class Rest:
     Attributes:
         place_m: training rows' positions [n, 3].
         length_m: of correlation.
-        weight: inverse covariance times principal values, shape [n, k].
+        weight: inverse covariance times principal values less their mean, shape [n, k].
         image: principal images [k, height, width].
+        mean: principal values of the mean [k].
+        share: factor of the room's prediction that the rest is added to.
     """
 
     place_m: FloatArray
     length_m: float
     weight: FloatArray
     image: NDArray[np.float32]
+    mean: FloatArray
+    share: float
 
     @classmethod
-    def of(cls, place_m: FloatArray, rest: NDArray[np.float32], length_m: float) -> Rest:
-        """From what is left of training spectra, [n, height, width]."""
+    def of(
+        cls,
+        place_m: FloatArray,
+        spectra: NDArray[np.float32],
+        predicted: NDArray[np.float32],
+        kind: RestKind,
+        wavelength_m: float,
+    ) -> Rest:
+        """From training spectra and the room's predictions of them, [n, height, width] each."""
+        rest = spectra - kind.share * predicted
         flat = rest.reshape(len(rest), -1)
         # Principal images by the rows' Gram matrix: there are fewer rows than pixels.
         value, vector = np.linalg.eigh(flat.astype(float) @ flat.T.astype(float))
         kept = np.flatnonzero(value > value[-1] * 1e-9)[::-1][:COMPONENTS]
         scale = np.sqrt(value[kept])
         image = (vector[:, kept] / scale).T @ flat
-        covariance = _alike(place_m, place_m, length_m) + NOISE * np.eye(len(place_m))
-        weight = cho_solve(cho_factor(covariance), vector[:, kept] * scale)
-        return cls(place_m, length_m, weight, image.reshape(-1, *rest.shape[1:]).astype(np.float32))
+        length_m = kind.wavelengths * wavelength_m
+        factor = cho_factor(_alike(place_m, place_m, length_m) + kind.noise * np.eye(len(place_m)))
+        values, mean = vector[:, kept] * scale, np.zeros(len(kept))
+        if kind.centred:
+            each = cho_solve(factor, np.ones(len(place_m)))
+            mean = each @ values / each.sum()
+        weight = cho_solve(factor, values - mean)
+        images = image.reshape(-1, *rest.shape[1:]).astype(np.float32)
+        return cls(place_m, length_m, weight, images, mean, kind.share)
 
-    def __call__(self, place_m: FloatArray) -> NDArray[np.float32]:
-        """What to add to predictions at positions [m, 3], [m, height, width]."""
-        value = (_alike(place_m, self.place_m, self.length_m) @ self.weight).astype(np.float32)
-        return np.asarray(np.tensordot(value, self.image, axes=1))
+    def __call__(self, place_m: FloatArray, predicted: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Spectra at positions [m, 3] of which the room predicts [m, height, width]; 0..1."""
+        value = (_alike(place_m, self.place_m, self.length_m) @ self.weight + self.mean).astype(np.float32)
+        added = np.tensordot(value, self.image, axes=1)
+        return np.asarray(np.clip(np.float32(self.share) * predicted + added, 0, 1))
 
 
 def _alike(a_m: FloatArray, b_m: FloatArray, length_m: float) -> FloatArray:
