@@ -117,6 +117,8 @@ def test_positions_from_a_file(tmp_path: Path) -> None:
         file.write_text(text)
         with pytest.raises(InputError, match=line):
             read_positions(file)
+    with pytest.raises(InputError, match=r"none.csv: no such file; give measured positions"):
+        read_positions(tmp_path / "none.csv")
 
 
 @pytest.mark.skipif(

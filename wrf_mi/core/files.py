@@ -48,10 +48,17 @@ _REMEDIES = {
 }
 
 
-def os_failure(error: OSError) -> str:
-    """What the operating system refused, of which file, and the remedy for that, in one line."""
-    file = error.filename2 if error.filename2 is not None else error.filename
+def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
+    """What the operating system refused and the remedy for that, in one line.
+
+    Args:
+        error: of the system.
+        path: the file or folder that it was for; by default the one that the error names.
+        what: that could not be done to it, such as "cannot be written".
+    """
+    file = path or (error.filename2 if error.filename2 is not None else error.filename)
     text = one_line(error.strerror or error)
+    text = f"{what} ({text})" if what else text
     if isinstance(file, str | bytes | os.PathLike):
         text = f"{os.fsdecode(file)}: {text}"
     remedy = _REMEDIES.get(error.errno or 0)
@@ -69,7 +76,7 @@ def text_lines(path: Path) -> list[str]:
     except FileNotFoundError:
         raise InputError(f"{path}: missing; the folder is not complete") from None
     except OSError as error:
-        raise InputError(os_failure(error)) from None
+        raise InputError(os_failure(error, path, "cannot be read")) from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read ({one_line(error)}); give a UTF-8 text file") from None
     return text.rstrip().splitlines()
@@ -134,7 +141,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
     except OSError as error:
-        raise InputError(os_failure(error)) from None
+        raise InputError(os_failure(error, path, "cannot be written")) from None
     try:
         yield part
         if replace and path.exists():

@@ -74,7 +74,10 @@ def read_positions(path: str | Path) -> FloatArray:
     Raises:
         InputError: missing, no such column, or a field that is not a finite number.
     """
-    table = read_csv(Path(path), skip_blank=True)
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give measured positions with the header x,y or x,y,z in metres")
+    table = read_csv(path, skip_blank=True)
     table = replace(table, header=[name.lower() for name in table.header])
     z = table.numbers("z") if "z" in table.header else np.full(len(table.rows), np.nan)
     return np.stack([table.numbers("x"), table.numbers("y"), z], axis=-1)
