@@ -68,7 +68,7 @@ def _check_options(a: Arguments) -> None:
         return
     if a.model == "hybrid":
         if any(value is not None for value in (*_traced(a), a.preset)):
-            other = "--scene, --material, antenna options, --split, --n-train, --seed and --set"
+            other = "--scene, --material, --split, --n-train, --seed and --set, and antenna options"
             raise InputError(f"train --model hybrid takes {other}")
     elif (baseline := _baseline(a)) is not None:
         if any(value is not None for value in (a.scene, a.material, a.preset, *_traced(a))) or _antennas(a):

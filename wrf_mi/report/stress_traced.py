@@ -18,6 +18,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.furnished import write_scene
 
 from ..backend.device import on_device, to_float, to_tensor
+from ..core import Antenna
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.types import Receiver
@@ -139,7 +140,8 @@ def traced_gradients(count: int = 6) -> list[Row]:
         scene = open_scene(write_scene(Path(work), parts, "Room"), CARRIER_HZ, thickness)
     rng = np.random.default_rng(0)
     tx = np.array([1.9, 1.8, 1.3]) + rng.uniform(-0.3, 0.3, (count, 3))
-    receiver = Receiver("array", np.array([4.2, 2.9, 0.4]), np.array([0.0, 0.0, 0.0, 1.0]))
+    # Turned with its array, so that reports depend on how it is turned.
+    receiver = Receiver("array", np.array([4.2, 2.9, 0.4]), np.array([0.0, 0.0, 0.0, 1.0]), Antenna(frame="array"))
     options = TraceOptions(max_depth=2, transmission=True, rays=1 << 12)
     traced = trace_paths(scene, tx, receiver, options)
     return [_solver_gradients(scene, traced), *_hybrid_gradients(scene, traced, receiver, options)]
