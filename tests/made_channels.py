@@ -15,15 +15,15 @@ def channels(positions: bool = True) -> Record:
     shape = (ROWS, ANTENNAS, SUBCARRIERS)
     uplink = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
     tx_pos = rng.uniform(0, 4, (ROWS, 3)) if positions else np.full((ROWS, 3), np.nan)
+    array_m = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
     return Record(
         "made-up",
         "csi",
         tx_pos,
-        (Receiver("base-station", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1])),),
+        (Receiver("base-station", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]), array_m=array_m),),
         (uplink * np.exp(0.1j)).astype(np.complex64)[None],
         official=(np.arange(20), np.arange(20, ROWS)),
         frequencies_hz=2.4e9 + 1e6 * np.arange(SUBCARRIERS),
-        array_m=np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]),
         uplink=uplink,
         uplink_hz=2.3e9 + 1e6 * np.arange(SUBCARRIERS),
     )

@@ -72,10 +72,9 @@ def wave_record(rows: int = 40, held_out: int = 12, receivers: int = 2, seed: in
         official=(every[:-held_out], every[-held_out:]),
         folds=every % 2,
         frequencies_hz=np.array([FREQUENCY_HZ]),
-        array_m=ELEMENTS_M,
-    )
+    ).with_array(ELEMENTS_M)
 
 
 def without_array(record: Record) -> Record:
     """The same, of an instrument that is not known."""
-    return replace(record, array_m=None)
+    return record.with_array(None)

@@ -81,8 +81,7 @@ def record_of(h, elements=None, known=True):
         frequencies_hz=HZ[HALF:] if known else None,
         uplink_hz=HZ[:HALF] if known else None,
         uplink=h[:, :, :HALF].astype(np.complex64),
-        array_m=elements,
-    )
+    ).with_array(elements)
 
 
 def split_of(n, test=0):
@@ -297,7 +296,7 @@ def broken(record, case):
         "uplink frequencies": lambda: replace(record, uplink_hz=record.uplink_hz[:-1]),
         "downlink frequencies": lambda: replace(record, frequencies_hz=record.frequencies_hz[:-1]),
         "antennas": lambda: replace(record, uplink=record.uplink[:, :-1]),
-        "array": lambda: replace(record, array_m=record.array_m[:-1]),
+        "array": lambda: record.with_array(record.receivers[0].array_m[:-1]),
         "two receivers": lambda: replace(
             record, receivers=record.receivers * 2, observation=np.repeat(record.observation, 2, axis=0)
         ),

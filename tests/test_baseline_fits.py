@@ -216,10 +216,9 @@ def sparse_paths(rows: int = 300, antennas: int = 2, seed: int = 0) -> Record:
         (RECEIVER,),
         channel(DOWNLINK_HZ)[None],
         frequencies_hz=DOWNLINK_HZ,
-        array_m=elements,
         uplink=channel(UPLINK_HZ),
         uplink_hz=UPLINK_HZ,
-    )
+    ).with_array(elements)
 
 
 def test_downlink_from_uplink_beats_the_uplink():

@@ -317,7 +317,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
     one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
     model = fit_measured_spectrum(one, record.official[0][:20], MeasuredSpectrumSettings(directions=20, lengths=2))
     assert sizes == [9, 9, 2]
-    near = model._report(model.sides[0].signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
+    near = model._reports[0](model.sides[0].signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
     assert np.median(ssim(near, record.observation[0, record.official[0][:20]])) > 0.9
 
 
@@ -335,8 +335,9 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
 def test_data_that_tell_too_little_are_refused(
     change: dict[str, Any], count: int, message: str, record: Record
 ) -> None:
+    broken = record.with_array(change["array_m"]) if "array_m" in change else replace(record, **change)
     with pytest.raises(InputError, match=message):
-        fit_measured_spectrum(replace(record, **change), np.arange(count))
+        fit_measured_spectrum(broken, np.arange(count))
 
 
 def test_spectra_of_an_unknown_instrument_are_refused(two_gateways: Record, record: Record) -> None:

@@ -30,9 +30,9 @@ HEIGHT, WIDTH = 30, 60
 THICKNESS_M = {"itu_concrete": 0.2, "itu_brick": 0.1, "itu_plasterboard": 0.05, "itu_metal": 0.002}
 ARRAY = planar_array(4, 4, 0.16)
 # The array looks along -x with its y axis up.
-RECEIVER = Receiver("array", np.array([5.2, 2.4, 1.1]), np.array([0.5, -0.5, -0.5, 0.5]))
+RECEIVER = Receiver("array", np.array([5.2, 2.4, 1.1]), np.array([0.5, -0.5, -0.5, 0.5]), array_m=ARRAY)
 NOISE = RESIDUALS[0].noise
-INSTRUMENT = Spectrometer(RECEIVER, ARRAY, HZ, HEIGHT, WIDTH)
+INSTRUMENT = Spectrometer(RECEIVER, HZ, HEIGHT, WIDTH)
 HOW = Chaining(reflections=2, passed=1, rays=1 << 14, most=1000, seed=1)
 
 
@@ -53,7 +53,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> SpectrumModel:
 
 def record_of(model: SpectrumModel, tx: np.ndarray) -> Record:
     spectra = model.instrument.report(model.signals(model.waves(tx)))
-    return Record("made", "spectrum", tx, (RECEIVER,), spectra[None], frequencies_hz=np.array([HZ]), array_m=ARRAY)
+    return Record("made", "spectrum", tx, (RECEIVER,), spectra[None], frequencies_hz=np.array([HZ]))
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,7 @@ def test_bad_input_is_refused(bare: SpectrumModel) -> None:
     with pytest.raises(InputError, match="task"):
         fit_spectrum(replace(record, task="rssi"), np.arange(3), None)
     with pytest.raises(InputError, match="array or carrier"):
-        fit_spectrum(replace(record, array_m=None), np.arange(3), None)
+        fit_spectrum(record.with_array(None), np.arange(3), None)
     hybrid = fit_spectrum(record, np.zeros(0, np.int64), None)
     for wrong in ([1.0, 2.0, 3.0], [[np.nan, 0, 0]]):
         with pytest.raises(InputError, match="transmitters"):

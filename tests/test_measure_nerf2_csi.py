@@ -48,7 +48,7 @@ def test_reads_a_folder(folder: Path) -> None:
     assert record.official is not None
     assert [part.tolist() for part in record.official] == [[5, 0, 3, 1], [4, 2]]  # NeRF2 counts these from 0
     np.testing.assert_allclose(record.receivers[0].position_m, [0.5, 0, 1])
-    np.testing.assert_allclose(record.array_m, [[-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0]])
+    np.testing.assert_allclose(record.receivers[0].array_m, [[-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0]])
     assert record.frequencies_hz is None
     assert record.uplink_hz is None
     np.testing.assert_array_equal(record.scored, record.observation)
@@ -95,7 +95,7 @@ def test_what_is_written_is_read_again(folder: Path, tmp_path: Path) -> None:
         for key in ("observation", "uplink", "tx_pos_m", "frequencies_hz", "uplink_hz", "scored"):
             np.testing.assert_array_equal(getattr(back, key), getattr(record, key))
         # Elements are kept in the world's frame.
-        np.testing.assert_allclose(back.array_m, record.array_m, atol=FLOAT64)
+        np.testing.assert_allclose(back.receivers[0].array_m, record.receivers[0].array_m, atol=FLOAT64)
         np.testing.assert_array_equal(back.receivers[0].orientation_xyzw, record.receivers[0].orientation_xyzw)
         assert [part.tolist() for part in back.official or ()] == [[5, 0, 3, 1], [4, 2]]
         assert (tmp_path / name / "note.txt").read_text() == "x"

@@ -113,18 +113,18 @@ def test_positions_survive_exactly(tmp_path_factory: pytest.TempPathFactory, pos
 
 def test_carrier_and_array_are_optional(folder: Path, tmp_path: Path):
     record = read_spectrum_folder(folder)
-    assert (record.frequencies_hz, record.array_m) == (None, None)
+    assert (record.frequencies_hz, record.receivers[0].array_m) == (None, None)
     elements = np.random.default_rng(3).normal(size=(5, 3))
-    told = replace(record, frequencies_hz=np.array([915.25e6]), array_m=elements)
+    told = replace(record, frequencies_hz=np.array([915.25e6])).with_array(elements)
     read = read_spectrum_folder(write_spectrum_folder(tmp_path / "told", told))
     assert_same(read, told)
     np.testing.assert_array_equal(read.frequencies_hz, [915.25e6])
-    np.testing.assert_array_equal(read.array_m, elements)
+    np.testing.assert_array_equal(read.receivers[0].array_m, elements)
     with (folder / "gateway_info.yml").open("a") as file:
         file.write("frequency_hz: 920e6\narray: {rows: 2, columns: 3, spacing_m: 0.16}\n")
     read = read_spectrum_folder(folder)
     np.testing.assert_array_equal(read.frequencies_hz, [920e6])
-    np.testing.assert_array_equal(read.array_m, planar_array(2, 3, 0.16))
+    np.testing.assert_array_equal(read.receivers[0].array_m, planar_array(2, 3, 0.16))
     assert [r.name for r in read.receivers] == ["gateway1"]
 
 

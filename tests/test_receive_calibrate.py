@@ -50,8 +50,7 @@ def spectra(gain: np.ndarray, rows: int = 50) -> tuple[Record, np.ndarray]:
         (receiver,),
         grey[None],
         frequencies_hz=np.array([FREQUENCY_HZ]),
-        array_m=ELEMENTS,
-    )
+    ).with_array(ELEMENTS)
     return record, signals
 
 
@@ -107,7 +106,7 @@ def test_signals_are_retrieved_from_grey_images(faulty):
 def test_gains_and_grid_are_found(faulty):
     """The array truly has 1.002 of the stated spacing. Gains to 0.15 rad: directions lie between points of a grid."""
     record, _ = faulty
-    fit = fit_array(replace(record, array_m=ELEMENTS / 1.002), np.arange(50))
+    fit = fit_array(record.with_array(ELEMENTS / 1.002), np.arange(50))
     assert fit.spacing.value == pytest.approx(1.002, abs=2e-4)
     assert fit.spacing.half < 5e-4
     np.testing.assert_allclose(fit.elements_m, ELEMENTS, atol=1e-4)
@@ -172,7 +171,7 @@ def test_the_mean_phase_slope_of_gains_is_a_shift():
 def test_records_that_tell_nothing_are_refused(faulty):
     record, _ = faulty
     with pytest.raises(InputError, match="with their array and carrier"):
-        fit_array(replace(record, array_m=None), np.arange(50))
+        fit_array(record.with_array(None), np.arange(50))
     with pytest.raises(InputError, match="4 rows to calibrate by"):
         fit_array(record, np.arange(4))
     with pytest.raises(InputError, match=f"no receiver 'sensor10'; give one of {record.receivers[0].name}, or its"):
@@ -184,7 +183,7 @@ def test_real_spectra_are_cut_magnitudes_of_single_snapshots():
     """16 rows: what is left outside the lags is what 8 bits explain, and 16 complex numbers make each spectrum."""
     record = load("rfid-lab")
     rows = make_splits(record, "official")[0].all_train[::10]
-    lags = Lags(record.array_m, float(record.frequencies_hz[0]), 90, 360)
+    lags = Lags(record.receivers[0].array_m, float(record.frequencies_hz[0]), 90, 360)
     found = unscale(record.observation[0, rows], lags)
     assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(np.sqrt(np.mean(found.rounding**2)), rel=0.02)
     assert retrieve_signals(found, lags).found.all()

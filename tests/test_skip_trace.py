@@ -20,7 +20,6 @@ from wrf_mi.receive import rssi_dbm
 from wrf_mi.report.traced import CONVERGENCE, trace_run
 from wrf_mi.trace import TraceOptions, trace_paths
 from wrf_mi.trace.target import choose_options, remainder
-from wrf_mi.trace.tracer import Instrument
 
 RX = receiver([3.1, 2.2, 1.5])
 PLAIN = TraceOptions()
@@ -116,7 +115,8 @@ def test_run_states_its_convergence(tmp_path: Path) -> None:
 def test_spectra_are_judged_by_themselves(shoebox: Any) -> None:
     """Waves interfere at an array: what is chosen keeps spectra within the target, at another position too."""
     array_m = planar_array(4, 4, 0.5 * speed_of_light / FREQUENCY_HZ)
-    instrument = Instrument("spectrum", (RX,), np.array([FREQUENCY_HZ]), array_m, (18, 36))
+    receivers = (replace(RX, array_m=array_m),)
+    instrument = SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(18, 36))
     target_db = 4.0
     here = inside(3)
     by_power = choose_options(shoebox, here[:2], RX, target_db, PLAIN, kinds=())

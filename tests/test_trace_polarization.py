@@ -47,8 +47,8 @@ def array(turn_deg: float, antenna: Antenna) -> Receiver:
 def record(receiver: Receiver, tx: np.ndarray, spectra: np.ndarray) -> Record:
     rows = np.arange(len(tx))
     split = rows[: len(tx) // 2], rows[len(tx) // 2 :]
-    ends: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "array_m": ARRAY_M}
-    return Record("turned", "spectrum", tx, (receiver,), spectra[None], official=split, **ends)
+    ends = {"official": split, "frequencies_hz": np.array([HZ])}
+    return Record("turned", "spectrum", tx, (receiver,), spectra[None], **ends).with_array(ARRAY_M)
 
 
 def places(count: int = 12) -> np.ndarray:

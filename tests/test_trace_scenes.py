@@ -17,7 +17,7 @@ from wrf_mi.scene.surfaces import Surface
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
 from wrf_mi.trace.devices import before_walls, check_devices, solids, winding_number
 from wrf_mi.trace.surfaces import find_planes, scene_surfaces
-from wrf_mi.trace.tracer import Instrument, RayTracer
+from wrf_mi.trace.tracer import RayTracer
 
 
 def refused(words: str, source: Any, frequency_hz: float = FREQUENCY_HZ, **how: Any) -> None:
@@ -134,7 +134,7 @@ def test_rays_for_an_antenna_behind_its_wall_are_settled_before_it(tmp_path: Pat
     write_xml(tmp_path, SHOEBOX)
     tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(max_depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
-    before, behind = (Instrument("rssi", (receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
+    before, behind = (PowerInstrument((receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
     wanted, found = (RayTracer(tmp_path / "scene.xml", one, options).rays(tx) for one in (before, behind))
     assert found == wanted
 

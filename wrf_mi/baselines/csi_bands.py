@@ -76,7 +76,8 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
             f"{record.name}: {up} uplink and {down} downlink subcarriers, but {len(uplink_hz)} and {len(downlink_hz)} "
             "frequencies; give one for each"
         )
-    elements = None if record.array_m is None or not known else np.asarray(record.array_m, float)
+    array_m = record.receivers[0].array_m
+    elements = None if array_m is None or not known else np.asarray(array_m, float)
     if elements is not None and elements.shape != (antennas, 3):
         raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
     return Bands(uplink_hz, downlink_hz, antennas, None if elements is None else principal(elements), known)

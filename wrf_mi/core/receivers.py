@@ -20,7 +20,16 @@ SHOWN = 20
 """Names that an error lists at most."""
 NUMBER = re.compile(r"[0-9]{1,9}")
 """A string that may stand for a number."""
-KEYS = ("receiver_name", "receiver_position_m", "receiver_orientation_xyzw", "receiver_antenna")
+KEYS = (
+    "receiver_name",
+    "receiver_position_m",
+    "receiver_orientation_xyzw",
+    "receiver_antenna",
+    "receiver_elements",
+    "receiver_elements_m",
+)
+UNKNOWN = -1
+"""Number of elements of a receiver whose array is not known."""
 
 
 def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
@@ -60,12 +69,19 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
 
 
 def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
-    """Arrays of n receivers by the names `KEYS`: [n], [n, 3] in metres, [n, 4], and [n, 3] words of the antennas."""
+    """Arrays of n receivers by the names `KEYS`.
+
+    Shapes: [n], [n, 3] in metres, [n, 4], [n, 3] words of the antennas, [n] elements of each array, and [all, 3] their
+    positions in the receivers' frames, metres.
+    """
+    arrays = [one.array_m for one in receivers]
     return {
         "receiver_name": np.array([one.name for one in receivers]),
         "receiver_position_m": np.stack([one.position_m for one in receivers]),
         "receiver_orientation_xyzw": np.stack([one.orientation_xyzw for one in receivers]),
         "receiver_antenna": np.array([astuple(one.antenna) for one in receivers]),
+        "receiver_elements": np.array([UNKNOWN if array is None else len(array) for array in arrays]),
+        "receiver_elements_m": np.concatenate([np.zeros((0, 3)), *(array for array in arrays if array is not None)]),
     }
 
 
@@ -76,5 +92,9 @@ def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]
         KeyError: one of `KEYS` is missing.
         InputError: an antenna that is none.
     """
-    columns = zip(*(arrays[key] for key in KEYS), strict=True)
-    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words))) for n, p, q, words in columns)
+    counts = arrays["receiver_elements"]
+    ends = np.cumsum(np.maximum(counts, 0))
+    places = np.split(arrays["receiver_elements_m"], ends[:-1])
+    elements = [None if count == UNKNOWN else own for count, own in zip(counts, places, strict=True)]
+    columns = zip(*(arrays[key] for key in KEYS[:4]), elements, strict=True)
+    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), own) for n, p, q, words, own in columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,15 @@ class Receiver:
         position_m: shape [3], world frame, metres.
         orientation_xyzw: unit quaternion, receiver's frame to world.
         antenna: of the receiver, or of each element of its array.
+        array_m: elements of its antenna array [m, 3], receiver's frame, metres; None: one antenna, or the data do not
+            tell.
     """
 
     name: str
     position_m: FloatArray
     orientation_xyzw: FloatArray
     antenna: Antenna = ANTENNA
+    array_m: FloatArray | None = None
 
     @property
     def to_world(self) -> FloatArray:
@@ -53,8 +56,6 @@ class Record:
         folds: the spatial block of each row, shape [n], or None.
         frequencies_hz: of the carrier, shape [1], or of each subcarrier of ``observation``; None where the data do not
             tell.
-        array_m: elements of the antenna array behind a spectrum, or of channel coefficients the antennas, [m, 3],
-            receiver's frame, metres, or None.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         tx_antenna: antenna of the transmitter.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
@@ -73,7 +74,6 @@ class Record:
     official: tuple[IntArray, IntArray] | None = None
     folds: IntArray | None = None
     frequencies_hz: FloatArray | None = None
-    array_m: FloatArray | None = None
     tx_heading_rad: FloatArray | None = None
     tx_antenna: Antenna = ANTENNA
     uplink: NDArray[np.complex64] | None = None
@@ -89,6 +89,10 @@ class Record:
     def scored(self) -> NDArray[np.float32] | NDArray[np.complex64]:
         """What predictions are held against: the truth where it is known, else the observation."""
         return self.observation if self.truth is None else self.truth
+
+    def with_array(self, array_m: FloatArray | None) -> Record:
+        """The same measurements by receivers that all have one array, elements [m, 3] in metres, or None."""
+        return replace(self, receivers=tuple(replace(one, array_m=array_m) for one in self.receivers))
 
     @property
     def has_positions(self) -> bool:

@@ -111,7 +111,6 @@ class MeasuredSpectrumHybrid:
     Args:
         receivers: whose spectra they are.
         sides: one for each.
-        elements_m: of the arrays [m, 3], metres.
         frequency_hz: of the carrier.
         shape: height and width of a spectrum.
     """
@@ -122,13 +121,13 @@ class MeasuredSpectrumHybrid:
         self,
         receivers: tuple[Receiver, ...],
         sides: tuple[Side, ...],
-        elements_m: FloatArray,
         frequency_hz: float,
         shape: tuple[int, int],
     ) -> None:
         self.receivers, self.sides = receivers, sides
-        self.elements_m, self.frequency_hz, self.shape = elements_m, frequency_hz, shape
-        self._report = SpectrumReport(elements_m, frequency_hz, *shape)
+        self.frequency_hz, self.shape = frequency_hz, shape
+        arrays = (one.array_m for one in receivers)
+        self._reports = [SpectrumReport(own, frequency_hz, *shape) for own in arrays if own is not None]
 
     def predict(
         self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
@@ -148,12 +147,13 @@ class MeasuredSpectrumHybrid:
             raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
         mean = np.zeros((len(positions), *self.shape), np.float32)
         std = np.zeros_like(mean)
-        side = self.sides[receiver_index(self.receivers, receiver)]
+        index = receiver_index(self.receivers, receiver)
+        side, report = self.sides[index], self._reports[index]
         for start in range(0, len(positions), PREDICTED_AT_ONCE):
             part = slice(start, start + PREDICTED_AT_ONCE)
             posterior = side.signals.predict(positions[part])
             mean[part], std[part] = _mixed(
-                posterior, self._report, side.nearby.predict(positions[part]), side.nearby.std(positions[part]), side
+                posterior, report, side.nearby.predict(positions[part]), side.nearby.std(positions[part]), side
             )
         return Estimate(np.clip(mean, 0, 1), (side.spread * std).astype(float))
 
@@ -175,7 +175,6 @@ class MeasuredSpectrumHybrid:
         """All that `from_arrays` needs."""
         stored: dict[str, NDArray[Any]] = {
             "kind": np.array("measured-spectrum"),
-            "elements_m": self.elements_m,
             "frequency_hz": np.array(self.frequency_hz),
             "shape": np.array(self.shape),
             **receiver_arrays(self.receivers),
@@ -201,7 +200,7 @@ class MeasuredSpectrumHybrid:
             nearby = NearbySpectra.from_arrays(below(f"{number}/nearby/"))
             sides.append(Side(process, nearby, float(half), float(spread)))
         height, width = (int(v) for v in arrays["shape"])
-        return cls(receivers, tuple(sides), arrays["elements_m"], float(arrays["frequency_hz"]), (height, width))
+        return cls(receivers, tuple(sides), float(arrays["frequency_hz"]), (height, width))
 
 
 def fit_measured_spectrum(
@@ -225,19 +224,16 @@ def fit_measured_spectrum(
     """
     if record.task != "spectrum":
         raise InputError(f"{record.name}: task {record.task}; this hybrid predicts spectra")
-    if record.array_m is None or record.frequencies_hz is None:
+    if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: its array or frequency is not known; state both in its gateway_info.yml")
     if len(rows) < LEAST_ROWS:
         raise InputError(_too_few(record.name, len(rows)))
     frequency_hz = float(record.frequencies_hz[0])
     height, width = record.observation.shape[2:]
-    lags = Lags(record.array_m, frequency_hz, height, width)
-    report = SpectrumReport(record.array_m, frequency_hz, height, width)
     sides = tuple(
-        _fit_side(record, r, rows, settings, lags, report, frequency_hz, seed, listen)
-        for r in range(len(record.receivers))
+        _fit_side(record, r, rows, settings, frequency_hz, seed, listen) for r in range(len(record.receivers))
     )
-    return MeasuredSpectrumHybrid(record.receivers, sides, record.array_m, frequency_hz, (height, width))
+    return MeasuredSpectrumHybrid(record.receivers, sides, frequency_hz, (height, width))
 
 
 def _fit_side(
@@ -245,14 +241,15 @@ def _fit_side(
     number: int,
     rows: IntArray,
     settings: MeasuredSpectrumSettings,
-    lags: Lags,
-    report: SpectrumReport,
     frequency_hz: float,
     seed: int,
     listen: Listen,
 ) -> Side:
-    assert record.array_m is not None
     receiver = record.receivers[number]
+    assert receiver.array_m is not None, "see `fit_measured_spectrum`"
+    height, width = record.observation.shape[2:]
+    lags = Lags(receiver.array_m, frequency_hz, height, width)
+    report = SpectrumReport(receiver.array_m, frequency_hz, height, width)
     observed = np.asarray(record.observation[number, rows], np.float32)
     received = np.isfinite(observed).all(axis=(1, 2))
     observed, positions = observed[received], record.tx_pos_m[rows][received]
@@ -271,7 +268,7 @@ def _fit_side(
         departures(towards, 2 * np.pi / wavelength, settings.cone_deg, settings.directions),
     )
     process = fit_signals(
-        signals, positions, record.array_m, covariances, seed, lambda done: listen(f"{receiver.name}: signals", done)
+        signals, positions, receiver.array_m, covariances, seed, lambda done: listen(f"{receiver.name}: signals", done)
     )
     nearby = fit_nearby(positions, observed, receiver.position_m, wavelength, seed)
     side = Side(process, nearby, 1.0, 1.0)

@@ -142,7 +142,6 @@ class SpectrumHybrid:
             own: Arrays = {
                 **receiver_arrays([one.receiver]),
                 "tx_antenna": np.array(astuple(one.tx_antenna)),
-                "array_m": one.array_m,
                 "frequency_hz": np.array(one.frequency_hz),
                 "size": np.array([one.height, one.width]),
                 "thing_names": np.array(model.room.things.names, dtype=str),
@@ -180,7 +179,7 @@ class SpectrumHybrid:
             own = {key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{index}/")}
             (receiver,), tx_antenna = stored_receivers(own), Antenna(*map(str, own["tx_antenna"]))
             height, width = (int(size) for size in own["size"])
-            instrument = Spectrometer(receiver, own["array_m"], float(own["frequency_hz"]), height, width, tx_antenna)
+            instrument = Spectrometer(receiver, float(own["frequency_hz"]), height, width, tx_antenna)
             edges = np.cumsum([0, *own["thing_faces"]])
             parts = tuple(own["triangles_m"][a:b] for a, b in pairwise(edges))
             room = Room(Things(tuple(str(name) for name in own["thing_names"]), parts), Slabs(*own["given_slabs"]))
@@ -238,7 +237,7 @@ def fit_spectrum(
     """
     if record.task != "spectrum":
         raise InputError(f"{record.name}: task {record.task!r}; this hybrid is for spectra")
-    if record.array_m is None or record.frequencies_hz is None:
+    if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: array or carrier unknown; state array and frequency_hz in gateway_info.yml")
     rows = np.asarray(rows, np.int64)
     height, width = record.observation.shape[-2:]
@@ -250,7 +249,7 @@ def fit_spectrum(
             listen(f"{name}: {what}", (index + share) / len(record.receivers))
 
         carrier_hz, tx_antenna = float(record.frequencies_hz[0]), record.tx_antenna
-        instrument = Spectrometer(receiver, record.array_m, carrier_hz, height, width, tx_antenna)
+        instrument = Spectrometer(receiver, carrier_hz, height, width, tx_antenna)
         heard("chains of planes", 0.0)
         how = Chaining(settings.reflections, settings.passed, settings.rays, settings.chains, seed)
         model = begin(instrument, scene, how)

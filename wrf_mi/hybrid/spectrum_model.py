@@ -39,8 +39,7 @@ class Spectrometer:
     """What reports spectra at one place.
 
     Attributes:
-        receiver: its pose.
-        array_m: elements [m, 3], receiver's frame, metres.
+        receiver: its pose and array.
         frequency_hz: of the carrier.
         height: of a spectrum.
         width: of a spectrum.
@@ -48,11 +47,16 @@ class Spectrometer:
     """
 
     receiver: Receiver
-    array_m: FloatArray
     frequency_hz: float
     height: int
     width: int
     tx_antenna: Antenna = ANTENNA
+
+    @property
+    def array_m(self) -> FloatArray:
+        """Elements [m, 3], receiver's frame, metres."""
+        assert self.receiver.array_m is not None, "see `wrf_mi.hybrid.spectrum.fit_spectrum`"
+        return self.receiver.array_m
 
     @property
     def antennas(self) -> Antennas:

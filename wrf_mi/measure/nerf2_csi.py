@@ -20,6 +20,7 @@ and normalising belongs to a method, from its training rows alone.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     half = subcarriers // 2
     station = folder / STATION
     info = read_yaml(station)
-    receiver, array_m = _read_station(station, info, antennas)
+    receiver = _read_station(station, info, antennas)
     asked = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
     frequencies = None if asked is None else _frequencies(station, asked, subcarriers)
     return Record(
@@ -94,7 +95,6 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         observation=channel[None, :, :, half:],
         official=read_official(folder, n, first=0, source=CHANNELS),
         frequencies_hz=None if frequencies is None else frequencies[half:],
-        array_m=array_m,
         uplink=channel[:, :, :half],
         uplink_hz=None if frequencies is None else frequencies[:half],
         truth=_read_truth(folder / TRUTH, (n, antennas, half)),
@@ -118,7 +118,7 @@ def write_nerf2_csi(
     Raises:
         InputError: the folder exists or cannot be written, or the record lacks what the layout holds.
     """
-    down, up, array_m = record.observation, record.uplink, record.array_m
+    down, up, array_m = record.observation, record.uplink, record.receivers[0].array_m
     if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
         need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
         raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
@@ -176,7 +176,7 @@ def read_channels(path: Path) -> NDArray[np.complex64]:
     return single
 
 
-def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> tuple[Receiver, FloatArray]:
+def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> Receiver:
     places = info.get("base_station")
     elements = numbers_of(places)
     if elements.ndim != 2 or elements.shape[1] != 3 or not fits_single(elements):
@@ -187,7 +187,7 @@ def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> tuple[Rece
     orientation = unit_quaternion(path, "base_station", info.get("orientation", list(IDENTITY)))
     antenna = read_antenna(path, "antenna", info.get("antenna"))
     receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
-    return receiver, (elements - receiver.position_m) @ receiver.to_world
+    return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
 
 
 def _frequencies(path: Path, values: object, subcarriers: int) -> FloatArray:

@@ -272,6 +272,8 @@ def _complete(dataset: DataSet, record: Record) -> Record:
             record = replace(record, folds=parse_folds(path, len(record)))
     if record.frequencies_hz is None and dataset.frequency_hz is not None:
         record = replace(record, frequencies_hz=np.array([dataset.frequency_hz]))
-    if record.array_m is None and dataset.array is not None:
-        record = replace(record, array_m=planar_array(*dataset.array))
+    if dataset.array is not None:
+        array_m = planar_array(*dataset.array)
+        own = (one if one.array_m is not None else replace(one, array_m=array_m) for one in record.receivers)
+        record = replace(record, receivers=tuple(own))
     return record

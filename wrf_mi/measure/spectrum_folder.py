@@ -5,7 +5,7 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
 - ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
   metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world). Optional and ours: ``frequency_hz``
   of the carrier, one for all receivers; ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``,
-  a list of x, y, z in the array's frame; ``antenna`` in each receiver's entry, and ``tx_antenna`` beside these, with
+  a list of x, y, z in the array's frame, for all receivers or in the entry of each; ``antenna`` in each receiver's entry, and ``tx_antenna`` beside these, with
   ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with ``frame`` too; see `wrf_mi.core.Antenna`; the
   default is isotropic and vertical in the world). ``dataset_name`` and other plain values beside them are not used.
 - ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
@@ -76,7 +76,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         raise InputError(f"{folder}: not a folder; give one that holds {GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
     info = read_yaml(gateways)
-    receivers = _receivers(gateways, info)
+    receivers = _receivers(gateways, info, _array(gateways, info, "array"))
     positions = read_positions(folder / POSITIONS)
     images = folder / "spectrum"
     places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
@@ -89,7 +89,6 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         official=read_official(folder, len(positions), first=1),
         folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
         frequencies_hz=_frequency(gateways, info),
-        array_m=_array(gateways, info),
         tx_antenna=read_antenna(gateways, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS),
         source=str(folder),
     )
@@ -166,7 +165,8 @@ def parse_folds(path: Path, rows: int) -> IntArray:
 def _entry(receiver: Receiver) -> dict[str, Any]:
     pose = {"position": receiver.position_m.tolist(), "orientation": receiver.orientation_xyzw.tolist()}
     antenna = antenna_entry(receiver.antenna)
-    return pose | ({"antenna": antenna} if antenna else {})
+    elements = {} if receiver.array_m is None else {"array": {"elements_m": receiver.array_m.tolist()}}
+    return pose | ({"antenna": antenna} if antenna else {}) | elements
 
 
 def _instrument(record: Record) -> dict[str, Any]:
@@ -175,8 +175,6 @@ def _instrument(record: Record) -> dict[str, Any]:
         known[TX_ANTENNA] = antenna
     if record.frequencies_hz is not None:
         known["frequency_hz"] = float(record.frequencies_hz[0])
-    if record.array_m is not None:
-        known["array"] = {"elements_m": record.array_m.tolist()}
     return known
 
 
@@ -204,10 +202,11 @@ def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
     return np.array(list(carriers)) if carriers else None
 
 
-def _array(path: Path, info: dict[Any, Any]) -> FloatArray | None:
-    if "array" not in info:
+def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
+    """Elements [m, 3] of an entry's ``array``; ``name``: of it, for messages."""
+    if "array" not in entry:
         return None
-    array = info["array"]
+    array = entry["array"]
     try:
         if "elements_m" in array:
             elements = np.array(array["elements_m"], float)
@@ -218,11 +217,12 @@ def _array(path: Path, info: dict[Any, Any]) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        raise InputError(f"{path}: array is {str(array)[:60]!r}; {remedy}")
+        raise InputError(f"{path}: {one_line(name)} is {str(array)[:60]!r}; {remedy}")
     return elements
 
 
-def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
+def _receivers(path: Path, info: dict[Any, Any], array_m: FloatArray | None) -> tuple[Receiver, ...]:
+    """Receivers of the file; ``array_m``: array of those that state none of their own."""
     poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in ("array", TX_ANTENNA)}
     if not poses:
         raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
@@ -233,7 +233,8 @@ def _receivers(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
         position = finite_numbers(path, f"{name}: position", pose.get("position"), 3)
         orientation = unit_quaternion(path, name, pose.get("orientation"))
         antenna = read_antenna(path, f"{name}: antenna", pose.get("antenna"))
-        receivers.append(Receiver(name, position, orientation, antenna))
+        own_m = _array(path, pose, f"{name}: array") if "array" in pose else array_m
+        receivers.append(Receiver(name, position, orientation, antenna, own_m))
     return tuple(receivers)
 
 

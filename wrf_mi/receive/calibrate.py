@@ -124,11 +124,12 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int | str = 0, waves: i
         InputError: a record of another task or without its array and carrier; too few rows; no such receiver.
     """
     index = receiver_index(record.receivers, receiver)
-    if record.task != "spectrum" or record.array_m is None or record.frequencies_hz is None:
+    array_m = record.receivers[index].array_m
+    if record.task != "spectrum" or array_m is None or record.frequencies_hz is None:
         raise InputError(
             f"{record.name}: calibration needs spectra with their array and carrier; give them in the data"
         )
-    elements, frequency_hz = _stated(record)
+    elements, frequency_hz = array_m, float(record.frequencies_hz[0])
     chosen = np.asarray(rows, np.int64)
     if len(chosen) < 2 * GEOMETRY_PARTS:
         raise InputError(f"{record.name}: {len(chosen)} rows to calibrate by; give {2 * GEOMETRY_PARTS} or more")
@@ -165,12 +166,6 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int | str = 0, waves: i
         shift,
         near,
     )
-
-
-def _stated(record: Record) -> tuple[FloatArray, float]:
-    assert record.array_m is not None
-    assert record.frequencies_hz is not None
-    return np.asarray(record.array_m, float), float(record.frequencies_hz[0])
 
 
 def _groups(record: Record, rows: IntArray) -> IntArray:

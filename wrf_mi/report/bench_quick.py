@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,8 @@ from ..splat.render import splat  # noqa: E402
 from ..splat.tiles import perception_plane  # noqa: E402
 from ..trace import TraceOptions, open_scene, recompute, trace_paths  # noqa: E402
 from ..trace.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path  # noqa: E402
-from ..trace.tracer import Instrument, RayTracer  # noqa: E402
+from ..receive.instruments import SpectrumInstrument  # noqa: E402
+from ..trace.tracer import RayTracer  # noqa: E402
 from .bench import BenchFailed, machine  # noqa: E402
 from .bench_traced import random_field, scene_of  # noqa: E402
 from .stock import StockRenderer, rgb_variant  # noqa: E402
@@ -146,7 +147,8 @@ def _batch() -> tuple[Call, Call]:
 
 def _tracer() -> RayTracer:
     array_m = planar_array(4, 4, SPACING_M)
-    instrument = Instrument("spectrum", (RECEIVER,), np.array([FREQUENCY_HZ]), array_m, (HEIGHT, WIDTH))
+    receivers = (replace(RECEIVER, array_m=array_m),)
+    instrument = SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
     return RayTracer("laboratory", instrument, TraceOptions(rays=1 << 14))
 
 
@@ -172,8 +174,8 @@ def _hybrid() -> tuple[Call, Call]:
 
     tracer, one = _tracer(), transmitter_path(1)
     kind = kind_of(_record(20), True)
-    more: dict[str, Any] = {"frequencies_hz": np.array([FREQUENCY_HZ]), "array_m": planar_array(4, 4, SPACING_M)}
-    record = Record("made-up", "spectrum", one, (RECEIVER,), _record(1).observation, **more)
+    receivers, carrier_hz = tracer.instrument.receivers, np.array([FREQUENCY_HZ])
+    record = Record("made-up", "spectrum", one, receivers, _record(1).observation, frequencies_hz=carrier_hz)
     model = kind.fit(record, np.zeros(0, np.int64), tracer.scene, kind.settings(), 0, lambda what, share: None)
     return lambda: model.predict(one, 0).mean, lambda: tracer(one)
 

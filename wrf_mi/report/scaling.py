@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,13 @@ from ..fit.trainer import make_field  # noqa: E402
 from ..hybrid.models import kind_of  # noqa: E402
 from ..receive import bartlett_spectrum, element_signals  # noqa: E402
 from ..receive.footprints import gaussian_signals  # noqa: E402
+from ..receive.instruments import SpectrumInstrument  # noqa: E402
 from ..splat.render import splat  # noqa: E402
 from ..splat.tiles import perception_plane  # noqa: E402
 from ..trace import TraceOptions, open_scene, trace_paths  # noqa: E402
 from ..trace.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path  # noqa: E402
 from ..trace.surfaces import scene_surfaces  # noqa: E402
-from ..trace.tracer import Instrument, RayTracer  # noqa: E402
+from ..trace.tracer import RayTracer  # noqa: E402
 from .bench_traced import random_field, scene_of  # noqa: E402
 from .timing import Call  # noqa: E402
 
@@ -118,9 +119,10 @@ def _field(transmitters: int) -> Call:
     return lambda: predictor(tx)
 
 
-def _instrument() -> Instrument:
+def _instrument() -> SpectrumInstrument:
     array_m = planar_array(4, 4, SPACING_M)
-    return Instrument("spectrum", (RECEIVER,), np.array([FREQUENCY_HZ]), array_m, (HEIGHT, WIDTH))
+    receivers = (replace(RECEIVER, array_m=array_m),)
+    return SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
 
 
 def _tracer(transmitters: int) -> Call:
@@ -132,9 +134,9 @@ def _hybrid(transmitters: int) -> Call:
     """The hybrid's prediction in a room without training rows: the physics alone."""
     one = transmitter_path(1)
     image = np.zeros((1, 1, HEIGHT, WIDTH), np.float32)
-    array_m = planar_array(4, 4, SPACING_M)
-    more: Any = {"frequencies_hz": np.array([FREQUENCY_HZ]), "array_m": array_m}
-    record = Record("none", "spectrum", one, (RECEIVER,), image, **more)
+    instrument = _instrument()
+    own = instrument.receivers, image
+    record = Record("none", "spectrum", one, *own, frequencies_hz=instrument.frequencies_hz)
     kind = kind_of(record, True)
     scene = open_scene("laboratory", FREQUENCY_HZ)
     model = kind.fit(record, np.zeros(0, np.int64), scene, kind.settings(), 0, lambda what, share: None)

@@ -16,7 +16,7 @@ import io
 import logging
 import shutil
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -190,11 +190,10 @@ def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
         name=NAME,
         task="spectrum",
         tx_pos_m=positions,
-        receivers=(RECEIVER,),
+        receivers=(replace(RECEIVER, array_m=array_m),),
         observation=spectra,
         official=(rows[: room.train], rows[room.train :]),
         frequencies_hz=np.array([FREQUENCY_HZ]),
-        array_m=array_m,
     )
 
 

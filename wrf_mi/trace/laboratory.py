@@ -100,10 +100,9 @@ def _trace(info: SceneInfo, progress: bool) -> Record:
         name=NAME,
         task="spectrum",
         tx_pos_m=positions,
-        receivers=(RECEIVER,),
+        receivers=(replace(RECEIVER, array_m=array_m),),
         observation=spectra[None],
         frequencies_hz=np.array([FREQUENCY_HZ]),
-        array_m=array_m,
     )
     split = make_splits(record, "random", seed=OPTIONS.seed)[0]
     return replace(record, official=(split.all_train, split.test))

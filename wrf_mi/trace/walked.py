@@ -189,8 +189,8 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     rng = np.random.default_rng([walk.seed, 0])
     ways = [users_way(route, walk, rng) for route in plan.routes for _ in range(walk.users)]
     positions = np.concatenate(ways)
-    receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION))
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
+    receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION), array_m=array_m)
     # Diffuse reflection: the base station searches, so that all users see the same patches of rough wall.
     shared: dict[str, Any] = {"transmission": True, "seed": walk.seed}
     shared |= {"scattering_coefficient": walk.scattering}
@@ -218,7 +218,6 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
         receivers=(receiver,),
         observation=down.astype(np.complex64)[None],
         frequencies_hz=DOWNLINK_HZ,
-        array_m=array_m,
         uplink=up.astype(np.complex64),
         uplink_hz=UPLINK_HZ,
         truth=channel[None, ..., HALF:].astype(np.complex64),
