@@ -1,0 +1,84 @@
+"""Tasks: what observations are, how they are scored and which instrument reports them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib.metadata import entry_points
+
+from ..core import InputError, Record
+from . import csi, rssi, spectrum
+from .task import UPLINK, Task
+
+ENTRY_POINTS = "wrf_mi.tasks"
+"""Group of the entry points by which other packages add tasks."""
+
+
+class _Tasks(Mapping[str, Task]):
+    """Tasks by name: those of this package, of installed ones, and those that `register` added."""
+
+    def __init__(self, *own: Task) -> None:
+        self._known = {task.name: task for task in own}
+        self._others = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+    def add(self, task: Task) -> None:
+        if task.name in self:
+            raise InputError(f"task {task.name!r}: there is one of that name; choose another")
+        self._known[task.name] = task
+
+    def __getitem__(self, name: str) -> Task:
+        if name not in self._known:
+            self._known[name] = self._others[name].load()
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._known, **self._others})
+
+    def __len__(self) -> int:
+        return len(self._known | self._others)
+
+
+_TASKS = _Tasks(spectrum.TASK, rssi.TASK, csi.TASK)
+TASKS: Mapping[str, Task] = _TASKS
+"""Every task by the name that records bear (`wrf_mi.core.Record.task`)."""
+
+
+def register(task: Task) -> None:
+    """Add a task for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
+
+    Raises:
+        InputError: a name that is taken.
+    """
+    _TASKS.add(task)
+
+
+def task_of(record: Record) -> Task:
+    """The task of a record.
+
+    Raises:
+        InputError: a name that no task bears.
+    """
+    return known_task(record.task, record.source or record.name)
+
+
+def known_task(name: str, place: str) -> Task:
+    """The task of a name; ``place`` is where that stands, for the message.
+
+    Raises:
+        InputError: no task bears it.
+    """
+    if name not in TASKS:
+        raise InputError(f"{place}: task {name!r}; known are {', '.join(TASKS)}")
+    return TASKS[name]
+
+
+def require(record: Record, *names: str, why: str) -> None:
+    """Refuse a record of another task than those named.
+
+    Raises:
+        InputError: ``why`` says what they are needed for.
+    """
+    if record.task not in names:
+        raise InputError(f"{record.name}: holds {record.task}; {why}")
+
+
+__all__ = ["ENTRY_POINTS", "TASKS", "UPLINK", "Task", "known_task", "register", "require", "task_of"]

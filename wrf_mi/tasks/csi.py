@@ -1,0 +1,66 @@
+"""Channel state information: complex coefficients on subcarriers, at one or several antennas."""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from ..receive.instruments import ChannelInstrument
+from .scores import cea_db
+from .task import Task, carrier_hz
+
+
+class Csi(Task):
+    """Observations are channels [subcarriers] or [antennas, subcarriers], complex64, scored by estimation accuracy."""
+
+    name = "csi"
+    block, label, higher_is_better = "cea_db", "CEA (dB)", True
+    axes, more_axes, is_complex = 1, 1, True
+    from_uplink = "copy of the uplink"
+    heading, quantity = "channel coefficients", "power (dB)"
+    note = (
+        "CEA is the channel estimation accuracy, -10 log10 of the relative squared error over a sample's antennas "
+        "and subcarriers; the blend mixes the four nearest training rows by inverse squared distance; the copy of the "
+        "uplink takes each antenna's uplink coefficients for the downlink's."
+    )
+
+    def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
+        """See `wrf_mi.tasks.scores.cea_db`."""
+        return cea_db(prediction, truth)
+
+    def instrument(self, record: Record) -> ChannelInstrument:
+        """Antennas, one or several at each receiver, that report channel coefficients."""
+        frequencies = carrier_hz(record, "frequencies_hz in base-station.yml")
+        several = record.observation.ndim > 3
+        if several and any(receiver.array_m is None for receiver in record.receivers):
+            raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
+        single = record if several else record.with_array(None)
+        return ChannelInstrument(single.receivers, frequencies, record.tx_antenna)
+
+    def check(self, record: Record) -> None:
+        """Refuse numbers of rows, antennas, subcarriers and frequencies that differ."""
+        place, shape = record.source or record.name, record.observation.shape
+        if len(shape) not in (3, 4):
+            text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"
+            raise InputError(f"{place}: channel coefficients {list(shape)}; {text}")
+        frequencies = record.frequencies_hz
+        if frequencies is not None and len(frequencies) not in (1, shape[-1]):
+            raise InputError(_differ(place, "", shape[-1], len(frequencies)))
+        if record.uplink is None:
+            return
+        antennas = shape[2] if len(shape) == 4 else 1
+        if record.uplink.ndim != 3 or record.uplink.shape[:2] != (shape[1], antennas):
+            raise InputError(
+                f"{place}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
+                "antennas; give both for the same ones"
+            )
+        if record.uplink_hz is not None and len(record.uplink_hz) != record.uplink.shape[2]:
+            raise InputError(_differ(place, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
+
+
+def _differ(place: str, what: str, subcarriers: int, frequencies: int) -> str:
+    return f"{place}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
+
+
+TASK = Csi()

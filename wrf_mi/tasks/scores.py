@@ -1,0 +1,117 @@
+"""The one place where each metric is computed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from skimage.metrics import structural_similarity
+
+from ..core import InputError
+from ..core.angles import FloatArray
+
+EXACT = np.finfo(float).eps ** 2
+"""Smallest relative squared error that float64 can show."""
+REAL_90, COMPLEX_90 = 1.6449, 1.5174
+"""Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
+
+
+def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
+    """Structural similarity of each predicted spectrum.
+
+    Args:
+        prediction: grey values, shape [..., H, W], H and W at least 7.
+        truth: the same shape, in 0..1.
+
+    Returns:
+        Shape [...].
+
+    Raises:
+        InputError: shapes that differ, a prediction that is not finite, or an image smaller than the window.
+
+    Source: scikit-image ``structural_similarity(truth, prediction, data_range=1)``, as the WRF-GS+ authors score.
+    """
+    predicted, expected = np.asarray(prediction, float), np.asarray(truth, float)
+    _check(predicted, expected)
+    height, width = expected.shape[-2:]
+    if min(height, width) < 7:
+        raise InputError(f"image of {height} x {width} pixels: SSIM needs at least 7 x 7")
+    pairs = zip(expected.reshape(-1, height, width), predicted.reshape(-1, height, width), strict=True)
+    return np.array([structural_similarity(t, p, data_range=1.0) for t, p in pairs]).reshape(expected.shape[:-2])
+
+
+def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
+    """Absolute error of received powers in dB, NaN where nothing was received.
+
+    Args:
+        prediction: power in dBm, any shape.
+        truth: the same shape; NaN where nothing was received.
+
+    Raises:
+        InputError: shapes that differ, or no finite prediction where something was received.
+    """
+    predicted, expected = np.asarray(prediction, float), np.asarray(truth, float)
+    _check(predicted, expected)
+    return np.abs(predicted - expected)
+
+
+def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
+    """Channel estimation accuracy in dB, -10 log10(sum |prediction - truth|^2 / sum |truth|^2) over subcarriers.
+
+    Args:
+        prediction: complex coefficients, shape [..., subcarriers].
+        truth: the same shape; against noise-free values where it is synthetic.
+
+    Returns:
+        Shape [...]; NaN where the truth is zero.
+
+    Raises:
+        InputError: shapes that differ, or a prediction that is not finite.
+
+    Source: the signal-to-noise ratio of NeRF2's and WRF-GS's channel prediction.
+    """
+    predicted, expected = np.asarray(prediction, complex), np.asarray(truth, complex)
+    _check(predicted, expected)
+    error = np.square(np.abs(predicted - expected)).sum(axis=-1)
+    power = np.square(np.abs(expected)).sum(axis=-1)
+    # A prediction without any error would be infinitely accurate; float64 cannot tell more than this.
+    ratio = np.maximum(np.divide(error, power, out=np.full(power.shape, np.nan), where=power > 0), EXACT)
+    return -10 * np.log10(ratio)
+
+
+def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
+    """Share of the known values inside the predicted 90 % intervals.
+
+    Args:
+        prediction: any shape, real or complex.
+        std: predicted standard deviation, the same shape; errors are taken to be normal (complex: circular).
+        truth: the same shape; NaN where nothing was received.
+    """
+    error = np.abs(np.asarray(prediction) - np.asarray(truth))
+    bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
+    known = np.isfinite(error)
+    return float((error <= bound * np.asarray(std, float))[known].mean())
+
+
+def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:
+    if prediction.shape != truth.shape:
+        raise InputError(f"prediction {prediction.shape} and truth {truth.shape} differ in shape")
+    # Without this a method that fails where it is hard would be scored on the rest.
+    wrong = int(np.count_nonzero(~np.isfinite(prediction) & ~np.isnan(truth)))
+    if wrong:
+        raise InputError(f"prediction: {wrong} of {truth.size} values are not finite where the truth is known")
+
+
+def summary(values: ArrayLike) -> dict[str, float]:
+    """Median, mean, 10th and 90th percentile of all values that are not NaN.
+
+    Raises:
+        InputError: no values.
+    """
+    v = np.asarray(values, float).ravel()
+    v = v[~np.isnan(v)]
+    if not len(v):
+        raise InputError("no test rows to score: the split has none")
+    p10, median, p90 = np.percentile(v, [10, 50, 90])
+    return {"median": float(median), "mean": float(v.mean()), "p10": float(p10), "p90": float(p90)}
