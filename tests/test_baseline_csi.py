@@ -29,7 +29,7 @@ from wrf_mi.baselines.uplink_paths import find_paths  # noqa: E402
 from wrf_mi.baselines.uplink_waves import waves_of  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.core.arrays import planar_array  # noqa: E402
-from wrf_mi.report.metrics import cea_db  # noqa: E402
+from wrf_mi.tasks.scores import cea_db  # noqa: E402
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.4e9, 312.5e3, 26
 OFFSETS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)]) * SPACING_HZ

@@ -32,7 +32,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.core.arrays import planar_array  # noqa: E402
 from wrf_mi.measure import load, make_splits  # noqa: E402
 from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale  # noqa: E402
-from wrf_mi.report.metrics import abs_error_db, cea_db, ssim  # noqa: E402
+from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim  # noqa: E402
 
 FITTED = 0.9
 """Structural similarity to which 8 spectra must be fitted."""

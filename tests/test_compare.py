@@ -15,8 +15,8 @@ from PIL import Image
 from wrf_mi.core import InputError
 from wrf_mi.report import figures
 from wrf_mi.report.compare import COLUMNS, compare
-from wrf_mi.report.metrics import ssim, summary
 from wrf_mi.report.run_folder import read_run
+from wrf_mi.tasks.scores import ssim, summary
 
 SHAPE = (10, 24)
 

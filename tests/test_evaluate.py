@@ -12,8 +12,9 @@ import pytest
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.measure import make_splits
 from wrf_mi.report.evaluate import evaluate, pool, write_results
-from wrf_mi.report.metrics import TASKS, abs_error_db, cea_db
 from wrf_mi.report.run_folder import Run, read_run
+from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import abs_error_db, cea_db
 
 ROWS = 40
 FLOAT32 = 1e-5

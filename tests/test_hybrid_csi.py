@@ -20,7 +20,7 @@ from wrf_mi.hybrid.csi_paths import images_of, seen_from
 from wrf_mi.hybrid.csi_rest import fit_diffuse
 from wrf_mi.hybrid.csi_visible import Learner
 from wrf_mi.hybrid.walls import outline_edges, walls_of
-from wrf_mi.report.metrics import cea_db
+from wrf_mi.tasks.scores import cea_db
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
 from wrf_mi.trace.surfaces import scene_surfaces
 

@@ -23,7 +23,7 @@ from wrf_mi.hybrid.measured_spectrum import (
 from wrf_mi.hybrid.models import kind_of
 from wrf_mi.hybrid.nearby import NearbySpectra, fit_nearby, line_of_sight, sight_axes
 from wrf_mi.receive.lags import Lags
-from wrf_mi.report.metrics import inside_interval, ssim
+from wrf_mi.tasks.scores import inside_interval, ssim
 
 RECEIVER_M = np.array([3.0, 1.0, -0.5])
 UP_M = np.array([0.0, 0.0, 4.0])

@@ -22,9 +22,9 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.report.compare import compare
 from wrf_mi.report.hybrid_run import HybridRun, evaluate_hybrid, open_hybrid, train_hybrid
-from wrf_mi.report.metrics import inside_interval, ssim
 from wrf_mi.report.run_folder import read_run
 from wrf_mi.scene.make import make_scene
+from wrf_mi.tasks.scores import inside_interval, ssim
 
 QUICK = ("directions=20", "lengths=2")
 """Of spectra without a mesh: a fit of a second."""

@@ -15,7 +15,8 @@ from skimage.metrics import structural_similarity
 from wrf_mi.baselines.idw import InverseDistance
 from wrf_mi.core import InputError
 from wrf_mi.measure import load, make_splits
-from wrf_mi.report.metrics import TASKS, abs_error_db, cea_db, ssim, summary
+from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim, summary
 
 EXACT = 1e-12
 PUBLISHED = 0.0005

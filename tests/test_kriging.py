@@ -12,7 +12,8 @@ from wrf_mi.baselines.kriging import Kriging, constant, log_distance
 from wrf_mi.baselines.trees import Trees
 from wrf_mi.core import InputError
 from wrf_mi.measure import load, make_splits
-from wrf_mi.report.metrics import TASKS, summary
+from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import summary
 
 EXACT = 1e-9
 """Systems of a few dozen rows, condition 1e4, in float64."""

@@ -307,4 +307,6 @@ def test_what_is_there_is_checked_and_needs_no_network(name: str):
 def test_what_the_files_of_rfid_lab_do_not_tell():
     record = load("rfid-lab")
     assert record.frequencies_hz == [920e6]
-    np.testing.assert_allclose(record.receivers[0].array_m[[0, 1, 4]], [[-0.24, -0.24, 0], [-0.08, -0.24, 0], [-0.24, -0.08, 0]])
+    np.testing.assert_allclose(
+        record.receivers[0].array_m[[0, 1, 4]], [[-0.24, -0.24, 0], [-0.08, -0.24, 0], [-0.24, -0.08, 0]]
+    )

@@ -14,7 +14,7 @@ from wrf_mi.field import FIELDS
 from wrf_mi.fit.config import TrainConfig, with_settings
 from wrf_mi.fit.state import FitState
 from wrf_mi.fit.trainer import Trainer
-from wrf_mi.report.metrics import ssim
+from wrf_mi.tasks.scores import ssim
 
 RECOVERED = 0.97
 """Median similarity on transmitters never trained on. The nearest-neighbour blend stays below 0.91 there."""

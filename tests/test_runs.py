@@ -25,8 +25,8 @@ from wrf_mi.fit.config import TrainConfig  # noqa: E402
 from wrf_mi.fit.folder import load_predictor, read_checkpoint  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
 from wrf_mi.measure import load, load_split, make_splits, write_spectrum_folder  # noqa: E402
-from wrf_mi.report.metrics import ssim  # noqa: E402
 from wrf_mi.report.runs import Interrupted, Run, evaluate_run, resume, train  # noqa: E402
+from wrf_mi.tasks.scores import ssim  # noqa: E402
 
 PARALLEL_TOLERANCE = 1e-3
 """Greys of two runs on several threads after 40 steps: sums of gradients differ in their last digit, 1e-7, and Adam

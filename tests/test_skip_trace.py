@@ -17,6 +17,7 @@ from wrf_mi.cli import main
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receive import rssi_dbm
+from wrf_mi.receive.instruments import SpectrumInstrument
 from wrf_mi.report.traced import CONVERGENCE, trace_run
 from wrf_mi.trace import TraceOptions, trace_paths
 from wrf_mi.trace.target import choose_options, remainder

@@ -18,9 +18,9 @@ from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import write_spectrum_folder
 from wrf_mi.report.traced import TracedRun, trace_run
+from wrf_mi.tasks import instrument_of
 from wrf_mi.trace import TraceOptions, load_trace, open_scene, trace_paths
 from wrf_mi.trace.polarization import GAIN_DB, cross_polarized
-from wrf_mi.trace.tracer import instrument_of
 
 HZ = 920e6
 OPTIONS = TraceOptions(max_depth=1, rays=1 << 12)

@@ -12,6 +12,7 @@ from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, write_xml
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
+from wrf_mi.receive.instruments import PowerInstrument
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.surfaces import Surface
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths

@@ -17,12 +17,13 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import make_splits, read_nerf2_csi
 from wrf_mi.receive import csi, element_signals
 from wrf_mi.report.evaluate import evaluate
-from wrf_mi.report.metrics import cea_db
+from wrf_mi.tasks import instrument_of
+from wrf_mi.tasks.scores import cea_db
 from wrf_mi.trace import TraceOptions, load_record, open_scene, trace_paths, walked_channels
 from wrf_mi.trace.array_channels import array_channels
 from wrf_mi.trace.devices import check_devices
 from wrf_mi.trace.surfaces import scene_surfaces
-from wrf_mi.trace.tracer import RayTracer, instrument_of
+from wrf_mi.trace.tracer import RayTracer
 from wrf_mi.trace.walked import CARRIER_HZ, DOWNLINK_HZ, PLACES, UPLINK_HZ, Walk, users_way, with_noise
 
 SMALL = Walk(rows=2, columns=3, users=1, places=4, depth=3, reflections=1, rays=1 << 12, scattered_rays=1 << 6)

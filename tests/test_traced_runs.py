@@ -24,10 +24,11 @@ from wrf_mi.report.run_folder import read_run
 from wrf_mi.report.runs import evaluate_run, predict_to_file
 from wrf_mi.report.traced import trace_run
 from wrf_mi.scene.make import make_scene
+from wrf_mi.tasks import instrument_of
 from wrf_mi.trace import TraceOptions, load_trace, solve
 from wrf_mi.trace.offsets import fit_offsets
 from wrf_mi.trace.options import with_kinds
-from wrf_mi.trace.tracer import RayTracer, instrument_of
+from wrf_mi.trace.tracer import RayTracer
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
 FLOAT32_DB = 1e-4

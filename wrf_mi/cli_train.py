@@ -245,7 +245,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if as_json:
         print_json(metrics)
         return 0
-    from .report.metrics import TASKS
+    from .tasks import TASKS
 
     task = TASKS[metrics["task"]]
     title = f"{task.label} on {metrics['n_test']} test rows"

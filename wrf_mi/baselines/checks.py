@@ -8,6 +8,7 @@ import numpy as np
 
 from ..core import InputError, Record
 from ..measure.observations import count_not_finite, place_of
+from ..tasks import task_of
 from .method import Inputs, Method
 
 
@@ -23,9 +24,9 @@ def check_record(method: Method, record: Record, others: Iterable[Method] = ()) 
         InputError: another task; no uplink for a method that needs one; numbers of rows, antennas, subcarriers and
             frequencies that differ.
     """
-    if record.task not in method.tasks:
-        served = " and ".join(method.tasks)
-        able = [other.name for other in others if record.task in other.tasks]
+    if not method.serves(record.task):
+        served = " and ".join(method.tasks or ())
+        able = [other.name for other in others if other.serves(record.task)]
         named = f": {', '.join(able)}" if able else ""
         text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
         raise InputError(f"{place_of(record)}: {text}")
@@ -33,30 +34,7 @@ def check_record(method: Method, record: Record, others: Iterable[Method] = ()) 
         raise InputError(
             f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         )
-    if record.task != "csi":
-        return
-    shape = record.observation.shape
-    if len(shape) not in (3, 4):
-        text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"
-        raise InputError(f"{place_of(record)}: channel coefficients {list(shape)}; {text}")
-    frequencies = record.frequencies_hz
-    if frequencies is not None and len(frequencies) not in (1, shape[-1]):
-        _differ(record, "", shape[-1], len(frequencies))
-    if record.uplink is None:
-        return
-    antennas = shape[2] if len(shape) == 4 else 1
-    if record.uplink.ndim != 3 or record.uplink.shape[:2] != (shape[1], antennas):
-        raise InputError(
-            f"{place_of(record)}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and "
-            f"{antennas} antennas; give both for the same ones"
-        )
-    if record.uplink_hz is not None and len(record.uplink_hz) != record.uplink.shape[2]:
-        _differ(record, "uplink ", record.uplink.shape[2], len(record.uplink_hz))
-
-
-def _differ(record: Record, what: str, subcarriers: int, frequencies: int) -> None:
-    text = f"{subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
-    raise InputError(f"{place_of(record)}: {text}")
+    task_of(record).check(record)
 
 
 def check_inputs(inputs: Inputs, record: Record, method: Method) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..tasks import task_of
 from .method import Inputs
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -81,7 +82,7 @@ def outputs_of(record: Record) -> Outputs:
     Raises:
         InputError: an uplink with another number of antennas than the downlink, or of several receivers.
     """
-    if record.task != "csi":
+    if not task_of(record).is_complex:
         known = record.frequencies_hz
         return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
     shape = record.observation.shape
@@ -142,7 +143,7 @@ def channel_scales(record: Record, rows: IntArray) -> FloatArray:
     One for each, so that a receiver far away counts as much as a near one; 1 where there is nothing to measure by.
     """
     power = np.ones(len(record.receivers))
-    if record.task == "csi":
+    if task_of(record).is_complex:
         for r, seen in enumerate(record.observation):
             size = np.abs(seen[rows].astype(complex))
             if np.isfinite(size).any():
@@ -159,7 +160,7 @@ def truth_of(
     the receiver's of ``scales``, or [n * antennas, 2 outputs] divided as `normalised_uplink` divided the uplink.
     """
     seen = record.observation[receiver, rows]
-    if record.task != "csi":
+    if not task_of(record).is_complex:
         return np.asarray(seen, np.float32).reshape(len(rows), -1)
     if outputs.by_uplink:
         assert record.uplink is not None

@@ -23,6 +23,7 @@ from ..fit.recorded import Recorded
 from ..hybrid.learned import learned_field
 from ..project.footprint import Pose
 from ..splat.tiles import perception_plane
+from ..tasks import Task, task_of
 from .band_fields import BAND_FIELDS, FeatureEncoding, spread
 from .conditions import Outputs, outputs_of, placed_receivers
 from .tensors import columns
@@ -108,7 +109,7 @@ class Frame:
     """
 
     model: str
-    task: str
+    task: Task
     outputs: Outputs
     basis: NDArray[np.complex128]
     scales: NDArray[np.float64]
@@ -131,7 +132,7 @@ def frame_of(model: str, record: Record, basis: NDArray[np.complex128], scales: 
     receivers = placed_receivers(record, outputs)
     place = np.stack([receiver.position_m for receiver in receivers])
     turned = np.stack([receiver.to_world for receiver in receivers])
-    return Frame(model, record.task, outputs, basis, scales, place, turned)
+    return Frame(model, task_of(record), outputs, basis, scales, place, turned)
 
 
 class Evaluation:
@@ -189,7 +190,7 @@ class Evaluation:
         """Powers in dBm [batch, 1], or coefficients, real parts, then imaginary ones, [batch, 2 components]."""
         re, im = self.amplitudes(params, data, condition, receiver)
         kind, batch = type(data["solid_angle"]), condition.shape[1]
-        if self.frame.task == "rssi":
+        if self.frame.task.in_decibel:
             offset = dr.gather(type(re), params["offset"].array, receiver)
             return kind(offset + DECIBELS * dr.log(re * re + im * im + LEAST_POWER), (batch, 1))
         shape = (batch, self.frame.components)

@@ -39,6 +39,7 @@ from ..core.types import IntArray
 from ..field import random_gaussians
 from ..field.encoding import telling_scale
 from ..field.network import Weights
+from ..tasks import task_of
 from .conditions import (
     Outputs,
     channel_scales,
@@ -106,7 +107,7 @@ class FittedGaussians:
         params = self._params[receiver if len(self._params) > 1 else 0]
         values = self._evaluation.predict(params, condition, receiver).astype(float)
         shape = (len(inputs), *self._shape)
-        if frame.task == "rssi":
+        if frame.task.in_decibel:
             return values.astype(np.float32).reshape(shape)
         half = frame.components
         channel = (values[:, :half] + 1j * values[:, half:]) @ frame.basis
@@ -146,7 +147,7 @@ def fit(model: str, record: Record, split: Split, s: GaussianSettings, seed: int
     """
     outputs, known = outputs_of(record), split.all_train
     scales, basis = channel_scales(record, known), np.ones((1, 1), complex)
-    if record.task == "csi":
+    if task_of(record).is_complex:
         basis = components_of(_observed(record, split, outputs, model), s.components)
     if not outputs.by_uplink:
         positions(record, model)
@@ -182,7 +183,7 @@ def _observed(record: Record, split: Split, outputs: Outputs, model: str) -> NDA
 def _truth(record: Record, frame: Frame, receiver: int, rows: IntArray) -> NDArray[np.float32]:
     """What reports are compared with, a row for each condition: powers in dBm or coefficients of the components."""
     parts = truth_of(record, frame.outputs, receiver, rows, frame.scales)
-    if frame.task == "rssi":
+    if frame.task.in_decibel:
         return parts
     half = frame.outputs.count
     found = (parts[:, :half] + 1j * parts[:, half:]) @ frame.basis.conj().T
@@ -217,7 +218,7 @@ def _fit_group(
     truth = {r: _truth(record, frame, r, known) for r in members}
     count = condition.shape[1]
     weights["offset"] = np.zeros((1, len(record.receivers)), np.float32)
-    if frame.task == "rssi":
+    if frame.task.in_decibel:
         params = {name: to_tensor(values) for name, values in weights.items()}
         for r in members:
             own = np.concatenate(rows[r])[:AT_ONCE]
@@ -248,7 +249,7 @@ def _fit_group(
         slot = dr.arange(type(given["rows"]), batch * values)
         row = dr.gather(type(slot), given["rows"], slot // values) + given["receiver"] * count
         error = found.array - dr.gather(type(found.array), data["truth"].array, row * values + slot % values)
-        return dr.mean(dr.abs(error)) / DB_UNIT if frame.task == "rssi" else dr.mean(error * error)
+        return dr.mean(dr.abs(error)) / DB_UNIT if frame.task.in_decibel else dr.mean(error * error)
 
     def score(params: Mapping[str, Any]) -> float:
         errors = []
@@ -257,7 +258,7 @@ def _fit_group(
             if len(validation):
                 found = evaluation.predict(params, columns(condition, opaque_rows(validation)), r)
                 error = found - truth[r][validation]
-                errors.append(np.abs(error).mean(axis=1) if frame.task == "rssi" else np.square(error).mean(axis=1))
+                errors.append(np.abs(error).mean(axis=1) if frame.task.in_decibel else np.square(error).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
 
     able = any(len(rows[r][1]) for r in members)

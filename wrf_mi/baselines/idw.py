@@ -13,19 +13,11 @@ from scipy.spatial import KDTree
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.angles import FloatArray
 
+from ..tasks import task_of
 from .by_receiver import ByReceiver, fit_each, load_each
 from .method import Listen, Method
 
 NAME = "idw"
-
-
-REFERENCE: Mapping[str, tuple[int, float]] = {
-    "spectrum": (4, 0.0),
-    # Of 0 to 1.6 m the best on tenths of flat-ble's training run that were held out in turn, in the order of time.
-    "rssi": (100, 0.4),
-    "csi": (4, 0.0),
-}
-"""Neighbours and softening in metres by task: the blend that every run is held against."""
 
 
 class InverseDistance:
@@ -129,9 +121,9 @@ def fit(record: Record, split: Split, settings: IdwSettings, seed: int, listen: 
     Raises:
         InputError: settings out of range, positions that are not known, or no row that was received.
     """
-    k, softening_m = REFERENCE[record.task]
-    k = k if settings.neighbours is None else settings.neighbours
-    softening_m = softening_m if settings.softening_m is None else settings.softening_m
+    task = task_of(record)
+    k = task.neighbours if settings.neighbours is None else settings.neighbours
+    softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
 
     def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
         return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
@@ -146,7 +138,7 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
 
 METHOD = Method(
     NAME,
-    tuple(REFERENCE),
+    None,
     IdwSettings,
     fit,
     load,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record, Split
 from ..core.angles import FloatArray
+from ..tasks import task_of
 from .by_receiver import ByReceiver, fit_each, load_each
 from .kriging import KrigedMean, Kriging, Trend, constant, log_distance
 from .method import Listen, Method
@@ -75,7 +76,7 @@ def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, list
     """
     if settings.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; leave the setting away")
-    name = settings.trend or (LOG_DISTANCE if record.task == "rssi" else CONSTANT)
+    name = settings.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
     how = settings.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
@@ -93,7 +94,7 @@ def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, list
         )
         return Kriged(model.fit(tx_pos, observed, heading).mean, name)
 
-    return fit_each(NAME, record, split, listen, one, settings.heading and record.task == "rssi")
+    return fit_each(NAME, record, split, listen, one, settings.heading and task_of(record).in_decibel)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
@@ -112,7 +113,7 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
 
 METHOD = Method(
     NAME,
-    ("spectrum", "rssi", "csi"),
+    None,
     KrigingSettings,
     fit,
     load,

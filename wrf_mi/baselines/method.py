@@ -70,7 +70,7 @@ class Method:
 
     Attributes:
         name: as in ``wrf-mi train --model``.
-        tasks: tasks of `wrf_mi.core.Record` that it serves.
+        tasks: tasks of `wrf_mi.core.Record` that it serves; None: all.
         settings: frozen dataclass of its settings, all with defaults.
         fit: ``fit(record, split, settings, seed, listen)``. ``split.validation`` may choose what is open; what is
             returned has seen all of ``split.all_train`` and no other row.
@@ -81,9 +81,13 @@ class Method:
     """
 
     name: str
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...] | None
     settings: type
     fit: Callable[[Record, Split, Any, int, Listen], Fitted]
     load: Callable[[dict[str, NDArray[Any]], Record], Fitted]
     source: str
     needs_uplink: bool = False
+
+    def serves(self, task: str) -> bool:
+        """Whether it serves a task."""
+        return self.tasks is None or task in self.tasks

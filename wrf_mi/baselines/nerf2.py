@@ -81,7 +81,7 @@ class FittedNerf2:
         condition, divisor = condition_of(self._frame, self._settings, inputs, receiver)
         values = self._field.march(params, self._seen[1], condition, receiver)
         shape = (len(inputs), *self._shape)
-        if self._frame.task == "csi":
+        if self._frame.task.is_complex:
             return channels_from(values, divisor, shape)
         return values.reshape(shape)
 
@@ -141,10 +141,10 @@ def _fit_group(
     dr.make_opaque(data)
     weights = s.networks.init(condition.shape[0], outputs.count, rng)
     weights["offset"] = np.zeros(len(record.receivers), np.float32)
-    if frame.task == "rssi":
+    if frame.task.in_decibel:
         for r in members:
             weights["offset"][r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
-    n_rays, spectrum = frame.directions.shape[1], frame.task == "spectrum"
+    n_rays, spectrum = frame.directions.shape[1], frame.task.image
     batch = s.training.batch if spectrum else s.sphere_batch
     all_rays = opaque_rows(np.arange(n_rays))
 

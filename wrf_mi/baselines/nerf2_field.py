@@ -20,6 +20,7 @@ from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
+from ..tasks import Task, task_of
 from .conditions import Outputs, normalised_uplink, outputs_of, placed_receivers, uplink_of
 from .coordinates import Coordinates
 from .method import Inputs
@@ -102,7 +103,7 @@ class Frame:
     far_m: float
     scales: FloatArray
     outputs: Outputs
-    task: str
+    task: Task
     directions: NDArray[np.float64]
     origins: NDArray[np.float64]
     groups: tuple[tuple[int, ...], ...]
@@ -113,7 +114,7 @@ def world_directions(record: Record, receivers: Sequence[Receiver], sphere_rays:
 
     Those of the pixels for spectra (`wrf_mi.core.angles`), else ``sphere_rays`` over the full sphere.
     """
-    if record.task == "spectrum":
+    if task_of(record).image:
         height, width = record.observation.shape[-2:]
         own = pixel_directions(height, width).reshape(-1, 3)
     else:
@@ -137,7 +138,7 @@ def frame_of(
         far_m,
         scales,
         outputs,
-        record.task,
+        task_of(record),
         world_directions(record, receivers, settings.sphere_rays),
         np.stack([receiver.position_m for receiver in receivers]),
         (everyone,) if settings.shared else tuple((r,) for r in everyone),
@@ -169,7 +170,7 @@ def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> 
     return Rays(columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver), **shared)
 
 
-def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: str, shape: tuple[int, int, int], rx: Any) -> Any:
+def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
     """What the instrument reports, from the rays' flat parts [outputs * batch * rays]; a tensor.
 
     Greys [batch, rays]; powers in dBm [batch, 1]; channels' real parts, then imaginary ones, [batch, 2 outputs].
@@ -177,11 +178,11 @@ def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: str, shape: 
     outputs, batch, rays = shape
     re, im = parts
     tensor = type(params["offset"])
-    if task == "spectrum":
+    if task.image:
         return tensor(dr.sqrt(re * re + im * im + DARK), (batch, rays))
     # Of equal solid angle; the root keeps incoherent sums at one size for any number of rays.
     re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
-    if task == "rssi":
+    if task.in_decibel:
         offset = dr.gather(type(re), params["offset"].array, rx)
         power = offset + float(10 / np.log(10)) * dr.log(re * re + im * im + DARK)
         return tensor(power, (batch, 1))
@@ -211,10 +212,10 @@ def step_loss(
     asked = predicted.shape[1]
     slot = dr.arange(type(given["rows"]), batch * asked)
     row = dr.gather(type(slot), given["rows"], slot // asked) + given["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), given["rays"], slot % asked) if frame.task == "spectrum" else slot % asked
+    column = dr.gather(type(slot), given["rays"], slot % asked) if frame.task.image else slot % asked
     truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, asked))
     error = predicted - truth
-    if frame.task == "rssi":
+    if frame.task.in_decibel:
         error = error * (1 / DB_UNIT)
     return dr.mean(error * error, axis=None).array
 
@@ -250,7 +251,7 @@ class Field:
         """What the points of a receiver's rays, all by default, are: in parts for spectra, else in one."""
         everything = np.arange(self.frame.directions.shape[1]) if rays is None else rays
         most = max(1, POINTS_AT_ONCE // self.settings.samples)
-        count = -(-len(everything) // most) if self.frame.task == "spectrum" else 1
+        count = -(-len(everything) // most) if self.frame.task.image else 1
         index = dr.opaque(mi.UInt32, receiver)
         return [
             self._looked(dict(params), self.data, index, opaque_rows(part))

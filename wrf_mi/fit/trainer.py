@@ -24,6 +24,7 @@ from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
 from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
+from ..tasks import require
 from .config import TrainConfig
 from .predictor import Predictor
 from .schedule import plan
@@ -147,9 +148,10 @@ class Trainer:
         state: FitState | None = None,
         loss: Loss | None = None,
     ) -> None:
-        if record.task != "spectrum":
-            what = f"{record.name}: task {record.task!r}; learned fields are fitted to spectra"
-            raise InputError(f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
+        why = (
+            "learned fields are fitted to spectra: choose a data set of spectra, or trace this one with `wrf-mi trace`"
+        )
+        require(record, "spectrum", why=why)
         check_rows(split, record, f"split {split.name}")
         check_observations(record, split, complete=True)
         config = config.resolved(record.tx_pos_m[split.all_train])

@@ -28,6 +28,7 @@ from ..core import InputError, Receiver, Record, receiver_arrays, stored_receive
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..tasks import require
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, prior_sd, seen_by_rows
 from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Model
@@ -186,8 +187,9 @@ def fit_csi(
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.
     """
-    if record.task != "csi" or record.frequencies_hz is None:
-        raise InputError(f"{record.name}: holds {record.task}; a CSI hybrid needs channels and their frequencies")
+    require(record, "csi", why="this hybrid predicts channels")
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: frequencies unknown, which the hybrid needs; state them in the data")
     rows = np.asarray(rows, np.int64)
     if not len(rows) and scene is None:
         raise InputError(f"{record.name}: neither training rows nor a scene; give one of them")

@@ -30,6 +30,7 @@ from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..receive.lags import Lags
 from ..receive.retrieve import retrieve_signals, unscale
+from ..tasks import require
 from .estimate import Estimate
 from .expected import SpectrumReport
 from .nearby import NearbySpectra, fit_nearby, line_of_sight
@@ -222,8 +223,7 @@ def fit_measured_spectrum(
     Raises:
         InputError: no spectra, no array, or too few rows.
     """
-    if record.task != "spectrum":
-        raise InputError(f"{record.name}: task {record.task}; this hybrid predicts spectra")
+    require(record, "spectrum", why="this hybrid predicts spectra")
     if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: its array or frequency is not known; state both in its gateway_info.yml")
     if len(rows) < LEAST_ROWS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -55,11 +55,13 @@ class HybridKind:
         settings: dataclass of its settings.
         fit: ``fit(record, rows, scene, settings, seed, listen)``; ``scene`` as opened by Sionna RT, or None.
         load: ``load(arrays, scene)``, from `HybridModel.arrays`.
+        uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
     """
 
     settings: type
     fit: Callable[[Record, IntArray, Any, Any, int, Listen], HybridModel]
     load: Callable[[dict[str, NDArray[Any]], Any], HybridModel]
+    uses_antennas: bool = True
 
 
 def kind_of(record: Record, with_scene: bool) -> HybridKind:
@@ -72,19 +74,27 @@ def kind_of(record: Record, with_scene: bool) -> HybridKind:
     Raises:
         InputError: a task that none serves.
     """
-    if record.task == "rssi":
-        from .rssi import RssiHybrid, RssiSettings, fit_rssi
-
-        return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
-    if record.task == "csi":
-        if record.observation.ndim != 3:
-            antennas = record.observation.shape[2]
-            raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
-        from .csi import CsiHybrid, CsiSettings, fit_csi
-
-        return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays)
-    if record.task != "spectrum":
+    if record.task not in KINDS:
         raise InputError(f"{record.name}: holds {record.task}; no hybrid predicts that")
+    return KINDS[record.task](record, with_scene)
+
+
+def _for_rssi(record: Record, with_scene: bool) -> HybridKind:
+    from .rssi import RssiHybrid, RssiSettings, fit_rssi
+
+    return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
+
+
+def _for_csi(record: Record, with_scene: bool) -> HybridKind:
+    if record.observation.ndim != 3:
+        antennas = record.observation.shape[2]
+        raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
+    from .csi import CsiHybrid, CsiSettings, fit_csi
+
+    return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays, uses_antennas=False)
+
+
+def _for_spectra(record: Record, with_scene: bool) -> HybridKind:
     if with_scene:
         from .spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
 
@@ -95,6 +105,14 @@ def kind_of(record: Record, with_scene: bool) -> HybridKind:
         return fit_measured_spectrum(record, rows, settings, seed, listen)
 
     return HybridKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumHybrid.from_arrays)
+
+
+KINDS: Mapping[str, Callable[[Record, bool], HybridKind]] = {
+    "rssi": _for_rssi,
+    "csi": _for_csi,
+    "spectrum": _for_spectra,
+}
+"""The hybrid of a record, with or without a scene, by its task."""
 
 
 def settings_of_hybrids() -> dict[str, Any]:

@@ -23,6 +23,7 @@ from ..core import InputError, Receiver, Record, receiver_arrays, stored_receive
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..tasks import require
 from .estimate import Estimate
 from .rssi_fit import Base, Field, Fit, Knobs, Measured, shift_of, stopper, widening
 from .rssi_map import PowerMap, trace_map
@@ -281,8 +282,9 @@ def fit_rssi(
     Raises:
         InputError: a record of another task or without its frequency, or neither rows nor a scene.
     """
-    if record.task != "rssi" or record.frequencies_hz is None:
-        raise InputError(f"{record.name}: holds {record.task}; an RSSI hybrid needs strengths (rssi) and a frequency")
+    require(record, "rssi", why="this hybrid predicts signal strengths")
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: carrier frequency unknown, which the hybrid needs; state it in the data")
     rows = np.unique(np.asarray(rows, np.int64))
     values = np.asarray(record.observation[:, rows], float)
     heard = np.isfinite(values).any(axis=0)

@@ -23,6 +23,7 @@ from ..core import Antenna, InputError, Receiver, Record, receiver_arrays, store
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..tasks import require
 from .estimate import Estimate
 from .spectrum_few import FEW_ROWS, fitted_to_few
 from .spectrum_fit import Constants, Maps
@@ -235,8 +236,7 @@ def fit_spectrum(
     Raises:
         InputError: a record of another task, or without array or carrier.
     """
-    if record.task != "spectrum":
-        raise InputError(f"{record.name}: task {record.task!r}; this hybrid is for spectra")
+    require(record, "spectrum", why="this hybrid predicts spectra")
     if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: array or carrier unknown; state array and frequency_hz in gateway_info.yml")
     rows = np.asarray(rows, np.int64)

@@ -5,9 +5,10 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
 - ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
   metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world). Optional and ours: ``frequency_hz``
   of the carrier, one for all receivers; ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``,
-  a list of x, y, z in the array's frame, for all receivers or in the entry of each; ``antenna`` in each receiver's entry, and ``tx_antenna`` beside these, with
-  ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with ``frame`` too; see `wrf_mi.core.Antenna`; the
-  default is isotropic and vertical in the world). ``dataset_name`` and other plain values beside them are not used.
+  a list of x, y, z in the array's frame, for all receivers or in the entry of each; ``antenna`` in a receiver's entry,
+  and ``tx_antenna`` beside these, with ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with
+  ``frame`` too; see `wrf_mi.core.Antenna`; the default is isotropic and vertical in the world). ``dataset_name`` and
+  other plain values beside them are not used.
 - ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
 - ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
   row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
@@ -115,7 +116,11 @@ def write_spectrum_folder(
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
-    if record.task != "spectrum" or not (record.observation.min() >= 0 and record.observation.max() <= 1):
+    if (
+        record.observation.ndim != 4
+        or np.iscomplexobj(record.observation)
+        or not (record.observation.min() >= 0 and record.observation.max() <= 1)
+    ):
         raise InputError(f"{path}: {record.name} holds no spectra within 0..1; scale them first")
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
         text = f"{record.name} has {len(record.frequencies_hz)} carriers, and {GATEWAYS} states one"

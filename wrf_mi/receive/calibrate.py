@@ -81,7 +81,7 @@ class ArrayFit:
     def array(self, record: Record) -> Array:
         """The array with the gains that were told; with equal ones where they were not."""
         own = self.calibration
-        return Array(self.elements_m, _stated(record)[1], own.gain if own is not None and own.told else None)
+        return Array(self.elements_m, _carrier_hz(record), own.gain if own is not None and own.told else None)
 
     def plain(self) -> dict[str, Any]:
         """In plain numbers, for a report."""
@@ -125,11 +125,11 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int | str = 0, waves: i
     """
     index = receiver_index(record.receivers, receiver)
     array_m = record.receivers[index].array_m
-    if record.task != "spectrum" or array_m is None or record.frequencies_hz is None:
+    if record.observation.ndim != 4 or array_m is None or record.frequencies_hz is None:
         raise InputError(
             f"{record.name}: calibration needs spectra with their array and carrier; give them in the data"
         )
-    elements, frequency_hz = array_m, float(record.frequencies_hz[0])
+    elements, frequency_hz = np.asarray(array_m, float), _carrier_hz(record)
     chosen = np.asarray(rows, np.int64)
     if len(chosen) < 2 * GEOMETRY_PARTS:
         raise InputError(f"{record.name}: {len(chosen)} rows to calibrate by; give {2 * GEOMETRY_PARTS} or more")
@@ -166,6 +166,11 @@ def fit_array(record: Record, rows: ArrayLike, receiver: int | str = 0, waves: i
         shift,
         near,
     )
+
+
+def _carrier_hz(record: Record) -> float:
+    assert record.frequencies_hz is not None
+    return float(record.frequencies_hz[0])
 
 
 def _groups(record: Record, rows: IntArray) -> IntArray:

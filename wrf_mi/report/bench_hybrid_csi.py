@@ -26,11 +26,11 @@ from ..hybrid.csi import CsiSettings, fit_csi
 from ..measure.newrf import read_newrf
 from ..scene.make import make_scene
 from ..scene.scan import RANGE_NOISE_M, simulate_scan
+from ..tasks.scores import cea_db
 from ..trace import TraceOptions, open_scene, trace_paths
 from ..trace.surfaces import scene_surfaces
 from .bench_scene import CLEAR_M, SCANNER_CLEAR_M, SCANNER_HEIGHTS_M, _clearance, spread
 from .bench_trace import room_file
-from .metrics import cea_db
 from .paired import paired_difference
 
 SEEDS = (1, 2, 3)

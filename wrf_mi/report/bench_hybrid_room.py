@@ -19,9 +19,9 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..fit.config import TrainConfig, with_settings
 from ..measure import make_splits
+from ..tasks.scores import ssim, summary
 from ..trace.furnished import traced_room
 from .hybrid_run import train_hybrid
-from .metrics import ssim, summary
 from .paired import agreed, paired_difference
 from .run_folder import Run, read_run
 from .runs import train

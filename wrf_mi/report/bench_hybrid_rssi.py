@@ -20,6 +20,8 @@ from ..hybrid.rssi import RssiSettings, fit_rssi
 from ..measure import load, make_splits
 from ..measure.registry import locate
 from ..scene.make import make_scene
+from ..tasks import TASKS
+from ..tasks.scores import abs_error_db
 from ..trace import TraceResult, open_scene, recompute, trace_paths
 from ..trace.calibrate import (
     OFFSETS_ALONE,
@@ -29,7 +31,6 @@ from ..trace.calibrate import (
     choose_calibration,
 )
 from .bench_calibration import HEIGHT_M, OPTIONS, WALLS_M
-from .metrics import TASKS, abs_error_db
 from .paired import agreed, paired_difference
 
 SEEDS = (0, 1, 2)

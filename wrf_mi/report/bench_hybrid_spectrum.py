@@ -13,8 +13,8 @@ from ..baselines.kriging import Kriging
 from ..core import Record
 from ..core.angles import FloatArray
 from ..measure import load, make_splits
+from ..tasks.scores import ssim, summary
 from .hybrid_run import train_hybrid
-from .metrics import ssim, summary
 from .paired import agreed, paired_difference
 from .run_folder import Run, read_run
 

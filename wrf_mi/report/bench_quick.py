@@ -35,11 +35,11 @@ from ..fit.folder import versions  # noqa: E402
 from ..fit.step import Prediction, device_pose  # noqa: E402
 from ..fit.trainer import Trainer  # noqa: E402
 from ..measure import make_splits  # noqa: E402
+from ..receive.instruments import SpectrumInstrument  # noqa: E402
 from ..splat.render import splat  # noqa: E402
 from ..splat.tiles import perception_plane  # noqa: E402
 from ..trace import TraceOptions, open_scene, recompute, trace_paths  # noqa: E402
 from ..trace.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path  # noqa: E402
-from ..receive.instruments import SpectrumInstrument  # noqa: E402
 from ..trace.tracer import RayTracer  # noqa: E402
 from .bench import BenchFailed, machine  # noqa: E402
 from .bench_traced import random_field, scene_of  # noqa: E402

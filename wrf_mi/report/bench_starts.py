@@ -9,9 +9,9 @@ from typing import Any
 
 from ..core import Record
 from ..fit.config import TrainConfig, with_settings
+from ..tasks.scores import summary
 from ..trace.furnished import traced_room
 from ..trace.laboratory import SCAN
-from .metrics import summary
 from .paired import agreed, paired_difference
 from .run_folder import read_run
 from .runs import train

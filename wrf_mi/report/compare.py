@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from ..core import InputError
 from ..core.files import write_atomically
 from ..fit.folder import CHECKPOINT
+from ..tasks import TASKS
 from . import figures
-from .metrics import TASKS
 from .run_folder import Run, read_runs
 from .traced import is_traced
 from .view import scene_view
@@ -55,7 +55,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     """Write the comparison of several runs.
 
     Runs on the same data set stand beside each other on the same test rows, and beside the reference method that needs
-    no model (`wrf_mi.report.metrics.TASKS`). Writes into ``out`` (made if need be): ``compare.csv``, one row per run
+    no model (`wrf_mi.tasks.TASKS`). Writes into ``out`` (made if need be): ``compare.csv``, one row per run
     and reference; for each data set ``<data set>-cdf.png``, ``<data set>-samples.png`` with the truth beside each
     method, ``<data set>-scene.png`` if one was traced and ``<data set>-training.png`` if one was trained; and
     ``index.html``, one file with all of it.
@@ -145,7 +145,7 @@ def _pictures(slug: str, runs: Sequence[Run]) -> list[Picture]:
         {name: run.reference_scores[key] for name, (run, key) in _references(runs).items()},
         task.label,
     )
-    samples = _spectra(runs) if runs[0].task == "spectrum" else _maps(runs)
+    samples = _spectra(runs) if TASKS[runs[0].task].image else _maps(runs)
     pictures: list[Picture] = [
         (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
         (f"{slug}-samples.png", *samples),

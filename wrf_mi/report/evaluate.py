@@ -15,7 +15,8 @@ from ..core import InputError, Record, Split
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
 from ..measure.observations import scorable
-from .metrics import TASKS, TaskScore, summary
+from ..tasks import TASKS, Task
+from ..tasks.scores import summary
 from .references import reference_predictions
 from .run_folder import METRICS, PREDICTIONS, reference_key
 
@@ -48,7 +49,7 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
     """Score a method on the test rows of a split, with the references that the data allow beside it.
 
     Args:
-        record: of any task in `wrf_mi.report.metrics.TASKS`.
+        record: of any task in `wrf_mi.tasks.TASKS`.
         split: references (`wrf_mi.report.references`) know all its training rows, validation rows included.
         predict: the method; finite wherever something was received.
 
@@ -107,7 +108,7 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     return metrics
 
 
-def _stored(task: TaskScore, arrays: dict[str, Any]) -> list[str]:
+def _stored(task: Task, arrays: dict[str, Any]) -> list[str]:
     """References that the arrays hold."""
     return [key for key in task.references if reference_key(key) in arrays]
 

@@ -32,9 +32,9 @@ from ..core.types import IntArray
 from ..fit.folder import CONFIG, SPLIT, check_new, load_rows, part_folders, stored_parts, versions
 from ..fit.trainer import peak_memory_mb
 from ..measure import make_splits, save_split
+from ..tasks.scores import inside_interval
 from ..trace import load_record
 from .evaluate import evaluate, pool, stored_metrics, write_results
-from .metrics import inside_interval
 
 VERSION, SECONDS = "run/format", "run/train_seconds"
 """Keys in the file of a fitted model that are not the model's."""

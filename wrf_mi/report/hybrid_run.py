@@ -24,9 +24,9 @@ from ..fit.folder import check_new, stated_config
 from ..hybrid.models import HybridModel, kind_of
 from ..measure import make_splits
 from ..measure.observations import check_observations
+from ..tasks import instrument_of
 from ..trace import load_record, open_scene
 from ..trace.solve import Prepared
-from ..trace.tracer import instrument_of
 from .fitted_run import FittedConfig, FittedRun, opened
 from .run_folder import stated_model
 
@@ -67,18 +67,18 @@ class HybridRun(FittedRun[HybridConfig, HybridModel]):
         Raises:
             InputError: a task that no hybrid serves, a scene that cannot be opened, or a material without one.
         """
-        if config.antennas and (config.scene is None or record.task == "csi"):
+        self._kind = kind_of(record, config.scene is not None)
+        if config.antennas and not (config.scene is not None and self._kind.uses_antennas):
             why = "without --scene nothing is traced" if config.scene is None else "its channels are of isotropic ones"
             raise InputError(f"{MODEL} on {record.name}: takes no antenna options: {why}")
         super().__init__(folder, config, config.antennas.of(record))
-        self._kind = kind_of(record, config.scene is not None)
         self._settings = with_settings(self._kind.settings(), config.settings)
         if config.n_train == 0 and config.scene is None:
             raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
         self._scene: Any | None = None
         if config.scene is not None:
             self._scene = open_scene(config.scene, instrument_of(record).carrier_hz, material=config.material)
-            if record.task == "csi" and any(one != ANTENNA for one in self._antennas()):
+            if not self._kind.uses_antennas and any(one != ANTENNA for one in self._antennas()):
                 logger.warning("%s: the hybrid for channels takes all antennas to be isotropic", record.name)
         elif config.material is not None:
             raise InputError("--material belongs to a bare mesh; give it with --scene")

@@ -25,8 +25,9 @@ from ..fit.folder import load_predictor, read_checkpoint
 from ..fit.trainer import final_params
 from ..hybrid.models import kind_of
 from ..measure import make_splits
+from ..tasks import instrument_of
 from ..trace import TraceOptions
-from ..trace.tracer import RayTracer, instrument_of
+from ..trace.tracer import RayTracer
 from .fit_key import fit_key, fit_once, scene_files
 from .hybrid_run import FITTED, open_hybrid, train_hybrid
 from .runs import Run, train

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .metrics import TASKS
+from ..tasks import TASKS
 
 Verdict = Literal["better", "worse", "tie"]
 
@@ -68,10 +68,10 @@ def paired_difference(
     independent of each other; where they are alike the true interval is wider than this one.
 
     Args:
-        scores_a: of one method, [..., rows], as `wrf_mi.report.metrics` computes them; NaN where nothing was received.
+        scores_a: of one method, [..., rows], as `wrf_mi.tasks.scores` computes them; NaN where nothing was received.
         scores_b: of the other on the same rows, the same shape. What is NaN in either is left out of both.
         seed: of the draws.
-        task: of the record; whether more is better stands in `wrf_mi.report.metrics.TASKS`.
+        task: of the record; whether more is better stands in `wrf_mi.tasks.TASKS`.
         resamples: number of draws.
 
     Raises:

@@ -13,8 +13,8 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from ..core.angles import FloatArray
+from ..tasks.scores import ssim
 from .methods import Method, Place, Ready
-from .metrics import ssim
 from .timing import Interval, bootstrap, interleaved, memory_mb, ratio, split, typical_split
 
 logger = logging.getLogger(__name__)

@@ -12,6 +12,7 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import write_atomically
+from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .run_folder import METRICS
 from .tx_file import HEADING
@@ -37,7 +38,7 @@ def check_prediction_file(out: Path, run: Path) -> None:
         task = stored_metrics(run).get("task")
         if task is None:
             raise InputError(f"{run}: no {METRICS}, so no finished run; finish it with train --resume")
-        if task != "rssi":
+        if TASKS[task].axes:
             remedy = f"give {out.with_suffix(NPZ).name}"
             raise InputError(f"{out}: {CSV} holds signal strengths (rssi), but {run} predicts {task}; {remedy}")
 

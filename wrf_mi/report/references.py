@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from ..baselines.idw import InverseDistance
 from ..core import InputError, Record
 from ..core.types import IntArray
-from .metrics import TASKS, UPLINK, TaskScore
+from ..tasks import TASKS, UPLINK, Task
 from .run_folder import Observations
 
 
 def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> dict[str, Observations]:
-    """The references that the data allow, see `wrf_mi.report.metrics.TaskScore.references`.
+    """The references that the data allow, see `wrf_mi.tasks.Task.references`.
 
     The blend needs positions, of training and of scored rows; the copy needs an uplink.
 
@@ -62,7 +62,7 @@ def copied_uplink(record: Record, rows: IntArray) -> NDArray[np.complex64]:
     return uplink[:, :, nearest].reshape(len(rows), *shape)
 
 
-def _blend(task: TaskScore, record: Record, known: IntArray, rows: IntArray) -> Observations:
+def _blend(task: Task, record: Record, known: IntArray, rows: IntArray) -> Observations:
     blends = []
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
         blend = InverseDistance(task.neighbours, softening_m=task.softening_m)

@@ -18,7 +18,7 @@ from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 
-from .metrics import TASKS, TaskScore
+from ..tasks import TASKS, Task
 
 METRICS = "metrics.json"
 PREDICTIONS = "predictions.npz"
@@ -41,7 +41,7 @@ class Run:
     Attributes:
         path: the run folder.
         name: for tables and legends.
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``; `wrf_mi.report.metrics.TASKS` says how it is scored.
+        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``; `wrf_mi.tasks.TASKS` says how it is scored.
         dataset: name or folder of the data set, "" where the run does not tell.
         metrics: content of ``metrics.json``.
         seed: of the configuration, or None where it states none.
@@ -51,7 +51,7 @@ class Run:
         prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients, or
             [n_rx, m, antennas, subcarriers].
         truth: the same shape; NaN where nothing was received.
-        references: by name (`wrf_mi.report.metrics.TaskScore.references`) what needs no model, the same shape.
+        references: by name (`wrf_mi.tasks.Task.references`) what needs no model, the same shape.
         validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
     """
 
@@ -180,7 +180,7 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     return metrics
 
 
-def _read_predictions(path: Path, task: TaskScore, references: Sequence[str]) -> dict[str, Any]:
+def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict[str, Any]:
     observed = ("prediction", "truth", *map(reference_key, references))
     try:
         with np.load(path, allow_pickle=False) as stored:

@@ -36,12 +36,11 @@ from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..measure.observations import check_observations
 from ..parallel import Scheduler, SerialScheduler, run_module
+from ..tasks import TASKS, instrument_of, require, task_of
 from ..trace import TraceOptions, load_record, open_scene
-from ..trace.tracer import instrument_of
 from .baseline_run import check_baseline
 from .evaluate import stored_metrics
 from .fit_key import content_digest, dataset_files, scene_files
-from .metrics import TASKS
 from .run_folder import CONFIG, METRICS
 from .traced import is_traced
 
@@ -205,8 +204,7 @@ def check_fit(
     record = _record(dataset)
     rows = _splits(dataset, split[0], split[1], None if split[2] == 0 and isinstance(settings, tuple) else split[2])
     if isinstance(settings, TrainConfig):
-        if record.task != "spectrum":
-            raise InputError(f"{record.name}: task {record.task!r}; learned fields are fitted to spectra")
+        require(record, "spectrum", why="learned fields are fitted to spectra")
         for one in rows:
             check_observations(record, one, complete=True)
             plan(settings, one, len(record.receivers))
@@ -218,7 +216,7 @@ def check_fit(
         with_settings(kind_of(record, scene is not None).settings(), settings)
         if split[2] == 0 and scene is None:
             raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
-    elif calibration is not None and record.task != "rssi":
+    elif calibration is not None and not task_of(record).in_decibel:
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     if scene is not None:
         _open_scene(scene, instrument_of(record).carrier_hz, material)

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..core import InputError
 from ..core.files import one_line, write_atomically
+from ..tasks import TASKS
 from .figures import save, score_cdf
-from .metrics import TASKS
 from .table_plan import PARTS, SHARES, Part, Row, plan
 
 
@@ -102,7 +102,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
     heads = [TASKS[task].label, *(_title(part) for part in columns), "paper, other data"]
     lines = ["| " + " | ".join(heads) + " |", "| " + " | ".join(["---"] * len(heads)) + " |"]
-    digits = 3 if task == "spectrum" else 2
+    digits = TASKS[task].digits
     for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
         cells = [f"{medians[method]:.{digits}f}" if method in medians else "" for medians in columns.values()]
         best = [method == min(medians, key=lambda name: sign * medians[name]) for medians in columns.values()]
@@ -131,7 +131,7 @@ def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str
 
     heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
     lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
-    digits = 3 if part.task == "spectrum" else 2
+    digits = TASKS[part.task].digits
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
         found = groups[share, method]
         each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}

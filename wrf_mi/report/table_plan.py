@@ -171,12 +171,12 @@ PARTS = (
     Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
-BLOCKED_SETTINGS: Mapping[str, tuple[str, ...]] = {
-    **{name: _set("steps=3000", "hold_out=0") for name in ("wrf-gs", "wrf-gs+")},
-    "dcgan": _set("training.steps=600"),
-    "nerf2": _set("training.steps=2000"),
+BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    **{("spectrum", name): _set("steps=3000", "hold_out=0") for name in ("wrf-gs", "wrf-gs+")},
+    ("spectrum", "dcgan"): _set("training.steps=600"),
+    ("spectrum", "nerf2"): _set("training.steps=2000"),
 }
-"""Of the five folds of a blocked split, which are fitted in turn: ten minutes for all of them."""
+"""Of the five folds of a blocked split, by task and method: they are fitted in turn, ten minutes for all of them."""
 
 
 @dataclass(frozen=True)
@@ -227,8 +227,8 @@ class Row:
                 words.append(word)
         if self.quick:
             words += self.entry.quick
-        elif self.part.split == "blocked" and self.part.task == "spectrum":
-            words += BLOCKED_SETTINGS.get(self.method, ())
+        elif self.part.split == "blocked":
+            words += BLOCKED_SETTINGS.get((self.part.task, self.method), ())
         few = [] if self.share == 1 else ["--n-train", str(self.share)]
         return ["train", self.part.dataset, *words, "--split", self.part.split, "--seed", str(self.seed), *few]
 

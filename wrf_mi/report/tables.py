@@ -30,13 +30,13 @@ from ..fit.folder import package_versions, versions
 from ..measure.registry import locate
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..scene.make import make_scene
+from ..tasks.scores import summary
 from ..trace import load_record
 from ..trace.furnished import traced_room
 from ..trace.walked import MEASURED
 from .bench import BenchFailed, machine, threads
 from .bench_hybrid_csi import SCANNED, scanned_scene
 from .fit_key import content_digest, dataset_files, fit_key, scene_files
-from .metrics import summary
 from .run_folder import CONFIG, METRICS, read_run
 from .table_pages import read_rows, write_tables
 from .table_plan import NAMED, Part, Row, available, plan

@@ -32,6 +32,8 @@ from ..fit.trainer import peak_memory_mb
 from ..measure import make_splits, save_split
 from ..measure.observations import check_observations
 from ..parallel import Scheduler, row_parts
+from ..receive.instruments import Instrument
+from ..tasks import instrument_of, task_of
 from ..trace import TraceOptions, TraceResult, load_record, load_trace, save_trace
 from ..trace.calibrate import CalibrationOptions, calibrate
 from ..trace.calibration import Calibration, calibrated_rssi, load_calibration, save_calibration
@@ -40,7 +42,7 @@ from ..trace.polarization import warn_of_cross_polarization
 from ..trace.result import join_traces
 from ..trace.solve import TARGETS_AT_ONCE
 from ..trace.target import CHOSEN_KINDS, choose_options
-from ..trace.tracer import Instrument, RayTracer, instrument_of
+from ..trace.tracer import RayTracer
 from .evaluate import evaluate, milliseconds_per_sample, pool, stored_metrics, write_results
 from .run_folder import stated_model
 
@@ -166,7 +168,8 @@ def trace_run(
     splits = make_splits(record, split, seed, n_train)
     if calibration is not None and calibration not in CALIBRATIONS:
         raise InputError(f"calibration {calibration!r}: unknown; choose from {', '.join(CALIBRATIONS)}")
-    if calibration is not None and record.task != "rssi":
+    task = task_of(record)
+    if calibration is not None and not task.in_decibel:
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     for rows in splits:
         check_observations(record, rows)
@@ -176,7 +179,7 @@ def trace_run(
     choice = None
     if target_error_db is not None:
         here = record.tx_pos_m, record.receivers
-        spectra = tracer.instrument.observe if record.task == "spectrum" else None
+        spectra = tracer.instrument.observe if task.image else None
         choice = choose_options(tracer.scene, *here, target_error_db, tracer.options, kinds, spectra, record.tx_antenna)
         config = replace(config, options=choice.options)
         tracer = RayTracer(scene, instrument_of(record), config.options, material)
@@ -288,7 +291,7 @@ class TracedRun:
         self.names = tuple(receiver.name for receiver in instrument.receivers)
         self._calibration: Calibration | None = None
         self._offsets: Callable[[FloatArray], FloatArray] | None = None
-        if record.task != "rssi":
+        if not task_of(record).in_decibel:
             return
         if not (folder / SPLIT).exists():
             raise InputError(f"{folder}: offsets for each block; trace with --split official to predict")
@@ -355,7 +358,7 @@ def _score(
             calibration = load_calibration(place / CALIBRATION)
             values = calibrated_rssi(calibration, traced, tracer.scene, record.tx_heading_rad)
             values = _with_floor(values, record, rows)
-        elif record.task == "rssi":
+        elif task_of(record).in_decibel:
             known = rows.all_train
             values = fit_offsets(observed[:, known], record.observation[:, known])(observed)
         parts.append(evaluate(record, rows, partial(_reported, values)))

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
 
 from ..core import InputError, Record
+from ..receive.instruments import Instrument
 from . import csi, rssi, spectrum
 from .task import UPLINK, Task
 
@@ -60,6 +61,15 @@ def task_of(record: Record) -> Task:
     return known_task(record.task, record.source or record.name)
 
 
+def instrument_of(record: Record) -> Instrument:
+    """The instrument behind a record, for ray tracing.
+
+    Raises:
+        InputError: a name that no task bears, or data that do not tell positions, carrier or array.
+    """
+    return task_of(record).instrument(record)
+
+
 def known_task(name: str, place: str) -> Task:
     """The task of a name; ``place`` is where that stands, for the message.
 
@@ -81,4 +91,4 @@ def require(record: Record, *names: str, why: str) -> None:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = ["ENTRY_POINTS", "TASKS", "UPLINK", "Task", "known_task", "register", "require", "task_of"]
+__all__ = ["ENTRY_POINTS", "TASKS", "UPLINK", "Task", "instrument_of", "known_task", "register", "require", "task_of"]

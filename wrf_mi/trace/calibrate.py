@@ -91,7 +91,7 @@ def calibrate(
     Raises:
         InputError: not signal strengths, paths of other positions, or a receiver without a row to fit to.
     """
-    if record.task != "rssi":
+    if record.observation.ndim != 2:
         raise InputError(f"{record.name}: holds {record.task}; calibration needs signal strengths (rssi)")
     if trace.paths.n_tx != len(record) or trace.paths.n_rx != len(record.receivers):
         raise InputError(f"{record.name}: paths of {trace.paths.n_tx} positions for {len(record)} rows; trace it anew")
