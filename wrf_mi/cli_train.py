@@ -54,9 +54,10 @@ def _baseline(a: Arguments) -> str | None:
     if model not in METHODS:
         return None
     if model in PAPER:
-        from .measure.registry import holds_spectra
+        from .measure.registry import stated_task
 
-        return None if not a.dataset or holds_spectra(a.dataset) else model
+        # What is neither a path nor known is refused where it is read.
+        return model if a.dataset and stated_task(a.dataset) not in (None, "spectrum") else None
     return model
 
 

@@ -108,6 +108,16 @@ def peak_memory_mb() -> float:
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 
 
+def require_spectra(record: Record) -> None:
+    """Refuse other records than spectra.
+
+    Raises:
+        InputError: the record holds another task's observations.
+    """
+    what = "learned fields are fitted to spectra"
+    require(record, "spectrum", why=f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
+
+
 def check_rows(split: Split, record: Record, source: str) -> None:
     """Refuse a split with rows that the record has not; ``source`` says where the split comes from.
 
@@ -148,10 +158,7 @@ class Trainer:
         state: FitState | None = None,
         loss: Loss | None = None,
     ) -> None:
-        why = (
-            "learned fields are fitted to spectra: choose a data set of spectra, or trace this one with `wrf-mi trace`"
-        )
-        require(record, "spectrum", why=why)
+        require_spectra(record)
         check_rows(split, record, f"split {split.name}")
         check_observations(record, split, complete=True)
         config = config.resolved(record.tx_pos_m[split.all_train])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -13,13 +12,8 @@ import pooch
 
 from ..core import InputError, Record
 from ..core.arrays import planar_array
-from .argos import SUFFIXES, read_argos
-from .ble_folder import ANCHORS, read_ble_folder
-from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
-from .nerf2_ble import POWERS, read_nerf2_ble
-from .nerf2_csi import CHANNELS, STATION, read_nerf2_csi
-from .newrf import read_newrf
-from .spectrum_folder import GATEWAYS, parse_folds, read_spectrum_folder
+from .layouts import is_data, layout_of
+from .spectrum_folder import parse_folds
 
 DATA_VARIABLE = "WRF_MI_DATA"
 """Environment variable: a folder that holds data sets as ``<name>/``; it takes the place of the user's cache."""
@@ -205,16 +199,14 @@ def datasets() -> list[DataSetStatus]:
 def load(name_or_folder: str | Path) -> Record:
     """Read a data set: a folder, a room's ``.npz`` file, a capture in HDF5, or a known one by its name.
 
-    A path to a folder is taken first, then ``<name>/`` below ``WRF_MI_DATA``, then in the user's cache. A folder with
-    ``gateway_rssi.csv`` or ``gateway_position.yml`` is read as `read_nerf2_ble` does, one with ``csidata.npy`` or
-    ``base-station.yml`` as `read_nerf2_csi`, one with ``anchors.csv`` as `read_ble_folder`, one with an ``.npz`` file
-    alone as `read_newrf`, one with a capture as `read_argos`, any other as `read_spectrum_folder`.
+    A path to a folder is taken first, then ``<name>/`` below ``WRF_MI_DATA``, then in the user's cache. Its files tell
+    the layout (`wrf_mi.measure.layouts`).
 
     Raises:
         InputError: not there (the line says how to get it), or what the reader finds wrong.
     """
     path = Path(name_or_folder)
-    if path.is_dir() or (path.is_file() and path.suffix in (".npz", *SUFFIXES)):
+    if is_data(path):
         return _read(path)
     if isinstance(name_or_folder, Path) or path.name != name_or_folder:
         raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
@@ -228,41 +220,16 @@ def load(name_or_folder: str | Path) -> Record:
     return _complete(dataset, _read(folder / (dataset.file or ""), dataset.name))
 
 
-LAYOUTS: tuple[tuple[tuple[str, ...], Callable[[Path, str | None], Record]], ...] = (
-    ((POWERS, BLE_GATEWAYS), read_nerf2_ble),
-    ((CHANNELS, STATION), read_nerf2_csi),
-    ((ANCHORS,), read_ble_folder),
-)
-"""Files of which a folder has one at least, and what reads it: so that a missing one is named."""
-
-
-def holds_spectra(name_or_folder: str | Path) -> bool:
-    """Whether a data set is one of spectra, told without reading it: of known ones by name, else by the files there.
-
-    What is neither a path nor known counts as such: to read it will say what is wrong.
-    """
+def stated_task(name_or_folder: str | Path) -> str | None:
+    """The task of a data set, told without reading it: by its layout, or of known ones by name; None: not known."""
     path = Path(name_or_folder)
     if path.exists():
-        return _reader(path) is read_spectrum_folder
-    return all(dataset.task == "spectrum" for dataset in KNOWN if dataset.name == str(name_or_folder))
+        return layout_of(path).task
+    return next((dataset.task for dataset in KNOWN if dataset.name == str(name_or_folder)), None)
 
 
 def _read(path: Path, name: str | None = None) -> Record:
-    return _reader(path)(path, name)
-
-
-def _reader(path: Path) -> Callable[[Path, str | None], Record]:
-    if path.is_file():
-        return read_argos if path.suffix in SUFFIXES else read_newrf
-    if not (path / GATEWAYS).exists():
-        for files_of, read in LAYOUTS:
-            if any((path / file).exists() for file in files_of):
-                return read
-        if any(path.glob("*.npz")):
-            return read_newrf
-        if any(one.suffix in SUFFIXES for one in path.iterdir()):
-            return read_argos
-    return read_spectrum_folder
+    return layout_of(path).read(path, name)
 
 
 def _complete(dataset: DataSet, record: Record) -> Record:

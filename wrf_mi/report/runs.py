@@ -30,7 +30,7 @@ from ..fit.folder import (
     write_config,
 )
 from ..fit.predictor import Predictor
-from ..fit.trainer import Progress, Trainer, check_rows, peak_memory_mb
+from ..fit.trainer import Progress, Trainer, check_rows, peak_memory_mb, require_spectra
 from ..measure import make_splits
 from ..measure.observations import check_observations
 from ..parallel import Scheduler, row_parts
@@ -126,8 +126,8 @@ def train(
         splits, name = make_splits(record, split, settings.seed, n_train), split
     for rows in splits:
         check_rows(rows, record, f"split {rows.name}")
-        if record.task == "spectrum":  # else the task is what is wrong, as `Trainer` says
-            check_observations(record, rows, complete=True)
+        require_spectra(record)
+        check_observations(record, rows, complete=True)
     settings = settings.resolved(record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
     run = RunConfig(source, name, n_train, settings)
     if len(splits) == 1:

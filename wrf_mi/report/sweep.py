@@ -32,11 +32,12 @@ from ..fit.config import TrainConfig, with_settings
 from ..fit.folder import package_versions
 from ..fit.schedule import plan
 from ..fit.start import initial_gaussians
+from ..fit.trainer import require_spectra
 from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..measure.observations import check_observations
 from ..parallel import Scheduler, SerialScheduler, run_module
-from ..tasks import TASKS, instrument_of, require, task_of
+from ..tasks import TASKS, instrument_of, task_of
 from ..trace import TraceOptions, load_record, open_scene
 from .baseline_run import check_baseline
 from .evaluate import stored_metrics
@@ -204,7 +205,7 @@ def check_fit(
     record = _record(dataset)
     rows = _splits(dataset, split[0], split[1], None if split[2] == 0 and isinstance(settings, tuple) else split[2])
     if isinstance(settings, TrainConfig):
-        require(record, "spectrum", why="learned fields are fitted to spectra")
+        require_spectra(record)
         for one in rows:
             check_observations(record, one, complete=True)
             plan(settings, one, len(record.receivers))
