@@ -24,9 +24,8 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Prediction
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.hybrid.estimate import Estimate
 
 Trend = Callable[[FloatArray], FloatArray]
 """From positions [n, 3] to the columns [n, p] that the trend is a sum of."""
@@ -246,7 +245,7 @@ class Kriging:
         """
         return self.mean.predict(tx_pos, tx_heading_rad)
 
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
 
         The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
@@ -261,7 +260,7 @@ class Kriging:
             gap = columns - half.T @ self._whitened
             share += (gap * np.linalg.solve(self._whitened.T @ self._whitened, gap.T).T).sum(axis=1)
         std = np.sqrt(np.maximum(share, 0))[:, None] * np.sqrt(self._variance)
-        return Estimate(mean, std.reshape(mean.shape))
+        return Prediction(mean, std.reshape(mean.shape))
 
     def _covariance(self, rows: slice | NDArray[np.intp], lengths: FloatArray, noise: float) -> FloatArray:
         circle = None if self._circle is None else self._circle[rows]

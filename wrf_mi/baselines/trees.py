@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.core import InputError, Prediction, Receiver, Record, Split
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.hybrid.estimate import Estimate
 
 from .by_receiver import ByReceiver, fit_each, load_each
 from .method import Listen, Method
@@ -80,7 +79,7 @@ class Trees:
         """
         return self._model.predict(self._asked(tx_pos, tx_heading_rad)).astype(self._type)
 
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
 
         The variance within leaves and that between trees add up (law of total variance).
@@ -92,7 +91,7 @@ class Trees:
             value = tree.tree_.value[leaf, 0, 0]
             mean += value / self.trees
             square += (tree.tree_.impurity[leaf] + value**2) / self.trees
-        return Estimate(mean.astype(self._type), np.sqrt(np.maximum(square - mean**2, 0)))
+        return Prediction(mean.astype(self._type), np.sqrt(np.maximum(square - mean**2, 0)))
 
     def grown(self) -> GrownTrees:
         """The trees without what grew them."""

@@ -4,6 +4,7 @@ from .angles import azimuth_elevation, pixel_directions, rotation_matrix, unit_v
 from .antenna import Antenna, AntennaOptions
 from .errors import BackendError, InputError
 from .paths import Paths, load_paths, save_paths
+from .prediction import Prediction
 from .receivers import receiver_arrays, stored_receivers
 from .types import Receiver, Record, Split
 
@@ -13,6 +14,7 @@ __all__ = [
     "BackendError",
     "InputError",
     "Paths",
+    "Prediction",
     "Receiver",
     "Record",
     "Split",

@@ -17,7 +17,7 @@ from ..core.receivers import receiver_index
 from ..field.gaussians import Gaussians
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
-from .step import Field, Params, Prediction, device_pose
+from .step import CompiledPredictor, Field, Params, device_pose
 from .still import StillField, stands_still
 
 
@@ -60,7 +60,7 @@ class Predictor:
         """Use other parameters (Dr.Jit tensors) from now on."""
         if params["position"].shape[1] != self._count:
             # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
-            self._predict, self._count = Prediction(self._field, self._skip), params["position"].shape[1]
+            self._predict, self._count = CompiledPredictor(self._field, self._skip), params["position"].shape[1]
         self._params, self._still = params, None
         dr.eval(self._params)
 

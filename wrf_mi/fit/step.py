@@ -195,7 +195,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
     return step
 
 
-class Prediction:
+class CompiledPredictor:
     """A prediction ``predict(params, tx_pos, pose, plane) -> greys``, without gradients.
 
     It is recorded, but for fields of so many Gaussians that networks see them in parts (`gaussians_in_parts`): there,

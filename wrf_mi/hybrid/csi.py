@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
+from ..core import InputError, Prediction, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
@@ -34,7 +34,6 @@ from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Model
 from .csi_rest import Diffuse, fit_diffuse
 from .csi_visible import Visibility
-from .estimate import Estimate
 from .walls import Walls, no_walls, walls_of
 
 Complex = NDArray[np.complex128]
@@ -75,7 +74,7 @@ class CsiHybrid:
         self.receivers, self.model, self.visibility, self.rest = receivers, model, visibility, rest
         self.sharpness, self.covariance, self._facts = sharpness, covariance, dict(facts)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Channels [m, subcarriers] from transmitters [m, 3] to one receiver; antennas are isotropic: no heading.
 
         The receiver is given by its name, or by its number from 0.
@@ -89,7 +88,7 @@ class CsiHybrid:
         index = receiver_index(self.receivers, receiver)
         first = range(0, max(len(position), 1), AT_ONCE)
         mean, std = zip(*(self._part(position[begin : begin + AT_ONCE], index) for begin in first), strict=True)
-        return Estimate(np.concatenate(mean), np.concatenate(std))
+        return Prediction(np.concatenate(mean), np.concatenate(std))
 
     def _part(self, position: FloatArray, receiver: int) -> tuple[Complex, FloatArray]:
         rows = Rows(np.zeros((len(position), 0), complex), position, np.full(len(position), receiver))

@@ -24,14 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 
-from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
+from ..core import InputError, Prediction, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..receive.lags import Lags
 from ..receive.retrieve import retrieve_signals, unscale
 from ..tasks import require
-from .estimate import Estimate
 from .expected import SpectrumReport
 from .nearby import NearbySpectra, fit_nearby, line_of_sight
 from .signal_kernels import Covariances, departures
@@ -132,7 +131,7 @@ class MeasuredSpectrumHybrid:
 
     def predict(
         self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
-    ) -> Estimate:
+    ) -> Prediction:
         """Expected spectra at positions [q, 3], metres, and their standard deviation, [q, height, width].
 
         Args:
@@ -156,7 +155,7 @@ class MeasuredSpectrumHybrid:
             mean[part], std[part] = _mixed(
                 posterior, report, side.nearby.predict(positions[part]), side.nearby.std(positions[part]), side
             )
-        return Estimate(np.clip(mean, 0, 1), (side.spread * std).astype(float))
+        return Prediction(np.clip(mean, 0, 1), (side.spread * std).astype(float))
 
     def summary(self) -> dict[str, Any]:
         """What was fitted, of the first receiver."""

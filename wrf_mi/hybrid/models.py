@@ -8,9 +8,8 @@ from typing import Any, Protocol
 
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import InputError, Prediction, Receiver, Record
 from ..core.types import IntArray
-from .estimate import Estimate
 
 Listen = Callable[[str, float], None]
 
@@ -28,7 +27,7 @@ class HybridModel(Protocol):
         """Whose observations it predicts."""
         ...
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """What a receiver observes of transmitters at [q, 3], metres, turned by [q] rad, and how sure that is.
 
         The receiver is given by its name, or by its number from 0.

@@ -19,12 +19,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver, Record, receiver_arrays, stored_receivers
+from ..core import InputError, Prediction, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..tasks import require
-from .estimate import Estimate
 from .rssi_fit import Base, Field, Fit, Knobs, Measured, shift_of, stopper, widening
 from .rssi_map import PowerMap, trace_map
 from .rssi_terms import Places, Priors, Stops
@@ -161,7 +160,7 @@ class RssiHybrid:
         self.receivers, self._field, self._stops = receivers, field, stops
         self._shift_db, self._widen, self._facts = shift_db, widen, dict(facts)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Signal strengths in dBm, [m], with the standard deviation of a single report.
 
         Args:
@@ -193,7 +192,7 @@ class RssiHybrid:
             means.append(np.concatenate([part[0] for part in parts]) if parts else np.zeros(0))
             variances.append(np.concatenate([part[1] for part in parts]) if parts else np.zeros(0))
         variance = np.mean(variances, axis=0) * self._widen[index] ** 2 + np.var(means, axis=0)
-        return Estimate(np.mean(means, axis=0) + self._shift_db, np.sqrt(variance))
+        return Prediction(np.mean(means, axis=0) + self._shift_db, np.sqrt(variance))
 
     def _part(
         self, position: FloatArray, heading: FloatArray | None, receiver: int, first: int

@@ -19,12 +19,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import Antenna, InputError, Receiver, Record, receiver_arrays, stored_receivers
+from ..core import Antenna, InputError, Prediction, Receiver, Record, receiver_arrays, stored_receivers
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..tasks import require
-from .estimate import Estimate
 from .spectrum_few import FEW_ROWS, fitted_to_few
 from .spectrum_fit import Constants, Maps
 from .spectrum_gains import Slabs
@@ -107,7 +106,7 @@ class SpectrumHybrid:
         """That report."""
         return tuple(model.instrument.receiver for model in self.models)
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Estimate:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Spectra of transmitters [m, 3] (metres) at one receiver, grey in 0..1: [m, height, width].
 
         The receiver is given by its name, or by its number from 0.
@@ -130,7 +129,7 @@ class SpectrumHybrid:
             mean[own] = model.spectra(positions[own])
             if model.error is None:
                 error[own] = mean[own].std(axis=(1, 2), keepdims=True)
-        return Estimate(mean, np.broadcast_to(error, mean.shape))
+        return Prediction(mean, np.broadcast_to(error, mean.shape))
 
     def arrays(self) -> Arrays:
         """All that is needed to predict again, see `from_arrays`; the mesh's triangles are among it."""

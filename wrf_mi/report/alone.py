@@ -155,7 +155,7 @@ def _channels(job: Job, work: Path) -> Arrays:
     room = room_file(job.dataset.removeprefix("newrf-"))
     model = fit_csi(record, train[: job.n_train or None], scanned_scene(room, work.parent, 1), CsiSettings(), 0)
     found = model.predict(record.tx_pos_m[test], 0)
-    return {**model.arrays(), "mean": found.mean, "std": found.std}
+    return {**model.arrays(), "mean": found.mean, "std": found.stated_std}
 
 
 def _traced(job: Job, work: Path) -> Arrays:

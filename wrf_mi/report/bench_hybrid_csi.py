@@ -86,7 +86,7 @@ def channels(room: str | Path, seeds: Sequence[int] = SEEDS, learned_steps: int 
             model.predict(position, 0)
             alone.append(time.perf_counter() - once)
         predictions["hybrid"] = estimate.mean
-        within = np.abs(estimate.mean - truth) < 2 * estimate.std
+        within = np.abs(estimate.mean - truth) < 2 * estimate.stated_std
         facts.append(
             {
                 "fit_seconds": fitted - start,

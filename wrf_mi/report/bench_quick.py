@@ -32,7 +32,7 @@ from ..core.arrays import planar_array  # noqa: E402
 from ..core.files import one_line, write_atomically  # noqa: E402
 from ..fit.config import TrainConfig, with_settings  # noqa: E402
 from ..fit.folder import versions  # noqa: E402
-from ..fit.step import Prediction, device_pose  # noqa: E402
+from ..fit.step import CompiledPredictor, device_pose  # noqa: E402
 from ..fit.trainer import Trainer  # noqa: E402
 from ..measure import make_splits  # noqa: E402
 from ..receive.instruments import SpectrumInstrument  # noqa: E402
@@ -133,7 +133,7 @@ def _batch() -> tuple[Call, Call]:
     field, pose = trainer.field, device_pose(RECEIVER)
     plane, positions = perception_plane(HEIGHT, WIDTH, mi.Float), transmitter_path(count)
     positions = positions[rng.permutation(count)]
-    together, alone = Prediction(field), Prediction(field)
+    together, alone = CompiledPredictor(field), CompiledPredictor(field)
     dr.eval(params)
 
     def ours() -> Any:

@@ -260,4 +260,4 @@ def predict_with(
     """The same with a run's model from `open_hybrid`."""
     found = [model.predict(tx_pos_m, r, tx_heading_rad) for r in range(len(model.receivers))]
     names = tuple(receiver.name for receiver in model.receivers)
-    return np.stack([e.mean for e in found]), np.stack([e.std for e in found]), names
+    return np.stack([e.mean for e in found]), np.stack([e.stated_std for e in found]), names
