@@ -376,3 +376,12 @@ def test_several_carriers_are_not_written(tmp_path: Path):
     with pytest.raises(InputError, match=r"2 carriers, and gateway_info\.yml states one; write a folder for each"):
         write_spectrum_folder(tmp_path / "a", record)
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("name", ["array", "tx_antenna"])
+def test_names_that_mean_something_else_are_not_written(tmp_path: Path, name: str):
+    record = make_record(4)
+    named = replace(record, receivers=(replace(record.receivers[0], name=name),))
+    with pytest.raises(InputError, match=f"a receiver is named '{name}'"):
+        write_spectrum_folder(tmp_path / "a", named)
+    assert not (tmp_path / "a").exists()

@@ -19,6 +19,7 @@ from .cli_train import print_json, progress_bar, show_metrics, sweep_command, tr
 from .core import BackendError, InputError
 from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from .core.files import os_failure
+from .graph.settings import RECEIVERS
 
 Arguments = argparse.Namespace
 
@@ -287,7 +288,10 @@ def _add_training(sub: Any) -> None:
     )
     models = list(dict.fromkeys(("wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", *METHODS)))
     sub.add_argument("--model", choices=models, help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
-    sub.add_argument("--scene", metavar="SCENE", help="for hybrid, or for ray-tracing, which is then the command trace")
+    text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for hybrid, or alone for ray-tracing"
+    sub.add_argument("--scene", metavar="SCENE", help=text)
+    text = "of a field of spectra: pixel (magnitude at each direction) or array (element signals); default: by --scene"
+    sub.add_argument("--receiver", choices=RECEIVERS, help=text)
     _add_tracing(sub)
     sub.add_argument(
         "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"

@@ -26,7 +26,19 @@ def train_command(a: Arguments) -> int:
         print(_settings_text())
         return 0
     if a.resume:
-        given = (a.dataset, a.out, a.model, a.split, a.n_train, a.seed, a.preset, a.scene, a.material, *_traced(a))
+        given = (
+            a.dataset,
+            a.out,
+            a.model,
+            a.split,
+            a.n_train,
+            a.seed,
+            a.preset,
+            a.scene,
+            a.material,
+            a.receiver,
+            *_traced(a),
+        )
         if any(value is not None for value in given) or _antennas(a) or a.set or a.deterministic:
             raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
         return _resume(a)
@@ -42,6 +54,11 @@ def train_command(a: Arguments) -> int:
 
 def _traced(a: Arguments) -> tuple[Any, ...]:
     return a.paths, a.depth, a.reflections, a.rays, a.calibrate
+
+
+def _refuse_receiver(a: Arguments, model: str) -> None:
+    if a.receiver is not None:
+        raise InputError(f"--receiver belongs to fields of spectra (wrf-gs, wrf-gs+, factorised), not to {model}")
 
 
 def _antennas(a: Arguments) -> AntennaOptions:
@@ -64,20 +81,24 @@ def _baseline(a: Arguments) -> str | None:
 def _check_options(a: Arguments) -> None:
     """Refuse options of ``train`` that do not belong together."""
     if a.model == "ray-tracing":
+        _refuse_receiver(a, a.model)
         if not (a.scene and a.dataset and a.out) or a.set or a.preset:
             raise InputError("train --model ray-tracing needs DATASET, --scene SCENE and --out RUN, and no settings")
         return
     if a.model == "hybrid":
+        _refuse_receiver(a, a.model)
         if any(value is not None for value in (*_traced(a), a.preset)):
             other = "--scene, --material, --split, --n-train, --seed and --set, and antenna options"
             raise InputError(f"train --model hybrid takes {other}")
     elif (baseline := _baseline(a)) is not None:
+        _refuse_receiver(a, baseline)
         if any(value is not None for value in (a.scene, a.material, a.preset, *_traced(a))) or _antennas(a):
             other = "a scene belongs to --model ray-tracing or hybrid, a preset to fields of spectra"
             raise InputError(f"{baseline} on {a.dataset}: takes --split, --n-train, --seed and --set; {other}")
-    elif any(value is not None for value in (a.scene, a.material, *_traced(a))) or _antennas(a):
-        which = "--model ray-tracing (--scene and antennas also to hybrid)"
-        raise InputError(f"--scene and what is traced in it belong to {which}")
+    elif any(value is not None for value in _traced(a)):
+        raise InputError("--paths, --depth, --reflections, --rays and --calibrate belong to --model ray-tracing")
+    elif a.scene is None and (a.material is not None or _antennas(a)):
+        raise InputError("--material and antenna options belong to a scene that is traced; give --scene")
     if not a.dataset or not a.out:
         raise InputError("train needs DATASET and --out RUN (or --resume RUN)")
 
@@ -118,7 +139,9 @@ def _train_field(a: Arguments) -> int:
     from .report.runs import train
 
     with progress_bar() as watch:
-        run = train(a.dataset, a.out, _field_config(a), _split(a), a.n_train, watch.listen, watch.stop)
+        place = {"scene": a.scene, "material": a.material, "antennas": _antennas(a)}
+        asked = a.dataset, a.out, _field_config(a), _split(a), a.n_train
+        run = train(*asked, watch.listen, watch.stop, **place)
     return show_metrics(run.metrics, Path(a.out), a.json)
 
 
@@ -126,7 +149,8 @@ def _field_config(a: Arguments) -> Any:
     from .fit.config import PRESETS, TrainConfig, with_settings
 
     config: Any = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
-    own = [f"{key}={value}" for key, value in (("model", a.model), ("seed", a.seed)) if value is not None]
+    named = (("model", a.model), ("seed", a.seed), ("receiver", a.receiver))
+    own = [f"{key}={value}" for key, value in named if value is not None]
     return with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..field.encoding import telling_scale
+from ..graph.settings import RECEIVERS, TracedConfig
 from ..splat.skip import Skip
 
 
@@ -33,7 +34,7 @@ class InitialConfig:
         nearest_m: smallest distance of a random Gaussian from its receiver, metres.
         farthest_m: largest distance, metres.
         opacity: alpha at a footprint's centre.
-        signal: deviation of the starting signals.
+        signal: deviation of the starting signals; 0: `SIGNAL_ALONE`, or `SIGNAL_WITH_SCENE` together with a scene.
     """
 
     gaussians: int = 270
@@ -44,7 +45,7 @@ class InitialConfig:
     nearest_m: float = 1.0
     farthest_m: float = 8.0
     opacity: float = 0.4
-    signal: float = 0.3
+    signal: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,8 @@ class DensityConfig:
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
 OTHERWISE = 15000
+SIGNAL_ALONE, SIGNAL_WITH_SCENE = 0.3, 0.02
+"""Deviation of the starting signals. Together with a scene the Gaussians begin by adding next to nothing to the paths."""
 LEAST_TX_SCALE_M = 1.0
 """Metres per unit of transmitters within two metres; doubled for wider ones as often as needed."""
 
@@ -164,7 +167,11 @@ class TrainConfig:
         checkpoint_every: steps between two checkpoints.
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
+        receiver: how the field becomes a spectrum: ``"pixel"``: its magnitude at each direction (the papers'),
+            ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does; "": array
+            with a scene, else pixel.
         skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
+        traced: paths that are trained together with the Gaussians, where a scene is given.
     """
 
     model: str = "wrf-gs+"
@@ -182,17 +189,23 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    receiver: str = ""
     skip: Skip = field(default_factory=Skip)
+    traced: TracedConfig = field(default_factory=TracedConfig)
 
-    def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
-        """The same with the number of steps and the scale of transmitters that are meant.
+    def resolved(self, tx_pos_m: ArrayLike, with_scene: bool = False) -> TrainConfig:
+        """The same with the number of steps, the scale of transmitters and the starting signals that are meant.
 
         Args:
             tx_pos_m: training transmitters [n, 3], metres.
+            with_scene: whether paths of a scene are trained together with the Gaussians.
         """
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
         scale = self.encoding.tx_scale_m or telling_scale(tx_pos_m, LEAST_TX_SCALE_M)
-        return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
+        signal = self.initial.signal or (SIGNAL_WITH_SCENE if with_scene else SIGNAL_ALONE)
+        initial = dataclasses.replace(self.initial, signal=signal)
+        encoding = dataclasses.replace(self.encoding, tx_scale_m=scale)
+        return dataclasses.replace(self, steps=steps, initial=initial, encoding=encoding)
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
@@ -203,6 +216,8 @@ class TrainConfig:
             good, words = _RANGES.get(name, _NOT_NEGATIVE)
             if not math.isfinite(value) or not good(value):
                 raise InputError(f"setting {name}: {value} is out of range, choose {words}")
+        if self.receiver not in ("", *RECEIVERS):
+            raise InputError(f"setting receiver: {self.receiver!r}; choose from {', '.join(RECEIVERS)}")
         sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
         if len(sources) > 1:
             raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")

@@ -19,7 +19,7 @@ import math
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,13 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..backend import init
-from ..core import InputError, Record, Split, receiver_arrays, stored_receivers
+from ..core import Antenna, AntennaOptions, InputError, Record, Split, receiver_arrays, stored_receivers
+from ..core.antenna import AS_STATED
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 from ..core.receivers import KEYS as RECEIVER_KEYS
+from ..graph.graph import Graph
 from ..measure import load_split, save_split
+from ..tasks import instrument_of
 from .config import TrainConfig, from_dict, to_dict
 from .packed import pack_params, unpack_params
 from .predictor import Predictor
@@ -56,12 +59,39 @@ class RunConfig:
         split: its name; one fold has its own, e.g. ``blocked:2``.
         n_train: number or fraction of training rows that was asked for; None: all.
         settings: of the fit.
+        scene: name, scene folder, Mitsuba XML or mesh whose paths were trained together with the Gaussians; None: none.
+        material: of a bare mesh, or None.
+        antennas: stated in place of the data's.
     """
 
     dataset: str
     split: str
     n_train: float | None
     settings: TrainConfig
+    scene: str | None = None
+    material: str | None = None
+    antennas: AntennaOptions = AS_STATED
+
+    def open_scene(self, record: Record) -> Any | None:
+        """The scene at the record's carrier, or None.
+
+        Raises:
+            InputError: it cannot be opened, or the data do not tell carrier or array.
+        """
+        if self.scene is None:
+            return None
+        return open_scene_at(self.scene, instrument_of(record).carrier_hz, self.material)
+
+
+def open_scene_at(scene: str, frequency_hz: float, material: str | None) -> Any:
+    """A scene for the tracer, which is imported now.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
+    from ..trace import open_scene
+
+    return open_scene(scene, frequency_hz, material=material)
 
 
 def package_versions() -> dict[str, str]:
@@ -92,6 +122,9 @@ def write_config(folder: Path, run: RunConfig) -> None:
         "n_train": run.n_train,
         "seed": run.settings.seed,
         "versions": versions(),
+        "scene": run.scene,
+        "material": run.material,
+        "antennas": asdict(run.antennas),
         "settings": to_dict(run.settings),
     }
     write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
@@ -104,8 +137,10 @@ def read_config(folder: Path) -> RunConfig:
         InputError: missing, not YAML, or settings that this version does not know.
     """
     with stated_config(folder) as content:
-        names = (content["dataset"], content["split"], content.get("n_train"), content["settings"])
-    return RunConfig(names[0], names[1], names[2], from_dict(names[3], str(folder / CONFIG)))
+        names = ("dataset", "split", "n_train", "scene", "material")
+        kept, antennas = {name: content[name] for name in names}, AntennaOptions(**content["antennas"])
+        settings = from_dict(content["settings"], str(folder / CONFIG))
+    return RunConfig(**kept, settings=settings, antennas=antennas)
 
 
 @contextmanager
@@ -155,10 +190,13 @@ def stored_parts(folder: Path) -> list[Path]:
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
     """Write ``checkpoint.npz``: enough to go on and enough to predict."""
+    known = trainer.record.frequencies_hz
     arrays = trainer.state.arrays() | {
         "format": np.asarray(FORMAT),
         "seconds": np.asarray(trainer.seconds),
         "image_size": np.asarray([trainer.height, trainer.width]),
+        "carrier_hz": np.asarray(np.nan if known is None else float(known[0])),
+        "tx_antenna": np.asarray(astuple(trainer.record.tx_antenna)),
         **receiver_arrays(trainer.record.receivers),
     }
     write_arrays(folder / CHECKPOINT, arrays)
@@ -178,7 +216,7 @@ def write_packed(
     Returns:
         Its size, bytes.
     """
-    kept = ("step", "seconds", "image_size", *RECEIVER_KEYS)
+    kept = ("step", "seconds", "image_size", "carrier_hz", "tx_antenna", *RECEIVER_KEYS)
     arrays = {"format": np.asarray(PACKED_FORMAT)} | {key: source[key] for key in kept}
     arrays |= pack_params(params, precision)
     return write_arrays(folder / CHECKPOINT, arrays, compressed=True).stat().st_size
@@ -228,7 +266,7 @@ def start_run(folder: Path, record: Record, split: Split, run: RunConfig) -> Tra
         InputError: the folder holds something already, or the split has rows that the record has not.
     """
     check_new(folder, f", or go on with train --resume {folder}")
-    trainer = Trainer(record, split, run.settings)
+    trainer = Trainer(record, split, run.settings, scene=run.open_scene(record))
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
     write_config(folder, replace(run, settings=trainer.config))
@@ -253,10 +291,11 @@ def resume_run(folder: Path, record: Record) -> Trainer:
         arrays = read_checkpoint(folder)
         if int(arrays["format"]) == PACKED_FORMAT:
             raise InputError(f"{folder}: compressed, so without what training needs; go on with the run it is made of")
-        trainer = Trainer(record, split, run.settings, state=FitState.from_arrays(arrays))
+        state = FitState.from_arrays(arrays)
+        trainer = Trainer(record, split, run.settings, state=state, scene=run.open_scene(record))
         trainer.seconds = float(arrays["seconds"])
     else:
-        trainer = Trainer(record, split, run.settings)
+        trainer = Trainer(record, split, run.settings, scene=run.open_scene(record))
     cut_log(folder, trainer.state.step)
     return trainer
 
@@ -274,14 +313,10 @@ def load_predictor(folder: str | Path, operator: bool = True) -> Predictor:
     path = Path(folder)
     config, arrays = read_config(path), read_checkpoint(path)
     height, width = map(int, arrays["image_size"])
-    settings = config.settings
-    return Predictor(
-        make_field(settings),
-        final_params(arrays),
-        stored_receivers(arrays),
-        height,
-        width,
-        settings.skip,
-        operator,
-        path,
-    )
+    settings, receivers, hz = config.settings, stored_receivers(arrays), float(arrays["carrier_hz"])
+    field, antenna = make_field(settings), Antenna(*map(str, arrays["tx_antenna"]))
+    known = None if np.isnan(hz) else np.array([hz])
+    scene = None if config.scene is None else open_scene_at(config.scene, hz, config.material)
+    ends = settings.receiver, known, scene, settings.traced, antenna
+    graph = Graph(field, receivers, (height, width), *ends)
+    return Predictor(field, final_params(arrays), receivers, height, width, settings.skip, operator, path, graph=graph)

@@ -11,14 +11,19 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import to_tensor
+from ..backend.device import on_device, to_tensor
 from ..core import InputError, Receiver
 from ..core.receivers import receiver_index
 from ..field.gaussians import Gaussians
+from ..graph.graph import Field, Graph
+from ..hybrid.combine import PixelReceiver
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
-from .step import CompiledPredictor, Field, Params, device_pose
+from .step import CompiledPredictor, Params, device_pose
 from .still import StillField, stands_still
+
+TOGETHER = 16
+"""Transmitters whose paths and Gaussians are evaluated together."""
 
 
 class Predictor:
@@ -26,7 +31,7 @@ class Predictor:
 
     Args:
         field: the model.
-        params: its parameters as NumPy arrays.
+        params: its parameters as NumPy arrays, and those of the traced side.
         receivers: poses, by which spectra are asked for.
         height: rows of a spectrum.
         width: columns.
@@ -35,6 +40,7 @@ class Predictor:
             map from signals to pixels (`wrf_mi.splat.operator`), built at the first prediction. It leaves nothing out,
             whatever ``skip`` says.
         store: folder in which operators are kept from process to process; None: in memory alone.
+        graph: of the field, these receivers and a scene; None: the field alone, seen by pixel receivers.
     """
 
     def __init__(
@@ -47,12 +53,15 @@ class Predictor:
         skip: Skip = NOTHING,
         operator: bool = False,
         store: Path | None = None,
+        graph: Graph | None = None,
     ) -> None:
-        self.receivers = tuple(receivers)
-        self._poses = [device_pose(r) for r in receivers]
+        self.receivers, self.graph = tuple(receivers), graph or Graph(field, receivers, (height, width))
+        # The operator and the recorded prediction are the magnitude at each direction.
+        self._pixels = self.graph.scene is None and all(type(model) is PixelReceiver for model in self.graph.models)
+        self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
-        self._by_operator, self._store = operator and stands_still(field), store
+        self._by_operator, self._store = operator and self._pixels and stands_still(field), store
         self._still: StillField | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
@@ -76,6 +85,18 @@ class Predictor:
             size = self._plane.height, self._plane.width
             self._still = StillField(self._field, params, self.receivers, *size, self._store)
         return self._still
+
+    def _reported(self, tx_pos_m: NDArray[np.float64], receiver: int) -> NDArray[np.float32]:
+        """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
+        side = self.graph.trace(tx_pos_m, receiver)
+        with dr.suspend_grad():
+            if side is not None:
+                side.refresh(self._params)
+            tx = to_tensor(np.ascontiguousarray(tx_pos_m.T, np.float32))
+            slots = on_device(np.arange(len(tx_pos_m)), mi.UInt32)
+            report = self.graph.report(receiver, side)
+            found: NDArray[np.float32] = report(self._params, tx, slots, self._poses[receiver], self._plane).numpy()
+        return found
 
     def __call__(self, tx_pos_m: ArrayLike, receiver: int | str = 0) -> NDArray[np.float32]:
         """Spectra of transmitters at one receiver.
@@ -105,6 +126,11 @@ class Predictor:
                 self._by_operator = False
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
+        if not self._pixels:
+            for start in range(0, len(positions), TOGETHER):
+                part = slice(start, start + TOGETHER)
+                out[part] = self._reported(np.asarray(tx_pos_m, float)[part], index).reshape(-1, height, width)
+            return out
         for image, position in zip(out, positions, strict=True):
             tx = to_tensor(position[:, None])
             image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)

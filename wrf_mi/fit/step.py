@@ -17,19 +17,20 @@ import mitsuba as mi
 from drjit.opt import Adam
 
 from ..core import Receiver
-from ..field import Factorised, WrfGs, WrfGsPlus
 from ..field.parts import AT_ONCE, gaussians_in_parts
+from ..field.recorded import Recorded
+from ..graph.graph import Field, Report
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
-from .recorded import Recorded
 
-Field = WrfGs | WrfGsPlus | Factorised
 Loss = Callable[[Any, Any, int, int, int], Any]
 """``loss(prediction, truth, batch, height, width)`` of flat arrays, a Dr.Jit float of one value."""
 Params = dict[str, Any]
 
+TRACED_NAMES = ("material.", "receiver.", "pattern.")
+"""Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
 DARK = 1e-8
 """Added to |R|^2 under the root, whose slope at zero is infinite: greys below 1e-4 are rounded to it."""
 
@@ -121,10 +122,10 @@ def no_trouble(names: Iterable[str]) -> Trouble:
 def watched(name: str) -> bool:
     """Whether a parameter's gradient shows any NaN or infinity of its group.
 
-    Per-Gaussian attributes are watched themselves, a layer through its bias, whose gradient is the sum
-    of all that reaches the layer.
+    Per-Gaussian attributes and what the traced side is made of are watched themselves, a layer through its bias, whose
+    gradient is the sum of all that reaches the layer.
     """
-    return "." not in name or name.endswith(".bias")
+    return "." not in name or name.endswith(".bias") or name.startswith(TRACED_NAMES)
 
 
 def _health(param: Any) -> Any:
@@ -135,27 +136,30 @@ def _health(param: Any) -> Any:
     return dr.sum(dr.square(dr.grad(param).array) + dr.abs(dr.detach(param).array))
 
 
-def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callable[..., Any]:
+def make_step(
+    report: Report, rates: Mapping[str, float], loss_of: Loss, state: Callable[[], Any] | None = None
+) -> Callable[..., Any]:
     """A recorded optimiser step.
 
     Args:
-        field: the model.
+        report: what a receiver reports of the graph, see `wrf_mi.graph.Graph.report`.
         rates: learning rate of each parameter.
         loss_of: loss of a batch.
+        state: arrays that the report reads beside its arguments; None: none.
 
     Returns:
-        ``step(adam, mean, data, rows, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
+        ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
         StepReport)``. It takes one step of ``adam`` in place, that of this number from 1, and returns the new running
         mean of the parameters. After trouble nothing changes any more.
     """
     groups = watched_groups(rates)
 
-    @Recorded
     def step(
         adam: Adam,
         mean: Params,
         data: TrainingData,
         rows: Any,
+        slots: Any,
         receiver: Any,
         pose: Pose,
         plane: Plane,
@@ -169,7 +173,7 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         params = {name: adam[name] for name in rates}
         tx_pos, truth = data.select(rows, receiver, plane)
         batch = dr.width(rows)
-        prediction = grey(field, params, tx_pos, pose, plane)
+        prediction = report(params, tx_pos, slots, pose, plane)
         loss = loss_of(prediction, truth, batch, plane.height, plane.width)
         dr.backward(loss)
         sums = [dr.detach(loss), *(_health(params[name]) for name in groups)]
@@ -188,11 +192,11 @@ def make_step(field: Field, rates: Mapping[str, float], loss_of: Loss) -> Callab
         trouble = Trouble(
             dr.select(untroubled & ~good, number, trouble.step), dr.select(untroubled, now, trouble.groups)
         )
-        report = StepReport(dr.detach(loss), urge)
-        dr.eval(adam, mean, trouble, report)
-        return mean, trouble, report
+        told = StepReport(dr.detach(loss), urge)
+        dr.eval(adam, mean, trouble, told)
+        return mean, trouble, told
 
-    return step
+    return Recorded(step, state)
 
 
 class CompiledPredictor:

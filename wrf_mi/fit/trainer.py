@@ -20,6 +20,7 @@ from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
+from ..graph.graph import Field, Graph, Report
 from ..loss.spectrum import spectrum_loss
 from ..loss.ssim import ssim
 from ..measure.observations import check_observations
@@ -30,7 +31,7 @@ from .predictor import Predictor
 from .schedule import plan
 from .start import initial_gaussians
 from .state import FitState
-from .step import Field, Loss, TrainingData, Trouble, device_pose, make_step, no_trouble, watched_groups
+from .step import TRACED_NAMES, Loss, TrainingData, Trouble, device_pose, make_step, no_trouble, watched_groups
 
 
 class NumericsError(RuntimeError):
@@ -108,6 +109,17 @@ def peak_memory_mb() -> float:
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 
 
+def graph_of(field: Field, record: Record, config: TrainConfig, scene: Any | None) -> Graph:
+    """The graph of a field, a record's receivers and a scene.
+
+    Raises:
+        InputError: a receiver model or a scene for which the data do not tell array or carrier.
+    """
+    size = int(record.observation.shape[-2]), int(record.observation.shape[-1])
+    ends = config.receiver, record.frequencies_hz, scene, config.traced, record.tx_antenna
+    return Graph(field, record.receivers, size, *ends)
+
+
 def require_spectra(record: Record) -> None:
     """Refuse other records than spectra.
 
@@ -141,6 +153,8 @@ class Trainer:
         initial: starting values in place of those that ``config.initial`` describes.
         state: of a fit that was stopped, to go on from.
         loss: in place of the paper's: ``loss(prediction, truth, batch, height, width)`` of flat Dr.Jit arrays.
+        scene: from `wrf_mi.trace.open_scene`, at the record's carrier: its paths are trained together with the
+            Gaussians. None: Gaussians alone.
 
     Raises:
         InputError: settings or data that cannot be trained on.
@@ -157,23 +171,28 @@ class Trainer:
         initial: InitialGaussians | None = None,
         state: FitState | None = None,
         loss: Loss | None = None,
+        scene: Any | None = None,
     ) -> None:
         require_spectra(record)
         check_rows(split, record, f"split {split.name}")
         check_observations(record, split, complete=True)
-        config = config.resolved(record.tx_pos_m[split.all_train])
+        config = config.resolved(record.tx_pos_m[split.all_train], scene is not None)
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
         self.field = field or make_field(config)
         self._loss = loss or partial(_paper_loss, eta=config.structural_weight)
+        self.graph = graph_of(self.field, record, config, scene)
         self.schedule = plan(config, split, len(record.receivers))
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
+        # Slots of the traced sides: all rows that train or choose.
+        self._known = split.all_train
+        self._sides = [self.graph.trace(record.tx_pos_m[self._known], r) for r in range(len(record.receivers))]
         if state is None:
             rng = np.random.default_rng([config.seed, 0])
             start = initial or initial_gaussians(config.initial, record, split.train, rng)
-            state = FitState(self.field.init(start, rng))
+            state = FitState(self.field.init(start, rng) | self._traced_start())
         self.state = state
         self._poses = [device_pose(r) for r in record.receivers]
         self._plane = perception_plane(self.height, self.width, mi.Float)
@@ -186,8 +205,39 @@ class Trainer:
 
     def record_functions(self) -> None:
         """Forget recorded kernels: the number of Gaussians stands in them as a constant."""
-        self._step = make_step(self.field, self._rates(), self._loss)
+        self._steps: dict[Any, Callable[..., Any]] = {}
         self._predictor: Predictor | None = None
+
+    def _traced_start(self) -> dict[str, NDArray[np.float32]]:
+        """Starting values of the traced side, with gains that match the training rows."""
+        values = self.graph.parameters(self._sides)
+        for r, side in enumerate(self._sides):
+            if side is not None and side.gain_name in values:
+                observed = self.record.observation[r, self._known]
+                values |= self.graph.match_gain(r, side, {}, observed)
+        return values
+
+    def _step_of(self, receiver: int) -> Callable[..., Any]:
+        """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""
+        side = self._sides[receiver]
+        if side is not None:
+            side.refresh({name: self.state.adam[name] for name in self.state.adam})
+        key = None if side is None and not self.graph.arrays(receiver, None) else (receiver, side and side.searches)
+        if key not in self._steps:
+            self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
+            report = self.graph.report(receiver, side)
+            state = None if key is None else partial(self.graph.arrays, receiver, side)
+            if side is not None:
+                self._warm(receiver, report)
+            self._steps[key] = make_step(report, self._rates(), self._loss, state)
+        return self._steps[key]
+
+    def _warm(self, receiver: int, report: Report) -> None:
+        """Evaluate a report once: what is made from NumPy's memory at first use must be there before a recording."""
+        with dr.suspend_grad():
+            params = {name: self.state.adam[name] for name in self.state.adam}
+            tx = to_tensor(self.record.tx_pos_m[self._known[:1]].T)
+            dr.eval(report(params, tx, mi.UInt32(0), self._poses[receiver], self._plane))
 
     def _rates(self) -> dict[str, float]:
         o = self.config.optimiser
@@ -199,7 +249,11 @@ class Trainer:
             "signal": o.signal,
             "image": 0.0,
         }
-        return {name: own.get(name, o.network) for name in self.state.adam}
+        traced = self.graph.traced
+        return {
+            name: traced.rate(name) if name.startswith(TRACED_NAMES) else own.get(name, o.network)
+            for name in self.state.adam
+        }
 
     def predictor(self) -> Predictor:
         """Predictions with the running mean of the parameters as it is now."""
@@ -211,6 +265,7 @@ class Trainer:
                 self.height,
                 self.width,
                 self.config.skip,
+                graph=self.graph,
             )
         else:
             self._predictor.update(self.state.mean)
@@ -255,11 +310,13 @@ class Trainer:
         while state.step < config.steps and not (state.step > first and stop()):
             t = state.step
             receiver = int(schedule.receiver[t])
-            state.mean, trouble, report = self._step(
+            rows = schedule.rows[t]
+            state.mean, trouble, report = self._step_of(receiver)(
                 state.adam,
                 state.mean,
                 self._data,
-                mi.UInt32(schedule.rows[t].tolist()),
+                mi.UInt32(rows.tolist()),
+                mi.UInt32(np.searchsorted(self._known, rows).tolist()),
                 dr.opaque(mi.UInt32, receiver),
                 self._poses[receiver],
                 self._plane,

@@ -174,7 +174,7 @@ class JointFit:
                 continue
             name = view.traced.gain_name
             for _ in range(MATCHING):
-                change = np.array([_missing_gain(view, view.traced, self.parameters), 0], np.float32)
+                change = np.array([missing_gain(view, view.traced, self.parameters), 0], np.float32)
                 self.set_values({name: self.values()[name] + change})
 
     def materials(self) -> dict[str, float]:
@@ -348,7 +348,7 @@ def _check(view: View, tx_pos_m: FloatArray) -> None:
         raise ValueError(f"JointFit: the traced side of {view.receiver.name} has other transmitters than the fit")
 
 
-def _missing_gain(view: View, traced: TracedField, parameters: Mapping[str, Any]) -> float:
+def missing_gain(view: View, traced: TracedField, parameters: Mapping[str, Any]) -> float:
     """Logarithm of the amplitude that the traced side lacks."""
     model, observed = view.model, np.asarray(view.observation)
     scales = isinstance(model, ArrayReceiver) and model.instrument_scale

@@ -54,6 +54,8 @@ from .folder_files import (
 CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 """Keys under which a file may state carriers."""
 GATEWAYS, TX_ANTENNA = "gateway_info.yml", "tx_antenna"
+RESERVED = ("array", TX_ANTENNA)
+"""Mappings of the file that are no receivers, so names that no receiver can have."""
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -122,6 +124,8 @@ def write_spectrum_folder(
         or not (record.observation.min() >= 0 and record.observation.max() <= 1)
     ):
         raise InputError(f"{path}: {record.name} holds no spectra within 0..1; scale them first")
+    for name in (receiver.name for receiver in record.receivers if receiver.name in RESERVED):
+        raise InputError(f"{path}: a receiver is named {name!r}, which means something else in {GATEWAYS}; rename it")
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
         text = f"{record.name} has {len(record.frequencies_hz)} carriers, and {GATEWAYS} states one"
         raise InputError(f"{path}: {text}; write a folder for each")
@@ -228,7 +232,7 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
 
 def _receivers(path: Path, info: dict[Any, Any], array_m: FloatArray | None) -> tuple[Receiver, ...]:
     """Receivers of the file; ``array_m``: array of those that state none of their own."""
-    poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in ("array", TX_ANTENNA)}
+    poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in RESERVED}
     if not poses:
         raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
     receivers = []

@@ -118,6 +118,8 @@ def compress_run(
     if is_blocked(source):
         raise InputError(f"{source}: one field for each block; choose one, e.g. {source / 'fold0'}")
     asked, arrays = read_config(source), read_checkpoint(source)
+    if asked.scene is not None:
+        raise InputError(f"{source}: trained together with the paths of {asked.scene}; compress a run without a scene")
     data = record or load_record(asked.dataset)
     split = load_rows(source, data)
     start = time.perf_counter()

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..baselines.method import Inputs
-from ..core import InputError, Receiver, Record, Split
+from ..core import AntennaOptions, InputError, Receiver, Record, Split
+from ..core.antenna import AS_STATED
 from ..core.types import IntArray
 from ..fit.config import TrainConfig
 from ..fit.folder import (
@@ -101,8 +102,12 @@ def train(
     n_train: int | float | None = None,
     listen: Listen = lambda fold, steps, progress: None,
     stop: Callable[[], bool] = lambda: False,
+    *,
+    scene: str | Path | None = None,
+    material: str | None = None,
+    antennas: AntennaOptions = AS_STATED,
 ) -> Run:
-    """Fit a field and score it.
+    """Fit a field, alone or together with the paths of a scene, and score it.
 
     Args:
         dataset: name, folder, or a record that was loaded.
@@ -112,14 +117,20 @@ def train(
         n_train: number or fraction of the training rows to use; None: all.
         listen: hears of progress.
         stop: asked after each step; True stops the run at a checkpoint.
+        scene: name, scene folder, Mitsuba XML or mesh: its paths are trained together with the Gaussians.
+        material: of a bare mesh.
+        antennas: patterns and polarisations in place of what the data state; with a scene.
 
     Raises:
-        InputError: data, settings or folder that cannot be used.
+        InputError: data, settings, scene or folder that cannot be used.
         Interrupted: ``stop`` ended the run; go on with `resume`.
     """
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
     settings, folder = config or TrainConfig(), Path(out)
+    if scene is None and (material is not None or antennas):
+        raise InputError("a material and antennas belong to a scene that is traced; give it, or leave them away")
+    record = antennas.of(record)
     if isinstance(split, Split):
         splits, name = [split], split.name
     else:
@@ -128,8 +139,9 @@ def train(
         check_rows(rows, record, f"split {rows.name}")
         require_spectra(record)
         check_observations(record, rows, complete=True)
-    settings = settings.resolved(record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
-    run = RunConfig(source, name, n_train, settings)
+    known = np.concatenate([rows.all_train for rows in splits])
+    settings = settings.resolved(record.tx_pos_m[known], scene is not None)
+    run = RunConfig(source, name, n_train, settings, None if scene is None else str(scene), material, antennas)
     if len(splits) == 1:
         _fit(start_run(folder, record, splits[0], run), folder, run, "", listen, stop)
         return Run(folder)
@@ -151,7 +163,7 @@ def resume(
     """
     path = Path(folder)
     run = read_config(path)
-    record = load_record(run.dataset)
+    record = run.antennas.of(load_record(run.dataset))
     if (path / "split.npz").exists():
         _fit(resume_run(path, record), path, run, "", listen, stop)
         return Run(path)
@@ -208,6 +220,7 @@ def _header(run: RunConfig, seconds: float) -> dict[str, Any]:
         "split": run.split,
         "seed": run.settings.seed,
         "steps": run.settings.steps,
+        **({} if run.scene is None else {"scene": run.scene}),
         "train_seconds": seconds,
         "peak_memory_mb": peak_memory_mb(),
     }

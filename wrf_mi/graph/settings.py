@@ -1,0 +1,67 @@
+"""Settings of the traced side of a graph, plain values that a configuration file states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..core import InputError
+
+RECEIVERS = ("pixel", "array")
+"""Receiver models of spectra, see `wrf_mi.hybrid.combine`."""
+
+MOST_DEGREE = 8
+"""Of an antenna's pattern: more harmonics than Dr.Jit's `sh_eval` has."""
+
+
+@dataclass(frozen=True)
+class TracedConfig:
+    """Paths of a scene that are trained together with the Gaussians: what is traced, and learning rates.
+
+    A parameter of rate 0 is held at its stated value and costs nothing.
+
+    Attributes:
+        depth: interactions of a path at most, transmissions included.
+        reflections: of these at most so many reflections.
+        transmission: paths through surfaces.
+        rays: that search from each receiver.
+        pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
+        material: rate of permittivities and conductivities (of their logarithms).
+        gain: rate of each receiver's gain (of its logarithm, and of its phase in rad).
+        pattern: rate of the patterns' coefficients.
+        position: rate of the receivers' positions, metres.
+        turn: rate of the receivers' orientations, rad.
+    """
+
+    depth: int = 3
+    reflections: int = 2
+    transmission: bool = True
+    rays: int = 1 << 16
+    pattern_degree: int = 0
+    material: float = 0.02
+    gain: float = 0.01
+    pattern: float = 0.01
+    position: float = 0.0
+    turn: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be traced.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        if not 0 <= self.pattern_degree <= MOST_DEGREE:
+            raise InputError(f"setting traced.pattern_degree: {self.pattern_degree}; choose 0 to {MOST_DEGREE}")
+        if self.pattern_degree and not self.pattern:
+            raise InputError("setting traced.pattern: 0 holds the pattern; leave traced.pattern_degree away")
+
+    def rate(self, name: str) -> float:
+        """Learning rate of a parameter of `wrf_mi.hybrid.traced.TracedField.parameters`."""
+        kind, last = name.partition(".")[0], name.rpartition(".")[2]
+        if kind == "material":
+            return self.material
+        if kind == "pattern":
+            return self.pattern
+        return {"gain": self.gain, "position": self.position, "turn": self.turn}[last]
+
+
+DEFAULT = TracedConfig()
