@@ -36,6 +36,9 @@ LARGEST = {
     "density.start": 1.0,
     "density.stop": 1.0,
     "density.grow": 1.0,
+    "traced.depth": 12,
+    "traced.pattern_degree": 8,
+    "traced.rays": 1 << 24,
 } | dict.fromkeys(INSIDE, 0.999)
 
 
@@ -43,7 +46,9 @@ def good_values(name: str, default: Any) -> st.SearchStrategy[Any]:
     if isinstance(default, bool):
         return st.booleans()
     if isinstance(default, int):
-        return st.integers(1, 10**9)
+        return st.integers(1, int(LARGEST.get(name, 10**9)))
+    if name == "receiver":
+        return st.sampled_from(["auto", "pixel", "array"])
     if isinstance(default, str):
         return st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
     if name == "initial.nearest_m":  # not beyond the farthest

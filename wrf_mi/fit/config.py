@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..field.encoding import telling_scale
-from ..graph.settings import RECEIVERS, TracedConfig
+from ..graph.settings import MOST_DEGREE, ReceiverModel, TracedConfig
 from ..splat.skip import Skip
+from ..trace.options import MAX_DEPTH, MAX_RAYS
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
 OTHERWISE = 15000
 SIGNAL_ALONE, SIGNAL_WITH_SCENE = 0.3, 0.02
-"""Deviation of the starting signals. Together with a scene the Gaussians begin by adding next to nothing to the paths."""
+"""Deviation of the starting signals: together with a scene the Gaussians add next to nothing to its paths at first."""
 LEAST_TX_SCALE_M = 1.0
 """Metres per unit of transmitters within two metres; doubled for wider ones as often as needed."""
 
@@ -168,8 +169,8 @@ class TrainConfig:
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
         receiver: how the field becomes a spectrum: ``"pixel"``: its magnitude at each direction (the papers'),
-            ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does; "": array
-            with a scene, else pixel.
+            ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does;
+            ``"auto"``: array with a scene, else pixel.
         skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
@@ -189,7 +190,7 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
-    receiver: str = ""
+    receiver: ReceiverModel = "auto"
     skip: Skip = field(default_factory=Skip)
     traced: TracedConfig = field(default_factory=TracedConfig)
 
@@ -216,8 +217,6 @@ class TrainConfig:
             good, words = _RANGES.get(name, _NOT_NEGATIVE)
             if not math.isfinite(value) or not good(value):
                 raise InputError(f"setting {name}: {value} is out of range, choose {words}")
-        if self.receiver not in ("", *RECEIVERS):
-            raise InputError(f"setting receiver: {self.receiver!r}; choose from {', '.join(RECEIVERS)}")
         sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
         if len(sources) > 1:
             raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")
@@ -256,6 +255,9 @@ _RANGES: Mapping[str, _Range] = {
     "density.split_deg": _POSITIVE,
     "density.least_opacity": _INSIDE,
     "density.reset_opacity": _INSIDE,
+    "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
+    "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
+    "traced.pattern_degree": (lambda x: 0 <= x <= MOST_DEGREE, f"0 to {MOST_DEGREE}"),
 }
 """What numbers may be, and words for it; `_NOT_NEGATIVE` where nothing is said here."""
 

@@ -27,7 +27,7 @@ from ..hybrid.learned import learned_field
 from ..hybrid.pose import position_name, receiver_pose, turn_name
 from ..project.footprint import Pose
 from ..splat.tiles import Plane
-from .settings import DEFAULT, RECEIVERS, TracedConfig
+from .settings import DEFAULT, ReceiverModel, TracedConfig
 
 if TYPE_CHECKING:
     from ..hybrid.traced import TracedField
@@ -44,7 +44,7 @@ class Graph:
         field: the Gaussians.
         receivers: poses, antennas and arrays.
         size: height and width of a spectrum.
-        receiver: one of `RECEIVERS`; "": ``array`` with a scene, else ``pixel``.
+        receiver: receiver model; ``auto``: ``array`` with a scene, else ``pixel``.
         frequencies_hz: of the carrier [1]; None: not known.
         scene: from `wrf_mi.trace.open_scene`, at the carrier; None: Gaussians alone.
         traced: what is traced, and rates.
@@ -59,15 +59,13 @@ class Graph:
         field: Field,
         receivers: Sequence[Receiver],
         size: tuple[int, int],
-        receiver: str = "",
+        receiver: ReceiverModel = "auto",
         frequencies_hz: FloatArray | None = None,
         scene: Any | None = None,
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
     ) -> None:
-        kind = receiver or (RECEIVERS[1] if scene is not None else RECEIVERS[0])
-        if kind not in RECEIVERS:
-            raise InputError(f"setting receiver: {receiver!r}; choose from {', '.join(RECEIVERS)}")
+        kind = receiver if receiver != "auto" else "pixel" if scene is None else "array"
         known = frequencies_hz is not None and all(one.array_m is not None for one in receivers)
         if not known and (kind == "array" or scene is not None):
             what = "a scene" if scene is not None else "setting receiver: array"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from ..core import InputError
-
+ReceiverModel = Literal["auto", "pixel", "array"]
 RECEIVERS = ("pixel", "array")
 """Receiver models of spectra, see `wrf_mi.hybrid.combine`."""
 
@@ -42,17 +42,6 @@ class TracedConfig:
     pattern: float = 0.01
     position: float = 0.0
     turn: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be traced.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        if not 0 <= self.pattern_degree <= MOST_DEGREE:
-            raise InputError(f"setting traced.pattern_degree: {self.pattern_degree}; choose 0 to {MOST_DEGREE}")
-        if self.pattern_degree and not self.pattern:
-            raise InputError("setting traced.pattern: 0 holds the pattern; leave traced.pattern_degree away")
 
     def rate(self, name: str) -> float:
         """Learning rate of a parameter of `wrf_mi.hybrid.traced.TracedField.parameters`."""
