@@ -62,7 +62,7 @@ def test_default_is_vertical_in_the_world_however_the_array_is_turned() -> None:
         ({"pattern": "horn"}, "pattern is 'horn'; choose from iso, dipole, hw_dipole, tr38901"),
         ({"polarization": "VH"}, "polarization is 'VH'; choose from V, H"),
         ({"frame": "body"}, "frame is 'body'; choose from world, array"),
-        ({"pattern": "tr38901"}, "has a boresight, which frame world does not tell; state array"),
+        ({"pattern": "tr38901"}, "has a boresight, which the frame world does not tell; state frame array"),
         ({"pattern": ["iso"]}, "pattern is"),
     ],
 )
@@ -84,7 +84,7 @@ def test_options_replace_what_the_data_state_and_leave_the_rest() -> None:
     changed = AntennaOptions(rx_polarization="V", tx_pattern="hw_dipole").of(record)
     assert [astuple(one.antenna) for one in changed.receivers] == [("dipole", "V", "world")] * 2
     assert changed.tx_antenna == Antenna("hw_dipole")
-    with pytest.raises(InputError, match="state array"):
+    with pytest.raises(InputError, match="state frame array"):
         AntennaOptions(rx_pattern="tr38901").of(record)
     assert AntennaOptions(rx_pattern="tr38901", rx_frame="array").of(record).receivers[1].antenna.frame == "array"
 

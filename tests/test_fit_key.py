@@ -134,7 +134,8 @@ def test_digest_tells_values_apart() -> None:
 
 def test_digest_of_a_folder_is_that_of_names_and_contents(tmp_path: Path) -> None:
     (tmp_path / "scene" / "meshes").mkdir(parents=True)
-    (tmp_path / "scene" / "scene.xml").write_text("<scene/>")
+    named = '<scene><shape type="ply"><string name="filename" value="{}"/></shape></scene>'
+    (tmp_path / "scene" / "scene.xml").write_text(named.format("meshes/wall.ply"))
     (tmp_path / "scene" / "meshes" / "wall.ply").write_text("ply")
     copy = shutil.copytree(tmp_path / "scene", tmp_path / "copy")
     assert content_digest(copy) == content_digest(tmp_path / "scene")
@@ -142,6 +143,19 @@ def test_digest_of_a_folder_is_that_of_names_and_contents(tmp_path: Path) -> Non
     (copy / "meshes" / "wall.ply").write_text("ply2")
     assert content_digest(copy) != content_digest(tmp_path / "scene")
     assert content_digest(scene_files(copy / "scene.xml")) != before
+    (copy / "beside.xml").write_text(named.format("floor.ply"))
+    (copy / "floor.ply").write_text("ply")
+    before = content_digest(scene_files(copy / "beside.xml"))
+    (copy / "floor.ply").write_text("ply2")
+    assert content_digest(scene_files(copy / "beside.xml")) != before
+    for name in ("beside.xml", "floor.ply"):
+        (copy / name).unlink()
+    (copy / "meshes" / "wall.ply").write_text("ply")
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "meshes").symlink_to(copy / "meshes")
+    before = content_digest(tmp_path / "linked")
+    (copy / "meshes" / "wall.ply").write_text("ply3")
+    assert content_digest(tmp_path / "linked") != before
     (copy / "meshes" / "wall.ply").write_text("ply")
     (copy / "meshes" / "wall.ply").rename(copy / "meshes" / "door.ply")
     assert content_digest(copy) != content_digest(tmp_path / "scene")

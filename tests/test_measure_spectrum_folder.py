@@ -282,7 +282,8 @@ def test_nothing_is_written_over_or_left_half_written(folder: Path):
         write_spectrum_folder(folder.parent / "other", broken)
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     with pytest.raises(InputError, match="no spectra within"):
-        write_spectrum_folder(folder.parent / "other", replace(make_record(), task="rssi"))
+        powers = make_record().observation[:, :, 0, 0]
+        write_spectrum_folder(folder.parent / "other", replace(make_record(), task="rssi", observation=powers))
     other = make_record(rows=4)
     assert_same(read_spectrum_folder(write_spectrum_folder(folder, other, replace=True)), other)
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
@@ -326,7 +327,7 @@ def test_antennas_are_read_and_written(tmp_path: Path):
         ("antenna: V", "gateway9: antenna is 'V'; give some of pattern, polarization, frame"),
         ("antenna: {polarisation: V}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
         ("antenna: {polarization: vertical}", "polarization is 'vertical'; choose from V, H"),
-        ("antenna: {pattern: tr38901}", "state array"),
+        ("antenna: {pattern: tr38901}", "state frame array"),
     ],
 )
 def test_wrong_antenna_is_one_line(folder: Path, entry: str, message: str):

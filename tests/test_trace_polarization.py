@@ -182,7 +182,7 @@ def test_antenna_options_are_refused_where_nothing_is_traced(
 
 def test_a_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
 
-    with pytest.raises(InputError, match="state array"):
+    with pytest.raises(InputError, match="state frame array"):
         trace_run(xml, turned_folder, tmp_path / "run", OPTIONS, antennas=AntennaOptions(rx_pattern="tr38901"))
     assert not (tmp_path / "run").exists()
 

@@ -305,6 +305,22 @@ def test_kinds_of_path_are_switched_one_by_one() -> None:
         line_of_sight=False, reflection=False, transmission=True, diffraction=True, rays="auto", max_depth=2
     )
     assert with_kinds(TraceOptions()) == TraceOptions()
+    assert with_kinds(TraceOptions(), max_reflections=1).max_reflections == 1
+    with pytest.raises(InputError, match="max_reflections -1"):
+        with_kinds(TraceOptions(), max_reflections=-1)
+
+
+def test_reflections_bound_the_paths_of_the_command(
+    flat_folder: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for bound in (0, 1):
+        asked = ["trace", room, flat_folder, "--depth", "2", "--reflections", bound, "--rays", "1024"]
+        status, _, err = call([*asked, "--out", tmp_path / str(bound)], capsys)
+        assert status == 0, err
+        assert (load_trace(tmp_path / str(bound) / "paths.npz").paths.interactions == 1).sum(axis=1).max() == bound
+    status, _, err = call([*asked[:5], "--reflections", "-3", "--out", tmp_path / "out"], capsys)
+    assert status == 2
+    assert "max_reflections -3" in err
 
 
 def test_tracer_reports_as_the_record_does(flat_folder: Path, room: Path) -> None:

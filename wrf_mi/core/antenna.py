@@ -61,7 +61,10 @@ class Antenna:
                 text = f"antenna: {name} is {str(getattr(self, name))[:40]!r}; choose from {', '.join(known)}"
                 raise InputError(text)
         if self.pattern == "tr38901" and self.frame == "world":
-            raise InputError("antenna: pattern tr38901 has a boresight, which frame world does not tell; state array")
+            raise InputError(
+                "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
+                "(--rx-frame array), or for transmitters and anchors one of " + ", ".join(OMNIDIRECTIONAL)
+            )
 
     @property
     def turned(self) -> Antenna:

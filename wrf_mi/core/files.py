@@ -74,7 +74,7 @@ def text_lines(path: Path) -> list[str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{path}: missing; the folder is not complete") from None
+        raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
     except OSError as error:
         raise InputError(os_failure(error, path, "cannot be read")) from None
     except UnicodeDecodeError as error:

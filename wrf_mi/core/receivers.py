@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from typing import Any
@@ -18,8 +17,6 @@ from .types import Receiver
 
 SHOWN = 20
 """Names that an error lists at most."""
-NUMBER = re.compile(r"[0-9]{1,9}")
-"""A string that may stand for a number."""
 KEYS = (
     "receiver_name",
     "receiver_position_m",
@@ -37,28 +34,25 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
 
     Args:
         receivers: in the record's order.
-        receiver: its name, or its number from 0. A string is a name first: where no receiver bears it, ``"2"`` is
-            number 2.
+        receiver: its name (a string), or its number from 0 (an integer).
 
     Raises:
         InputError: no such receiver, or several of that name.
 
     >>> import numpy as np
     >>> both = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in ("kitchen", "0")]
-    >>> receiver_index(both, "kitchen"), receiver_index(both, 0), receiver_index(both, "0"), receiver_index(both, "1")
-    (0, 0, 1, 1)
+    >>> receiver_index(both, "kitchen"), receiver_index(both, 0), receiver_index(both, "0")
+    (0, 0, 1)
     """
     names = [one.name for one in receivers]
     if isinstance(receiver, str):
         if names.count(receiver) > 1:
             numbers = ", ".join(str(index) for index, name in enumerate(names) if name == receiver)
             raise InputError(f"receiver {receiver!r}: name of several; give one's number, of {numbers}")
-        if receiver in names:
-            return names.index(receiver)
-        index = int(receiver) if NUMBER.fullmatch(receiver) else -1
+        index = names.index(receiver) if receiver in names else -1
     else:
         try:
-            index = operator.index(receiver)
+            index = -1 if isinstance(receiver, bool) else operator.index(receiver)
         except TypeError:
             index = -1
     if not 0 <= index < len(names):

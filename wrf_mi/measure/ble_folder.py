@@ -43,6 +43,8 @@ CARRIER_HZ = 2.44e9
 """The data are means over BLE's three advertising channels, 2402, 2426 and 2480 MHz (Bluetooth Core Specification,
 volume 6, part A): the middle of that band."""
 RSSI, TX = "rssi_", "tx_"
+COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
+"""Of ``anchors.csv``."""
 WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
 """A whole number, also as pandas writes it in a column of floats: ``3``, ``3.0``."""
 NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
@@ -99,6 +101,10 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
 
 def _read_anchors(table: CsvTable) -> tuple[list[str], FloatArray]:
     """Ids and positions [anchors, 3]."""
+    if unused := [column for column in table.header if column not in COLUMNS]:
+        logger.warning(
+            "%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), ", ".join(COLUMNS)
+        )
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         found = _id(text)
@@ -116,7 +122,7 @@ def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
     antennas = []
     for row in range(len(table.rows)):
         own = {key: texts[row].strip() for key, texts in stated.items() if texts[row].strip()}
-        antennas.append(read_antenna(table.path, f"row {row + 1}", own))
+        antennas.append(read_antenna(table.path, f"row {row + 1}: {prefix}antenna", own))
     return antennas
 
 

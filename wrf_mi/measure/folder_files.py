@@ -121,7 +121,8 @@ def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = 
     try:
         return Antenna(**value)
     except InputError as error:
-        raise InputError(f"{path}: {one_line(name)}: {error}") from None
+        text = str(error).removeprefix("antenna: ")
+        raise InputError(f"{path}: {one_line(name)}: {text}") from None
 
 
 def antenna_entry(antenna: Antenna) -> dict[str, str]:

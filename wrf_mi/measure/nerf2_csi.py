@@ -156,7 +156,7 @@ def read_channels(path: Path) -> NDArray[np.complex64]:
     try:
         values = np.load(path, allow_pickle=False)
     except FileNotFoundError:
-        raise InputError(f"{path}: missing; the folder is not complete") from None
+        raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
     except Exception as error:  # numpy raises several kinds on damaged files
         raise InputError(f"{path}: not readable as .npy ({one_line(error)}); write it again with numpy.save") from None
     if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:

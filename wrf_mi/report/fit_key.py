@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from ..core import InputError
+from ..core.files import one_line
 from ..fit.folder import versions
 from ..measure.registry import locate
 from .run_folder import METRICS
@@ -57,7 +60,7 @@ def _add(digest: Any, value: Any) -> None:
     if isinstance(value, Path):
         if not value.exists():
             raise InputError(f"{value}: no such file or folder; restore it")
-        files = [value] if value.is_file() else sorted(path for path in value.rglob("*") if path.is_file())
+        files = [value] if value.is_file() else _files_below(value)
         digest.update(f"files {len(files)}\n".encode())
         for file in files:
             with file.open("rb") as stream:
@@ -84,6 +87,12 @@ def _add(digest: Any, value: Any) -> None:
         raise TypeError(f"fit_key: {type(value).__name__} has no digest; give arrays, data classes or plain values")
 
 
+def _files_below(folder: Path) -> list[Path]:
+    """All files of a folder, those of folders that are links too."""
+    below = (Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+    return sorted(path for path in below if path.is_file())
+
+
 def dataset_files(name_or_folder: str) -> list[Path]:
     """Folder or file of a data set, whose content is part of a key; none where it is not on this machine yet.
 
@@ -96,10 +105,21 @@ def dataset_files(name_or_folder: str) -> list[Path]:
 
 
 def scene_files(scene: str | Path) -> list[Path]:
-    """Folder or file of a scene, with the meshes beside a Mitsuba XML; none for a scene of this package by its name."""
+    """Folder or file of a scene, with the files that a Mitsuba XML names; none for a scene of this package by its name.
+
+    Raises:
+        InputError: an XML that cannot be read.
+    """
     path = Path(scene)
-    beside = [path.parent / "meshes"] if path.suffix.lower() == ".xml" else []
-    return [place for place in (path, *beside) if place.exists()]
+    if not path.exists():
+        return []
+    if path.suffix.lower() != ".xml":
+        return [path]
+    try:
+        stated = [node.get("value", "") for node in ElementTree.parse(path).iter("string")]
+    except (ElementTree.ParseError, OSError) as error:
+        raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
+    return [path, *(place for value in stated if value and (place := path.parent / value).is_file())]
 
 
 def fit_once(folder: Path, fit: Callable[[], object]) -> Path:

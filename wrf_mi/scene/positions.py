@@ -137,7 +137,13 @@ def check_positions(
         raise InputError(f"{text}: {remedy}")
     if here.total > tolerated + LARGEST_SHARE * count:
         raise InputError(f"{text}: check the registration and the frame of the positions")
-    logger.info("%s", text)
+    if best.total <= here.total:
+        # Nobody walked where the building and its reflection differ, or too little to tell.
+        logger.warning(
+            "%s: positions do not tell the plan from its mirror image; see that it is right", text
+        )
+    else:
+        logger.info("%s", text)
 
 
 def reflections(

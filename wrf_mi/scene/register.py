@@ -200,7 +200,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     if mirrored.score > max(best.score + CLEAR_LEAD, LEAST_AGREEMENT):
         raise InputError(
             f"{name}: its mirror image fits the walls better (agreement {mirrored.score:.2f}, not {best.score:.2f}); "
-            "give the other row_0 of a grid (--row-0), or change the sign of one axis"
+            "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
     if best.score < LEAST_AGREEMENT:
         scale, agreement = best_scale(points, best, walls)

@@ -109,5 +109,5 @@ def with_kinds(
         if not str(rays).isdecimal():
             raise InputError(f'rays {rays!r}: give a whole number, or "auto"')
         rays = int(rays)
-    given: dict[str, Any] = {"max_depth": max_depth, "rays": rays, "seed": seed}
+    given: dict[str, Any] = {"max_depth": max_depth, "max_reflections": max_reflections, "rays": rays, "seed": seed}
     return replace(options, **changes, **{key: value for key, value in given.items() if value is not None})

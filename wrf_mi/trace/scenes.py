@@ -89,7 +89,12 @@ def _from_xml(path: Path) -> Any:
         # Merged shapes come in another order each time, and with them the paths.
         return rt.load_scene(str(path), merge_shapes=False)
     except (RuntimeError, ValueError, SyntaxError, TypeError) as error:
-        raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
+        # Mitsuba puts the traceback of what Sionna RT raises into its own message; its last line says what is wrong.
+        said = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        if "ITU material" in str(error):
+            known = ", ".join(THICKNESS_M)
+            raise InputError(f"{path}: {one_line(said[-1])}; known are {known}, and constants of your own") from None
+        raise InputError(f"{path}: cannot be opened ({one_line(said[-1])}); correct the scene") from None
 
 
 def _from_mesh(path: Path, material: str) -> Any:
