@@ -281,8 +281,8 @@ def test_nothing_is_written_over_or_left_half_written(folder: Path):
     with pytest.raises(TypeError):
         write_spectrum_folder(folder.parent / "other", broken)
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    powers = make_record().observation[:, :, 0, 0]
     with pytest.raises(InputError, match="no spectra within"):
-        powers = make_record().observation[:, :, 0, 0]
         write_spectrum_folder(folder.parent / "other", replace(make_record(), task="rssi", observation=powers))
     other = make_record(rows=4)
     assert_same(read_spectrum_folder(write_spectrum_folder(folder, other, replace=True)), other)

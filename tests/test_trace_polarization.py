@@ -166,7 +166,7 @@ def test_a_run_predicts_with_the_antennas_that_it_was_traced_with(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--model", "wrf-gs+", "--rx-polarization", "H"], "belong to --model ray-tracing"),
+        (["--model", "wrf-gs+", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
         (["--model", "kriging", "--tx-pattern", "dipole"], "a scene belongs to --model ray-tracing or hybrid"),
         (["--model", "hybrid", "--rx-polarization", "H"], "without --scene nothing is traced"),
     ],

@@ -139,9 +139,7 @@ def check_positions(
         raise InputError(f"{text}: check the registration and the frame of the positions")
     if best.total <= here.total:
         # Nobody walked where the building and its reflection differ, or too little to tell.
-        logger.warning(
-            "%s: positions do not tell the plan from its mirror image; see that it is right", text
-        )
+        logger.warning("%s: positions do not tell the plan from its mirror image; see that it is right", text)
     else:
         logger.info("%s", text)
 
