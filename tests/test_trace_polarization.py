@@ -194,3 +194,15 @@ def test_the_hybrid_follows_the_stated_antennas(xml: Path, turned_folder: Path, 
         status, _, err = call([*asked, "--set", "reflections=1", "--out", tmp_path / name], capsys)
         assert status == 0, err
     assert median(tmp_path / "vertical") > median(tmp_path / "crossed") + 0.1
+
+
+@pytest.mark.parametrize("model", ["hybrid", "wrf-gs+"])
+def test_training_with_a_scene_warns_of_crossed_polarisation(
+    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any, model: str
+) -> None:
+    quick = {"hybrid": ["--n-train", "0", "--set", "reflections=1"], "wrf-gs+": ["--set", "steps=1"]}[model]
+    asked = ["train", turned_folder, "--model", model, "--scene", xml, *quick]
+    for stated, warned in (([], False), (["--rx-frame", "array"], True)):
+        status, _, err = call([*asked, *stated, "--out", tmp_path / str(warned)], capsys)
+        assert status == 0, err
+        assert ("try --rx-polarization H or --rx-frame world" in caplog.text) is warned

@@ -127,6 +127,7 @@ class Predictor:
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
         if not self._pixels:
+            self.graph.check(np.asarray(tx_pos_m, float))
             for start in range(0, len(positions), TOGETHER):
                 part = slice(start, start + TOGETHER)
                 out[part] = self._reported(np.asarray(tx_pos_m, float)[part], index).reshape(-1, height, width)

@@ -188,8 +188,10 @@ class Trainer:
             init("llvm", threads=1)
         # Slots of the traced sides: all rows that train or choose.
         self._known = split.all_train
+        self.graph.check(record.tx_pos_m)
         self._sides = [self.graph.trace(record.tx_pos_m[self._known], r) for r in range(len(record.receivers))]
         if state is None:
+            self.graph.check_polarization(record.tx_pos_m[self._known])
             rng = np.random.default_rng([config.seed, 0])
             start = initial or initial_gaussians(config.initial, record, split.train, rng)
             state = FitState(self.field.init(start, rng) | self._traced_start())

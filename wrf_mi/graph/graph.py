@@ -74,8 +74,32 @@ class Graph:
             )
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self._tx_antenna = tx_antenna
+        self._prepared: Any | None = None
         hz = float("nan") if frequencies_hz is None else float(frequencies_hz[0])
         self.models = tuple(_model(kind, size, one, hz) for one in receivers)
+
+    def _prepare(self) -> Any:
+        from ..trace.solve import Prepared
+
+        if self._prepared is None:
+            self._prepared = Prepared(self.scene)
+        return self._prepared
+
+    def check(self, tx_pos_m: FloatArray) -> None:
+        """Refuse transmitters [n, 3] and receivers inside the scene's solids, warn of those near surfaces.
+
+        Raises:
+            InputError: naming the transmitter or receiver, and the solid.
+        """
+        if self.scene is not None:
+            self._prepare().check(tx_pos_m, self.receivers)
+
+    def check_polarization(self, tx_pos_m: FloatArray) -> None:
+        """Warn of receivers that are polarised across what arrives of transmitters [n, 3]."""
+        if self.scene is not None:
+            from ..trace.polarization import check_polarization
+
+            check_polarization(self.scene, tx_pos_m, self.receivers, self._tx_antenna)
 
     def trace(self, tx_pos_m: ArrayLike, number: int) -> TracedField | None:
         """The traced side of transmitters [n, 3] at one receiver; None without a scene."""
@@ -93,7 +117,7 @@ class Graph:
             rays=t.rays,
         )
         options = TracedOptions(what, t.pattern_degree, tx_antenna=self._tx_antenna)
-        return TracedField(self.scene, tx_pos_m, self.receivers[number], options)
+        return TracedField(self.scene, tx_pos_m, self.receivers[number], options, prepared=self._prepare())
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
         """Starting values of the traced side's parameters that a rate moves, by name; sides of all receivers."""

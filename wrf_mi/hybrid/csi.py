@@ -60,6 +60,7 @@ class CsiHybrid:
     """
 
     task: ClassVar[str] = "csi"
+    uses_heading: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -116,6 +116,7 @@ class MeasuredSpectrumHybrid:
     """
 
     task = "spectrum"
+    uses_heading = False
 
     def __init__(
         self,

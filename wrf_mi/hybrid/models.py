@@ -27,6 +27,11 @@ class HybridModel(Protocol):
         """Whose observations it predicts."""
         ...
 
+    @property
+    def uses_heading(self) -> bool:
+        """Whether it predicts from how the transmitter is turned."""
+        ...
+
     def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """What a receiver observes of transmitters at [q, 3], metres, turned by [q] rad, and how sure that is.
 

@@ -160,6 +160,11 @@ class RssiHybrid:
         self.receivers, self._field, self._stops = receivers, field, stops
         self._shift_db, self._widen, self._facts = shift_db, widen, dict(facts)
 
+    @property
+    def uses_heading(self) -> bool:
+        """Whether the training rows had headings."""
+        return bool(self._field.headings)
+
     def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Signal strengths in dBm, [m], with the standard deviation of a single report.
 

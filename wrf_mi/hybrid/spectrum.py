@@ -97,6 +97,7 @@ class SpectrumHybrid:
     """
 
     task = "spectrum"
+    uses_heading = False
 
     def __init__(self, models: tuple[SpectrumModel, ...], facts: Mapping[str, Any]) -> None:
         self.models, self._facts = models, dict(facts)

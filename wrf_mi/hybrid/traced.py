@@ -32,6 +32,7 @@ from ..core.types import IntArray
 from ..project.footprint import Pose
 from ..trace import TraceOptions, TraceResult, trace_paths
 from ..trace.buffer import SPECULAR, TRANSMISSION
+from ..trace.solve import Prepared
 from ..trace.surfaces import Surfaces, scene_surfaces
 from .follow import Chains, Complex, Level, Tables, Vector, follow
 from .materials import read_materials
@@ -103,6 +104,8 @@ class TracedField:
         options: see `TracedOptions`.
         tx_heading_rad: yaw of each transmitter's own frame about +z, shape [n]; None: 0.
         traced: paths found before, from the same transmitters to the same receiver; None: they are searched now.
+        prepared: of the scene, where many fields are traced in it: rays of a receiver are then shot once, and who made
+            it checks the antennas (`wrf_mi.trace.solve.Prepared.check`).
 
     Raises:
         ValueError: positions or headings of another shape or not finite.
@@ -117,6 +120,7 @@ class TracedField:
         options: TracedOptions = TracedOptions(),
         tx_heading_rad: ArrayLike | None = None,
         traced: TraceResult | None = None,
+        prepared: Prepared | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
         if self.tx_pos_m.ndim != 2 or self.tx_pos_m.shape[1] != 3 or not np.isfinite(self.tx_pos_m).all():
@@ -129,6 +133,7 @@ class TracedField:
             text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
             raise InputError(f"{text}; trace these")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
+        self._prepared = prepared
         self.frequency_hz = float(scene.frequency[0])
         self.searches = 0
         quarter_m = speed_of_light / self.frequency_hz / 4
@@ -224,8 +229,9 @@ class TracedField:
 
     def _search(self, here_m: FloatArray) -> None:
         receiver = replace(self.receiver, position_m=here_m)
-        antenna = self.options.tx_antenna
-        self._take(trace_paths(self.scene, self.tx_pos_m, receiver, self.options.trace, tx_antenna=antenna), here_m)
+        how: dict[str, Any] = {"tx_antenna": self.options.tx_antenna, "check": self._prepared is None}
+        found = trace_paths(self.scene, self.tx_pos_m, receiver, self.options.trace, prepared=self._prepared, **how)
+        self._take(found, here_m)
         self.searches += 1
 
     def _take(self, traced: TraceResult, here_m: FloatArray) -> None:

@@ -26,9 +26,11 @@ from ..measure import make_splits
 from ..measure.observations import check_observations
 from ..tasks import instrument_of
 from ..trace import load_record, open_scene
+from ..trace.polarization import check_polarization
 from ..trace.solve import Prepared
 from .fitted_run import FittedConfig, FittedRun, opened
 from .run_folder import stated_model
+from .traced import UNUSED_HEADING
 
 logger = logging.getLogger(__name__)
 
@@ -97,13 +99,16 @@ class HybridRun(FittedRun[HybridConfig, HybridModel]):
         return cls(folder, config, load_record(config.dataset))
 
     def check_antennas(self) -> None:
-        """Refuse antennas inside the scene's solids and warn of those near surfaces, as `wrf-mi trace` does.
+        """Refuse antennas in solids, warn of those near surfaces and of crossed polarisations, as `wrf-mi trace` does.
 
         Raises:
             InputError: naming the transmitter or receiver, and the solid.
         """
         if self._scene is not None:
-            Prepared(self._scene).check(np.asarray(self.record.tx_pos_m, float), self.record.receivers)
+            places = np.asarray(self.record.tx_pos_m, float)
+            Prepared(self._scene).check(places, self.record.receivers)
+            if self._kind.uses_antennas:
+                check_polarization(self._scene, places, self.record.receivers, self.record.tx_antenna)
 
     def fit(self, rows: Split, listen: Listen) -> HybridModel:
         """Fit it to all training rows."""
@@ -257,7 +262,13 @@ def predict_hybrid(
 def predict_with(
     model: HybridModel, tx_pos_m: FloatArray, tx_heading_rad: FloatArray | None
 ) -> tuple[NDArray[Any], FloatArray, tuple[str, ...]]:
-    """The same with a run's model from `open_hybrid`."""
+    """The same with a run's model from `open_hybrid`.
+
+    Raises:
+        InputError: headings for a model that does not use them.
+    """
+    if tx_heading_rad is not None and not model.uses_heading:
+        raise InputError(f"{MODEL}: {UNUSED_HEADING}")
     found = [model.predict(tx_pos_m, r, tx_heading_rad) for r in range(len(model.receivers))]
     names = tuple(receiver.name for receiver in model.receivers)
     return np.stack([e.mean for e in found]), np.stack([e.stated_std for e in found]), names

@@ -70,6 +70,10 @@ class Run:
 
     folder: Path
 
+    def __post_init__(self) -> None:
+        """Take the folder's name as text, too."""
+        object.__setattr__(self, "folder", Path(self.folder))
+
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """Content of ``metrics.json``."""

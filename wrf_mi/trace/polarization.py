@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ..core import Antenna, Receiver
 from ..core.angles import FloatArray
+from .options import TraceOptions
 from .result import TraceResult, recompute
+from .solve import trace_paths
 
 logger = logging.getLogger(__name__)
 
@@ -17,6 +21,8 @@ GAIN_DB = 10.0
 polarisation of some paths, but of a link that is polarised as meant most power keeps it."""
 SAMPLE = 256
 """Transmitters on which it is judged."""
+TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections=1, rays=1 << 12)
+"""Transmitters, and what is traced, where a model does not trace all of them at once."""
 
 
 def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
@@ -57,6 +63,20 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
         now.polarization,
         now.frame,
     )
+
+
+def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
+    """Trace a few transmitters and warn of cross-polarised receivers, for models that trace by themselves.
+
+    Args:
+        scene: ``sionna.rt.Scene``.
+        tx_pos_m: transmitters [n, 3], metres.
+        receivers: with their antennas.
+        tx_antenna: antenna of the transmitters.
+    """
+    few = np.unique(np.linspace(0, len(tx_pos_m) - 1, min(TRACED, len(tx_pos_m))).round().astype(int))
+    traced = trace_paths(scene, tx_pos_m[few], receivers, ROUGH, tx_antenna=tx_antenna, check=False)
+    warn_of_cross_polarization(traced, scene)
 
 
 def _median_power(traced: TraceResult) -> FloatArray:
