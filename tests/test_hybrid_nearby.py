@@ -257,7 +257,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, hybr
         errors = []
         for posterior, kriged, _ in by_gap:
             weight = posterior.ignorance**2 / (posterior.ignorance**2 + half**2)
-            mixed = kriged + weight[:, None, None] * (hybrid._report(posterior)[0] - kriged)
+            mixed = kriged + weight[:, None, None] * (hybrid._reports[0](posterior)[0] - kriged)
             errors.append(np.square(mixed - observed).mean())
         return float(np.mean(errors))
 
