@@ -203,7 +203,7 @@ def test_predictions_of_another_shape_are_named(tmp_path: Path):
 def test_fields_are_fitted_to_spectra_alone(tmp_path: Path, task: str, split: str):
     from wrf_mi.report.runs import train
 
-    with pytest.raises(InputError, match=f"made-up: task '{task}'; .* spectra") as error:
+    with pytest.raises(InputError, match=f"made-up: holds {task}; .* spectra") as error:
         train(record(task, 1), tmp_path / "run", split=split)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()

@@ -285,7 +285,7 @@ def test_an_unknown_factor_of_the_instrument_is_found(right: Any, measured: Reco
 def test_what_cannot_be_fitted_is_refused(measured: Record, fitted: CsiHybrid) -> None:
     with pytest.raises(InputError, match="neither training rows nor a scene"):
         fit_csi(measured, np.zeros(0, np.int64), None)
-    with pytest.raises(InputError, match="needs channels"):
+    with pytest.raises(InputError, match="holds rssi; this hybrid predicts channels"):
         fit_csi(replace(measured, task="rssi"), np.arange(5), None)
     with pytest.raises(InputError, match="no receiver 1"):
         fitted.predict(measured.tx_pos_m, 1)

@@ -266,7 +266,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, hybr
     assert left(fitted.half) <= min(left(half) for half in others)
     inside = []
     for posterior, kriged, deviation in by_gap:
-        mean, std = measured_spectrum._mixed(posterior, hybrid._report, kriged, deviation, fitted)
+        mean, std = measured_spectrum._mixed(posterior, hybrid._reports[0], kriged, deviation, fitted)
         inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 
@@ -324,7 +324,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("change", "count", "message"),
     [
-        ({"task": "csi"}, 20, "task csi; this hybrid predicts spectra"),
+        ({"task": "csi"}, 20, "holds csi; this hybrid predicts spectra"),
         ({"array_m": None}, 20, "array or frequency is not known; state both in its gateway_info.yml"),
         ({"frequencies_hz": None}, 20, "array or frequency is not known"),
         ({}, LEAST_ROWS - 1, f"7 training rows without a mesh; give {LEAST_ROWS} or more, or a scene"),

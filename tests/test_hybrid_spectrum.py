@@ -269,7 +269,7 @@ def test_without_a_mesh_there_is_the_direct_path(bare: SpectrumModel) -> None:
 
 def test_bad_input_is_refused(bare: SpectrumModel) -> None:
     record = record_of(bare, places(3, 8))
-    with pytest.raises(InputError, match="task"):
+    with pytest.raises(InputError, match="holds rssi; this hybrid predicts spectra"):
         fit_spectrum(replace(record, task="rssi"), np.arange(3), None)
     with pytest.raises(InputError, match="array or carrier"):
         fit_spectrum(record.with_array(None), np.arange(3), None)

@@ -68,7 +68,7 @@ def test_bad_input_is_refused_before_anything_starts(
         (folder, ["batch=1,0"], "batch: 0 is out of range"),
         (folder, ["split=official,blocked:9"], "blocked"),
         (folder, ["initial.points=nowhere.ply"], "nowhere.ply"),
-        (folder, ["scene=a,b"], "belong to --model ray-tracing"),
+        (folder, ["scene=a,b"], "carrier frequency unknown"),
         (folder, ["model=hybrid", "steps=1"], "steps"),
         (folder, ["model=hybrid", "n-train=0,4"], "nothing to predict from"),
         (flat_folder, ["model=factorised", "seed=0,1"], "learned fields are fitted to spectra"),

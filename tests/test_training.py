@@ -167,14 +167,14 @@ def test_nothing_is_compiled_after_the_first_steps(model: str, two_gateways: Rec
     trainer = Trainer(two_gateways, official(two_gateways), settings(*own, model=model))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
         trainer.run(stop=stop_after(10))
-        recordings = trainer._step.n_recordings
+        recordings = sum(step.n_recordings for step in trainer._steps.values())
         dr.kernel_history_clear()
         trainer.run(stop=stop_after(20))
         history = dr.kernel_history([dr.KernelType.JIT])
     assert trainer.state.step == 30
     assert len(history) >= 20
     assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
-    assert trainer._step.n_recordings == recordings
+    assert sum(step.n_recordings for step in trainer._steps.values()) == recordings
 
 
 def test_garbage_waits_while_a_function_is_recorded(one_gateway: Record) -> None:
@@ -247,7 +247,7 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
 
 
 def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
-    with pytest.raises(InputError, match="task 'rssi'; learned fields are fitted to spectra"):
+    with pytest.raises(InputError, match="holds rssi; learned fields are fitted to spectra"):
         Trainer(replace(one_gateway, task="rssi"), official(one_gateway), settings())
     with pytest.raises(InputError, match="model 'nerf2' cannot be trained here"):
         Trainer(one_gateway, official(one_gateway), settings("model=nerf2"))
@@ -291,7 +291,7 @@ def _break_gradient_of(trainer: Trainer, name: str) -> None:
             found.signal = [s + zero for s in found.signal]
             return found
 
-    trainer.field = Broken(**{f: getattr(trainer.field, f) for f in trainer.field.__dataclass_fields__})
+    trainer.graph.field = Broken(**{f: getattr(trainer.field, f) for f in trainer.field.__dataclass_fields__})
     trainer.record_functions()
 
 

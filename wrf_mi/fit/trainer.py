@@ -179,9 +179,8 @@ class Trainer:
         config = config.resolved(record.tx_pos_m[split.all_train], scene is not None)
         self.record, self.split, self.config = record, split, config
         self.height, self.width = (int(s) for s in record.observation.shape[-2:])
-        self.field = field or make_field(config)
         self._loss = loss or partial(_paper_loss, eta=config.structural_weight)
-        self.graph = graph_of(self.field, record, config, scene)
+        self.graph = graph_of(field or make_field(config), record, config, scene)
         self.schedule = plan(config, split, len(record.receivers))
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
@@ -204,6 +203,11 @@ class Trainer:
         )
         self.record_functions()
         self.seconds = 0.0
+
+    @property
+    def field(self) -> Field:
+        """The Gaussians of the graph."""
+        return self.graph.field
 
     def record_functions(self) -> None:
         """Forget recorded kernels: the number of Gaussians stands in them as a constant."""

@@ -210,14 +210,14 @@ def check_fit(
             check_observations(record, one, complete=True)
             plan(settings, one, len(record.receivers))
             initial_gaussians(settings.initial, record, one.train, np.random.default_rng([settings.seed, 0]))
-        return
-    for one in rows:
-        check_observations(record, one)
+    else:
+        for one in rows:
+            check_observations(record, one)
     if isinstance(settings, tuple):
         with_settings(kind_of(record, scene is not None).settings(), settings)
         if split[2] == 0 and scene is None:
             raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
-    elif calibration is not None and not task_of(record).in_decibel:
+    elif not isinstance(settings, TrainConfig) and calibration is not None and not task_of(record).in_decibel:
         raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
     if scene is not None:
         _open_scene(scene, instrument_of(record).carrier_hz, material)
