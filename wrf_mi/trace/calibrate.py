@@ -18,6 +18,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..measure.splits import position_folds
 from ..receive.graph import path_power, power_sum_db
+from ..tasks import task_of
 from .buffer import to_buffer
 from .calibration import Calibration, calibrated_rssi, harmonics, in_body, with_materials
 from .fields import field_of
@@ -91,7 +92,7 @@ def calibrate(
     Raises:
         InputError: not signal strengths, paths of other positions, or a receiver without a row to fit to.
     """
-    if record.observation.ndim != 2:
+    if not task_of(record).in_decibel:
         raise InputError(f"{record.name}: holds {record.task}; calibration needs signal strengths (rssi)")
     if trace.paths.n_tx != len(record) or trace.paths.n_rx != len(record.receivers):
         raise InputError(f"{record.name}: paths of {trace.paths.n_tx} positions for {len(record)} rows; trace it anew")
