@@ -120,7 +120,6 @@ CHECKS: Mapping[str, Check] = {
     "hybrid-room": Check("hybrid, traced room", "bench_hybrid_room:main"),
     "hybrid-starts": Check("WRF-GS+, traced room", "bench_starts:main"),
     "pareto": Check("traced room", "bench_pareto:main", data=("traced-room",)),
-    "sentinels": Check("figures kept", "bench_sentinels:main", data=(RFID, FLAT, CONFERENCE, OFFICE)),
     "scaling": Check("cost against work", "bench_scaling:main"),
     "operator": Check("prediction by operator", "bench_operator:main"),
     "budgets": Check("fields at budgets", "bench_budget:main", data=(RFID,)),
