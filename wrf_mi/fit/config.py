@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..field.encoding import telling_scale
-from ..graph.settings import MOST_DEGREE, ReceiverModel, TracedConfig
+from ..graph.settings import ReceiverModel, TracedConfig
 from ..splat.skip import Skip
-from ..trace.options import MAX_DEPTH, MAX_RAYS
+from ..trace.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ _RANGES: Mapping[str, _Range] = {
     "density.reset_opacity": _INSIDE,
     "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
     "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
-    "traced.pattern_degree": (lambda x: 0 <= x <= MOST_DEGREE, f"0 to {MOST_DEGREE}"),
+    "traced.pattern_degree": (lambda x: 0 <= x <= MAX_DEGREE, f"0 to {MAX_DEGREE}"),
 }
 """What numbers may be, and words for it; `_NOT_NEGATIVE` where nothing is said here."""
 

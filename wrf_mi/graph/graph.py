@@ -12,6 +12,7 @@ is not imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
@@ -24,7 +25,7 @@ from ..core.antenna import ANTENNA
 from ..field import Factorised, WrfGs, WrfGsPlus
 from ..hybrid.combine import ArrayReceiver, PixelReceiver
 from ..hybrid.learned import learned_field
-from ..hybrid.pose import position_name, receiver_pose, turn_name
+from ..hybrid.pose import receiver_pose
 from ..project.footprint import Pose
 from ..splat.tiles import Plane
 from .settings import DEFAULT, ReceiverModel, TracedConfig
@@ -74,16 +75,14 @@ class Graph:
             )
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self._tx_antenna = tx_antenna
-        self._prepared: Any | None = None
         hz = float("nan") if frequencies_hz is None else float(frequencies_hz[0])
         self.models = tuple(_model(kind, size, one, hz) for one in receivers)
 
-    def _prepare(self) -> Any:
+    @cached_property
+    def _prepared(self) -> Any:
         from ..trace.solve import Prepared
 
-        if self._prepared is None:
-            self._prepared = Prepared(self.scene)
-        return self._prepared
+        return Prepared(self.scene)
 
     def check(self, tx_pos_m: FloatArray) -> None:
         """Refuse transmitters [n, 3] and receivers inside the scene's solids, warn of those near surfaces.
@@ -92,7 +91,7 @@ class Graph:
             InputError: naming the transmitter or receiver, and the solid.
         """
         if self.scene is not None:
-            self._prepare().check(tx_pos_m, self.receivers)
+            self._prepared.check(tx_pos_m, self.receivers)
 
     def check_polarization(self, tx_pos_m: FloatArray) -> None:
         """Warn of receivers that are polarised across what arrives of transmitters [n, 3]."""
@@ -117,7 +116,7 @@ class Graph:
             rays=t.rays,
         )
         options = TracedOptions(what, t.pattern_degree, tx_antenna=self._tx_antenna)
-        return TracedField(self.scene, tx_pos_m, self.receivers[number], options, prepared=self._prepare())
+        return TracedField(self.scene, tx_pos_m, self.receivers[number], options, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
         """Starting values of the traced side's parameters that a rate moves, by name; sides of all receivers."""
@@ -159,11 +158,6 @@ class Graph:
         for _ in range(MATCHING):
             gain[0] += missing_gain(view, side, {**params, side.gain_name: mi.TensorXf(gain)})
         return {side.gain_name: gain}
-
-    def learned_names(self, names: Sequence[str]) -> list[str]:
-        """Those of a graph's parameters that are the field's."""
-        own = {name for one in self.receivers for name in (position_name(one), turn_name(one))}
-        return [n for n in names if n not in own and not n.startswith(("material.", "receiver.", "pattern."))]
 
 
 def _model(kind: str, size: tuple[int, int], receiver: Receiver, frequency_hz: float) -> PixelReceiver:

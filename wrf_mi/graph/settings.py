@@ -9,9 +9,6 @@ ReceiverModel = Literal["auto", "pixel", "array"]
 RECEIVERS = ("pixel", "array")
 """Receiver models of spectra, see `wrf_mi.hybrid.combine`."""
 
-MOST_DEGREE = 8
-"""Of an antenna's pattern: more harmonics than Dr.Jit's `sh_eval` has."""
-
 
 @dataclass(frozen=True)
 class TracedConfig:

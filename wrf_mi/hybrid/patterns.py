@@ -15,8 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_DEGREE = 8
-"""More than Dr.Jit's `sh_eval` or a single antenna's pattern asks for is refused."""
+from ..trace.options import MAX_DEGREE
 
 
 def pattern_coefficients(degree: int) -> NDArray[np.float32]:

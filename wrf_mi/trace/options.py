@@ -9,6 +9,8 @@ from ..core import InputError
 
 MAX_DEPTH = 12
 MAX_RAYS = 1 << 24
+MAX_DEGREE = 8
+"""Of trainable antenna patterns: a single antenna's asks for no more, and Dr.Jit's `sh_eval` has few more."""
 
 
 @dataclass(frozen=True)
