@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrf_mi.baselines.conditions import normalised_uplink
 from wrf_mi.baselines.csi_bands import relative_error
 from wrf_mi.baselines.linear import METHOD, PENALTIES, LinearMap, LinearSettings, choose
 from wrf_mi.baselines.method import Inputs, inputs_of
 from wrf_mi.baselines.models import METHODS
 from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.tasks.conditions import normalised_uplink
 
 ROWS, ANTENNAS, UP, DOWN = 40, 3, 6, 5
 EXACT = 1e-5

@@ -16,7 +16,6 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
-from wrf_mi.baselines.conditions import channels_from, normalised_uplink  # noqa: E402
 from wrf_mi.baselines.conv import (  # noqa: E402
     NORM_FLOOR,
     Grid,
@@ -35,6 +34,7 @@ from wrf_mi.baselines.training import Descent, Training, epochs, fit_network  # 
 from wrf_mi.baselines.vae import elbo_loss, pooled  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError  # noqa: E402
+from wrf_mi.tasks.conditions import channels_from, normalised_uplink  # noqa: E402
 
 EXACT = 1e-12
 """Some hundred float64 products of numbers around one."""

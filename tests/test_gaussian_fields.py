@@ -1,4 +1,4 @@
-"""WRF-GS and WRF-GS+ for signal strengths and channels: against the operator, principal components, round trips."""
+"""WRF-GS, WRF-GS+ and factorised fields for signal strengths and channels: against the operator, round trips."""
 
 from dataclasses import replace
 
@@ -14,29 +14,36 @@ import mitsuba as mi  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.baselines import nerf2  # noqa: E402
-from wrf_mi.baselines.band_fields import spread  # noqa: E402
-from wrf_mi.baselines.gaussian_evaluation import AT_ONCE, Evaluation, GaussianSettings, frame_of  # noqa: E402
-from wrf_mi.baselines.gaussian_fields import components_of, method_of  # noqa: E402
 from wrf_mi.baselines.method import inputs_of  # noqa: E402
-from wrf_mi.baselines.models import METHODS  # noqa: E402
 from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
-from wrf_mi.field import random_gaussians  # noqa: E402
+from wrf_mi.field import FIELDS  # noqa: E402
+from wrf_mi.field.gaussians import by_component  # noqa: E402
+from wrf_mi.fit.config import TrainConfig, default_config, with_settings  # noqa: E402
+from wrf_mi.fit.folder import RunConfig, load_predictor, resume_run, start_run, write_checkpoint  # noqa: E402
+from wrf_mi.fit.predictor import TOGETHER, Predictor  # noqa: E402
 from wrf_mi.fit.step import device_pose  # noqa: E402
+from wrf_mi.fit.targets import targets_of  # noqa: E402
+from wrf_mi.fit.trainer import Trainer  # noqa: E402
 from wrf_mi.receive.operator import SectorOperator  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
 
-MODELS = ("wrf-gs", "wrf-gs+")
-SMALL = GaussianSettings(
-    training=Training(steps=120, batch=8, rate=2e-3, rounds=2),
-    gaussians=12,
-    layers=2,
-    width=16,
-    height=6,
-    columns=24,
-    components=3,
+MODELS = tuple(FIELDS)
+SMALL = (
+    "steps=500",
+    "batch=8",
+    "hold_out=0.5",
+    "optimiser.network=2e-3",
+    "optimiser.warm_up=20",
+    "optimiser.averaging=0.98",
+    "initial.gaussians=12",
+    "network.layers=2",
+    "network.width=16",
+    "view.height=6",
+    "view.columns=24",
+    "view.components=3",
 )
 THREADED = 1e-2
 """Of the largest value: ten steps of Adam, whose gradients are summed by threads in any order."""
@@ -79,91 +86,113 @@ def halves(record: Record, validation: int = 6) -> Split:
     return Split("halves", 0, rows[: 40 - validation], rows[40 - validation : 40], rows[40:])
 
 
-def quiet(what: str, share: float) -> None:
-    """Hears of progress."""
+def config(record: Record, *settings: str) -> TrainConfig:
+    return with_settings(default_config(record.task), [*SMALL, *settings])
+
+
+def fitted(record: Record, split: Split, *settings: str) -> Predictor:
+    trainer = Trainer(record, split, config(record, *settings))
+    trainer.run()
+    return trainer.predictor()
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_power_is_that_of_the_operator_over_the_full_sphere(model):
+def test_power_is_that_of_the_operator_over_the_full_sphere(model: str) -> None:
     record = strengths()
-    settings = replace(SMALL, tx_scale_m=SMALL.scale_m)
-    evaluation = Evaluation(settings, frame_of(model, record, np.ones((1, 1), complex), np.ones(2)), 0)
-    rng = np.random.default_rng(3)
-    weights = evaluation.field.init(random_gaussians(record.receivers, 12, rng, size_deg=20, sphere=True), rng)
-    offsets = np.array([[-3.0, 7.0]], np.float32)
-    params = {name: to_tensor(values) for name, values in (weights | {"offset": offsets}).items()}
-    tx = to_tensor(record.tx_pos_m[:1].T)
+    trainer = Trainer(record, halves(record), config(record, f"model={model}"))
+    trainer.state.set_param("level", np.array([[-0.3, 0.7]], np.float32))
+    params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
+    arrays = {name: value.numpy() for name, value in params.items()}
+    predict = Predictor(trainer.field, arrays, record.receivers, 6, 24, graph=trainer.graph)
     for r, receiver in enumerate(record.receivers):
-        found = evaluation.predict(params, tx, r)[0, 0]
-        gaussians = evaluation.field.gaussians(params, tx)
+        found = predict(record.tx_pos_m[:1], r)[0]
+        gaussians = trainer.field.gaussians(params, to_tensor(record.tx_pos_m[:1].T))
         operator = SectorOperator.of(gaussians, device_pose(receiver), perception_plane(6, 24, mi.Float))
         re, im = (part.numpy() for part in gaussians.signal)
-        assert found == pytest.approx(offsets[0, r] + operator.power_db((re + 1j * im)[None])[0], abs=ROUNDING)
+        level_db = 20 / np.log(10) * (-0.3, 0.7)[r]
+        assert found == pytest.approx(level_db + operator.power_db((re + 1j * im)[None])[0], abs=ROUNDING)
 
 
-def test_spread_gives_each_component_an_image_of_its_own():
+@pytest.mark.parametrize("model", MODELS)
+def test_a_fit_begins_at_the_level_of_what_each_receiver_observed(model: str) -> None:
+    record = strengths()
+    louder = replace(record, observation=record.observation + np.array([[0], [-35]], np.float32))
+    predict = Trainer(louder, halves(louder), config(louder, f"model={model}")).predictor()
+    rows = halves(louder).all_train
+    for r in range(2):
+        found = predict(louder.tx_pos_m[rows], r).mean()
+        assert found == pytest.approx(np.nanmean(louder.observation[r, rows]), abs=1.0)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_component_has_an_image_of_its_own(model: str) -> None:
     record = channels()
-    frame = frame_of("wrf-gs+", record, np.eye(3, 8, dtype=complex), np.ones(1))
-    evaluation = Evaluation(SMALL, frame, 16)
-    rng = np.random.default_rng(0)
-    weights = evaluation.field.init(random_gaussians(record.receivers, 5, rng, sphere=True), rng)
-    params = {name: to_tensor(values) for name, values in weights.items()}
-    given = evaluation.field.gaussians(params, to_tensor(rng.normal(size=(16, 4))))
-    found = spread(given, 3)
-    assert found.batch == 12
-    assert found.count == 5
+    trainer = Trainer(record, halves(record), config(record, f"model={model}", "initial.gaussians=5"))
+    params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
+    given = trainer.field.gaussians(params, to_tensor(np.random.default_rng(0).normal(size=(16, 4))))
+    found = by_component(given, 3)
+    assert (found.batch, found.count) == (12, 5)
+    shared = dr.width(given.scale[0]) == 5
     for component in range(3):
         for part, half in ((0, 0), (1, 3)):
             signal = found.signal[part].numpy().reshape(4, 3, 5)[:, component]
             np.testing.assert_array_equal(signal, given.signal[half + component].numpy().reshape(4, 5))
-        for wide, narrow in zip((*found.scale, found.opacity), (*given.scale, given.opacity), strict=True):
-            np.testing.assert_array_equal(
-                wide.numpy().reshape(4, 3, 5)[:, component], narrow.numpy().reshape(4, 5), strict=True
-            )
+        if not shared:
+            for wide, narrow in zip((*found.scale, found.opacity), (*given.scale, given.opacity), strict=True):
+                one = wide.numpy().reshape(4, 3, 5)[:, component]
+                np.testing.assert_array_equal(one, narrow.numpy().reshape(4, 5), strict=True)
 
 
-def test_components_hold_what_channels_are_made_of():
+def test_components_hold_what_channels_are_made_of() -> None:
     rng = np.random.default_rng(0)
-    modes = rng.normal(size=(2, 7)) + 1j * rng.normal(size=(2, 7))
-    h = (rng.normal(size=(50, 2)) + 1j * rng.normal(size=(50, 2))) @ modes
-    basis = components_of(h, 2)
+    modes = rng.normal(size=(2, 8)) + 1j * rng.normal(size=(2, 8))
+    h = ((rng.normal(size=(60, 2)) + 1j * rng.normal(size=(60, 2))) @ modes)[None].astype(np.complex64)
+    tx = rng.uniform(-2, 2, (60, 3))
+    record = Record("made", "csi", tx, receivers(1), h)
+    basis = Trainer(record, halves(record), config(record, "view.components=2")).graph.form.basis
+    assert basis is not None
     np.testing.assert_allclose(basis @ basis.conj().T, np.eye(2), atol=1e-12)
-    np.testing.assert_allclose((h @ basis.conj().T) @ basis, h, atol=1e-10)
+    np.testing.assert_allclose((h[0] @ basis.conj().T) @ basis, h[0], atol=1e-5)
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("shared", [False, True])
-def test_strengths_are_learned_and_kept(model, shared):
+def test_strengths_are_learned_and_kept(model: str, tmp_path) -> None:
     record = strengths()
-    split, method = halves(record), method_of(model)
-    fitted = method.fit(record, split, replace(SMALL, shared=shared), 0, quiet)
-    inputs = inputs_of(record, split.test)
-    again = method.load(fitted.arrays(), record)
+    split = halves(record)
+    trainer = start_run(tmp_path, record, split, RunConfig("made", "halves", None, config(record, f"model={model}")))
+    trainer.run()
+    write_checkpoint(tmp_path, trainer)
+    predict, again = trainer.predictor(), load_predictor(tmp_path)
     for r in range(2):
-        found, truth = fitted.predict(inputs, r), record.observation[r, split.test]
+        found, truth = predict(record.tx_pos_m[split.test], r), record.observation[r, split.test]
         mean = np.abs(np.nanmean(record.observation[r, split.all_train]) - truth)
         assert np.median(np.abs(found - truth)) < np.median(mean)
-        np.testing.assert_array_equal(again.predict(inputs, r), found)
+        np.testing.assert_array_equal(again(record.tx_pos_m[split.test], r), found)
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_channels_are_learned_from_the_uplink_and_kept(model):
+def test_channels_are_learned_from_the_uplink_and_kept(model: str, tmp_path) -> None:
     record = channels()
-    split, method = halves(record), method_of(model)
-    settings = replace(SMALL, training=Training(steps=300, batch=32, rate=3e-3, rounds=3))
-    fitted = method.fit(record, split, settings, 0, quiet)
-    inputs = inputs_of(record, split.test)
-    found, truth = fitted.predict(inputs, 0), record.observation[0, split.test]
+    split = halves(record)
+    own = config(record, f"model={model}", "steps=400", "batch=32", "optimiser.network=3e-3")
+    trainer = start_run(tmp_path, record, split, RunConfig("made", "halves", None, own))
+    trainer.run()
+    write_checkpoint(tmp_path, trainer)
+    assert record.uplink is not None
+    nowhere, uplink, truth = record.tx_pos_m[split.test], record.uplink[split.test], record.observation[0, split.test]
+    found = trainer.predictor()(nowhere, 0, uplink)
     assert found.shape == truth.shape
 
     def error(prediction):
         return np.median(np.square(np.abs(prediction - truth)).sum((1, 2)) / np.square(np.abs(truth)).sum((1, 2)))
 
-    assert error(found) < 0.3 * error(record.uplink[split.test])
-    np.testing.assert_array_equal(method.load(fitted.arrays(), record).predict(inputs, 0), found)
+    assert error(found) < 0.3 * error(uplink)
+    np.testing.assert_array_equal(load_predictor(tmp_path)(nowhere, 0, uplink), found)
+    with pytest.raises(InputError, match="the rows to predict have none; give `uplink`"):
+        trainer.predictor()(nowhere, 0)
 
 
-def two_stations(rows: int = 60) -> Record:
+def two_stations(rows: int = 60, antennas: int = 1) -> Record:
     """Channels over positions; the second station's are 20 dB weaker and orthogonal to the first's, some unheard."""
     rng = np.random.default_rng(4)
     tx = np.column_stack([rng.uniform(-2, 2, (rows, 2)), np.full(rows, 0.3)])
@@ -171,69 +200,127 @@ def two_stations(rows: int = 60) -> Record:
     h = np.exp(1j * tx[:, :1]) * modes[:, None] * np.array([1e-3, 1e-4])[:, None, None]
     h[0, :5] = np.nan
     h[1, 3:9] = np.nan
+    if antennas > 1:
+        h = h.reshape(2, rows, antennas, -1)
     return Record("made", "csi", tx, receivers(2), h.astype(np.complex64))
 
 
-def test_a_second_receiver_with_other_components_is_learned():
-    record = two_stations()
+@pytest.mark.parametrize("antennas", [1, 2])
+def test_a_second_receiver_with_other_components_is_learned(antennas: int) -> None:
+    record = two_stations(antennas=antennas)
     split = halves(record)
-    settings = replace(SMALL, components=2, training=Training(steps=300, batch=16, rate=3e-3, rounds=3))
-    fitted = method_of("wrf-gs+").fit(record, split, settings, 0, quiet)
-    inputs = inputs_of(record, split.test)
+    predict = fitted(record, split, "view.components=2", "steps=700", "batch=16", "optimiser.network=3e-3")
     for r in range(2):
-        truth, found = record.observation[r, split.test], fitted.predict(inputs, r)
-        error = np.square(np.abs(found - truth)).sum(axis=1) / np.square(np.abs(truth)).sum(axis=1)
+        truth, found = record.observation[r, split.test], predict(record.tx_pos_m[split.test], r)
+        assert found.shape == truth.shape
+        size = tuple(range(1, truth.ndim))
+        error = np.square(np.abs(found - truth)).sum(axis=size) / np.square(np.abs(truth)).sum(axis=size)
         assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
 
 
-@pytest.mark.parametrize("name", [*MODELS, "nerf2"])
-def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(name):
+@pytest.mark.parametrize("model", [*MODELS, "nerf2"])
+def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
     """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""
     record, weak = two_stations(), 2.0**-7
     fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
-    split, quick = halves(record), Training(steps=10, batch=8, rounds=1)
-    method = METHODS[name]
-    settings = (
-        Nerf2Settings(training=quick, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
-        if name == "nerf2"
-        else replace(SMALL, components=2, shared=True, training=quick)
-    )
-    inputs = inputs_of(record, split.test)
-    plain, faint = (method.fit(one, split, settings, 0, quiet).predict(inputs, 1) for one in (record, fainter))
+    split = halves(record)
+    quick = Training(steps=10, batch=8, rounds=1)
+    small = Nerf2Settings(training=quick, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
+
+    def predicted(one: Record):
+        if model == "nerf2":
+            kept = nerf2.METHOD.fit(one, split, small, 0, lambda what, share: None)
+            return kept.predict(inputs_of(one, split.test), 1)
+        return fitted(one, split, f"model={model}", "view.components=2", "steps=10")(one.tx_pos_m[split.test], 1)
+
+    plain, faint = predicted(record), predicted(fainter)
     assert np.abs(plain).max() > 1e-6
     np.testing.assert_allclose(faint, weak * plain, rtol=0, atol=THREADED * weak * np.abs(plain).max())
 
 
-def test_any_number_of_rows_is_predicted_alike():
-    record = strengths(1, 2 * AT_ONCE + 3)
-    rows = np.arange(len(record))
-    split = Split("all", 0, rows[:40], rows[40:50], rows[50:])
-    quick = replace(SMALL, training=Training(steps=10, batch=8, rounds=1))
-    fitted = method_of("wrf-gs+").fit(record, split, quick, 0, quiet)
-    everything = fitted.predict(inputs_of(record, rows), 0)
-    alone = np.concatenate([fitted.predict(inputs_of(record, rows[i : i + 1]), 0) for i in (0, AT_ONCE, len(rows) - 1)])
-    # The same kernels on other numbers of columns: products round differently.
-    np.testing.assert_allclose(everything[[0, AT_ONCE, len(rows) - 1]], alone, atol=1e-3)
+def test_any_number_of_rows_is_predicted_alike() -> None:
+    record = strengths(1, 2 * TOGETHER + 53)
+    split = Split("all", 0, np.arange(40), np.arange(40, 50), np.arange(50, len(record)))
+    predict = fitted(record, split, "steps=10")
+    everything = predict(record.tx_pos_m, 0)
+    chosen = [0, TOGETHER, len(record) - 1]
+    np.testing.assert_array_equal(everything[chosen], [predict(record.tx_pos_m[i : i + 1], 0)[0] for i in chosen])
 
 
-def test_what_cannot_be_learned_from_is_refused():
-    method, record = method_of("wrf-gs+"), strengths()
+@pytest.mark.parametrize("hold_out", [0.5, 1.0])
+def test_a_fit_goes_on_from_its_best_moment(hold_out: float) -> None:
+    """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
+    record = strengths()
+    own = config(record, "steps=160", "validate_every=10", "patience=2", f"hold_out={hold_out}", "deterministic=true")
+    given, seen, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), [], {}
+    trainer = Trainer(record, halves(record), own)
+    trainer.validate = lambda: next(given)  # type: ignore[method-assign]
+
+    def listen(progress) -> None:
+        if progress.validation_ssim is not None:
+            seen.append((progress.step, progress.held_out))
+        if progress.step == 30:
+            kept.update(trainer.state.params())
+
+    trainer.run(listen)
+    left = 80 * 30 // 80 if hold_out < 1 else 0
+    assert [step for step, held_out in seen if held_out] == [10, 20, 30, 40, 50]
+    assert trainer.state.chosen == 30
+    assert trainer.state.step == 160
+    first = [step for step, held_out in seen if not held_out]
+    assert first == list(range(160 - left + 10, 161, 10))
+    if not left:
+        for name, values in trainer.state.params().items():
+            np.testing.assert_array_equal(values, kept[name])
+
+
+@pytest.mark.parametrize("stop", [25, 45, 150])
+def test_a_stopped_fit_chooses_as_one_that_was_not(stop: int, tmp_path) -> None:
+    record = strengths()
+    own = config(record, "steps=160", "validate_every=10", "patience=2", "deterministic=true")
+    whole = start_run(tmp_path / "whole", record, halves(record), RunConfig("made", "halves", None, own))
+    whole.run()
+    part = start_run(tmp_path / "part", record, halves(record), RunConfig("made", "halves", None, own))
+    part.run(save=lambda: write_checkpoint(tmp_path / "part", part), stop=lambda: part.state.step >= stop)
+    again = resume_run(tmp_path / "part", record)
+    again.run()
+    assert again.state.chosen == whole.state.chosen
+    for name, values in whole.state.mean_params().items():
+        np.testing.assert_array_equal(again.state.mean_params()[name], values)
+
+
+def test_rows_that_were_not_received_are_learned_from_at_no_receiver() -> None:
+    record = strengths()
+    targets = targets_of(record, np.arange(40))
+    assert set(range(40)) - set(targets.received(0, np.arange(40))) == {0, 1, 2}
+    np.testing.assert_array_equal(targets.received(1, np.arange(40)), np.arange(40))
+    trainer = Trainer(record, halves(record), config(record))
+    assert not set(trainer.schedule.rows[trainer.schedule.receiver == 0].ravel()) & {0, 1, 2}
+
+
+def test_what_cannot_be_learned_from_is_refused() -> None:
+    record = strengths()
     nowhere = replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="no position in row 0"):
-        method.fit(nowhere, halves(record), SMALL, 0, quiet)
+        Trainer(nowhere, halves(record), config(record))
     deaf = replace(record, observation=np.full_like(record.observation, np.nan))
-    with pytest.raises(InputError, match="received no training row"):
-        method.fit(deaf, halves(record), SMALL, 0, quiet)
-    dr.sync_thread()
+    with pytest.raises(InputError, match="receiver rx0: received none of 40 training rows"):
+        Trainer(deaf, halves(record), config(record))
 
 
-@pytest.mark.parametrize("name", [*MODELS, "nerf2"])
+@pytest.mark.parametrize("model", [*MODELS, "nerf2"])
 @pytest.mark.parametrize("lost", ["position_m", "orientation_xyzw"])
-def test_receivers_without_a_pose_are_refused_where_positions_tell(name, lost):
+def test_receivers_without_a_pose_are_refused_where_positions_tell(model: str, lost: str) -> None:
     record = strengths()
     unknown = replace(record.receivers[1], **{lost: np.full(3 if lost == "position_m" else 4, np.nan)})
     record = replace(record, receivers=(record.receivers[0], unknown))
-    method, quick = method_of(name) if name in MODELS else nerf2.METHOD, Training(steps=2, batch=4, rounds=1)
+    quick = Nerf2Settings(Training(steps=2, batch=4, rounds=1))
+
+    def fit():
+        if model == "nerf2":
+            return nerf2.METHOD.fit(record, halves(record), quick, 0, lambda what, share: None)
+        return Trainer(record, halves(record), config(record, f"model={model}"))
+
     with pytest.raises(InputError, match=r"made: the pose of receiver rx1 is not known.*give its position") as error:
-        method.fit(record, halves(record), method.settings(quick), 0, quiet)
+        fit()
     assert "\n" not in str(error.value)

@@ -17,10 +17,12 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.core import pixel_directions, unit_vectors
+from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.field import Gaussians
-from wrf_mi.hybrid.combine import Ports, magnitude, path_sum, power, scaled, solid_angles
+from wrf_mi.hybrid.combine import magnitude, power, scaled
 from wrf_mi.hybrid.learned import hemisphere_pair
+from wrf_mi.hybrid.ports import Ports, path_sum
 from wrf_mi.project.footprint import Pose
 from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale
 from wrf_mi.splat.tiles import perception_plane
@@ -126,7 +128,7 @@ def test_a_plane_wave_learned_is_one_traced() -> None:
 @pytest.mark.parametrize("how", ["coherent", "power"])
 def test_power_receiver(how: Any) -> None:
     """The integral of a constant over the full sphere is 4 pi."""
-    model = PowerReceiver(45, 60, (FREQUENCY_HZ,), how)
+    model = PowerReceiver(45, 60, (FREQUENCY_HZ,), how=how)
     made, found = paths()
     count = len(hemisphere_pair(45, 60))
     field = dr.full(Float64, 0.3, 2 * count), dr.full(Float64, -0.1, 2 * count)
@@ -148,13 +150,32 @@ def test_power_over_channels_and_without_interference() -> None:
     whole = (signal * np.tile(solid_angles(6, 8), 2)).sum(axis=1, keepdims=True)
     hopping = PowerReceiver(6, 8, frequencies)(made, field).numpy()
     np.testing.assert_allclose(hopping, 10 * np.log10((np.abs(traced + whole) ** 2).mean(axis=1)), atol=DOUBLE)
-    faded = PowerReceiver(6, 8, frequencies, "power", interference=False)
+    faded = PowerReceiver(6, 8, frequencies, how="power", interference=False)
     powers = (np.abs(found["gain"]) ** 2).sum(axis=1)
     expected = 10 * np.log10(powers + np.abs(whole[:, 0]) ** 2)
     np.testing.assert_allclose(faded(made, field).numpy(), expected, atol=DOUBLE)
     np.testing.assert_allclose(faded(made, None).numpy(), 10 * np.log10(powers), atol=1e-4)
-    with pytest.raises(ValueError, match="without interference"):
-        PowerReceiver(6, 8, frequencies, "coherent", interference=False)
+    # A mean power has no phase: as a complex number it is its root, which the learned side raises or lowers.
+    mixed = PowerReceiver(6, 8, frequencies, interference=False)
+    expected = 20 * np.log10(np.abs(np.sqrt(powers) + whole[:, 0]))
+    np.testing.assert_allclose(mixed(made, field).numpy(), expected, atol=DOUBLE)
+
+
+@pytest.mark.parametrize("antennas", [1, 3])
+def test_channels_of_a_basis(antennas: int) -> None:
+    """Learned coefficients times a basis, and paths at every antenna and subcarrier."""
+    frequencies, rng = (FREQUENCY_HZ, 1.01 * FREQUENCY_HZ), np.random.default_rng(4)
+    elements = rng.normal(0, 0.03, (antennas, 3))
+    basis = rng.normal(size=(4, 2 * antennas)) + 1j * rng.normal(size=(4, 2 * antennas))
+    model = CsiReceiver(6, 8, frequencies, elements if antennas > 1 else None, basis)
+    (made, found), (field, signal) = paths(), learned(2 * 4, 2 * 6 * 8)
+    places = elements if antennas > 1 else np.zeros((1, 3))
+    traced = np.stack([signals(found, places, K * f / FREQUENCY_HZ) for f in frequencies], axis=-1).reshape(2, -1)
+    coefficients = (signal * np.tile(solid_angles(6, 8), 2)).sum(axis=1).reshape(2, 4)
+    expected = traced + coefficients @ basis
+    report = model(made, field).numpy().reshape(2, -1, 2)
+    assert model.shape == ((antennas, 2, 2) if antennas > 1 else (2, 2))
+    np.testing.assert_allclose(report[..., 0] + 1j * report[..., 1], expected, atol=DOUBLE)
 
 
 def test_csi_receiver() -> None:

@@ -39,7 +39,7 @@ MODELS: dict[str, Any] = {
     "pixel": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent"),
     "pixel-power": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "power"),
     "array": ArrayReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent", instrument_scale=True),
-    "rssi": PowerReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ,), "coherent"),
+    "rssi": PowerReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ,)),
     "csi": CsiReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ, 1.01 * FREQUENCY_HZ)),
 }
 

@@ -27,10 +27,10 @@ from wrf_mi.hybrid import (
 import drjit as dr
 
 from wrf_mi.core import pixel_directions
+from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.types import Receiver
 from wrf_mi.field import Encoding, WrfGsPlus, random_gaussians
-from wrf_mi.hybrid.combine import solid_angles
 from wrf_mi.loss.spectrum import spectrum_loss
 from wrf_mi.receive.array import bartlett_spectrum
 from wrf_mi.receive.channel import element_signals

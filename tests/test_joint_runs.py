@@ -168,7 +168,7 @@ def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path,
         (["--rx-polarization", "H"], "--material and antenna options belong to a scene"),
         (["--scene", "nowhere"], "nowhere: no such scene"),
         (["--model", "kriging", "--receiver", "array"], "--receiver belongs to fields of spectra"),
-        (["--set", "receiver=horn"], "setting receiver: 'horn'; choose from auto, pixel, array"),
+        (["--set", "receiver=horn"], "receiver model 'horn': unknown; choose from pixel, array"),
         (["--set", "traced.pattern_degree=9"], "setting traced.pattern_degree: 9"),
     ],
 )

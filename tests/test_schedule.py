@@ -24,7 +24,8 @@ def split_of(train: int, validation: int = 3) -> Split:
 
 
 def plan_of(split: Split, receivers: int = 1, *settings: str, **values: Any) -> Schedule:
-    return plan(with_settings(TrainConfig(**values), settings), split, receivers)
+    config = with_settings(TrainConfig(**values), settings)
+    return plan(config, [split.train] * receivers, [split.all_train] * receivers)
 
 
 @given(
@@ -143,17 +144,20 @@ def test_rounds_of_density_control() -> None:
     assert plan_of(split_of(9), 1, *settings, "density.stop=1", steps=300).density == {100, 200}
 
 
-@pytest.mark.parametrize(
-    ("train", "validation", "settings", "message"),
-    [
-        (3, 2, ["batch=4"], "3 training rows beside 2 validation rows, batches need 4"),
-        (0, 1, [], "0 training rows beside 1 validation rows, batches need 1"),
-        (3, 1, ["batch=5", "hold_out=0"], "4 training rows, batches need 5"),
-    ],
-)
-def test_too_few_rows(train: int, validation: int, settings: list[str], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        plan_of(split_of(train, validation), 1, *settings, steps=10)
+def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
+    assert plan_of(split_of(3, 2), 1, "batch=4", steps=10).rows.shape == (10, 3)
+    assert plan_of(split_of(3, 1), 1, "batch=5", "hold_out=0", steps=10).rows.shape == (10, 4)
+    rows = [np.array([4, 7, 9]), np.array([1, 2, 3, 5, 6, 8])]
+    schedule = plan(with_settings(TrainConfig(batch=5, steps=9), ["hold_out=1"]), rows, rows)
+    assert schedule.rows.shape == (9, 3)
+    # An epoch has one batch of the first receiver and two of the second, each of its own rows.
+    for three in range(0, 9, 3):
+        owner = schedule.receiver[three : three + 3]
+        assert sorted(owner) == [0, 1, 1]
+        for number, batch in zip(owner, schedule.rows[three : three + 3], strict=True):
+            assert set(batch) <= set(rows[number])
+    with pytest.raises(InputError, match="no training row at one receiver beside 1 validation rows"):
+        plan_of(split_of(0, 1), 1, steps=10)
 
 
 def test_rows_that_join_at_once_count() -> None:

@@ -247,8 +247,9 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
 
 
 def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
-    with pytest.raises(InputError, match="holds rssi; learned fields are fitted to spectra"):
-        Trainer(replace(one_gateway, task="rssi"), official(one_gateway), settings())
+    levels = replace(one_gateway, task="rssi", observation=one_gateway.observation[..., 0, 0])
+    with pytest.raises(InputError, match="receiver model array does not report rssi; choose from power"):
+        Trainer(levels, official(levels), settings("receiver=array"))
     with pytest.raises(InputError, match="model 'nerf2' cannot be trained here"):
         Trainer(one_gateway, official(one_gateway), settings("model=nerf2"))
 

@@ -19,7 +19,6 @@ from .cli_train import print_json, progress_bar, show_metrics, sweep_command, tr
 from .core import BackendError, InputError
 from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from .core.files import os_failure
-from .graph.settings import RECEIVERS
 
 Arguments = argparse.Namespace
 
@@ -291,7 +290,7 @@ def _add_training(sub: Any) -> None:
     text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for hybrid, or alone for ray-tracing"
     sub.add_argument("--scene", metavar="SCENE", help=text)
     text = "of a field of spectra: pixel (magnitude at each direction) or array (element signals); default: by --scene"
-    sub.add_argument("--receiver", choices=RECEIVERS, help=text)
+    sub.add_argument("--receiver", metavar="NAME", help=text)
     _add_tracing(sub)
     sub.add_argument(
         "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"

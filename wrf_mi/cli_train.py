@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from .backend import init
-from .baselines.models import METHODS, PAPER
+from .baselines.models import METHODS
 from .core import AntennaOptions, InputError
 
 Arguments = argparse.Namespace
@@ -66,16 +66,8 @@ def _antennas(a: Arguments) -> AntennaOptions:
 
 
 def _baseline(a: Arguments) -> str | None:
-    """Name of the baseline that is to be trained: WRF-GS and WRF-GS+ are such where the data are no spectra."""
-    model = a.model or "wrf-gs+"
-    if model not in METHODS:
-        return None
-    if model in PAPER:
-        from .measure.registry import stated_task
-
-        # What is neither a path nor known is refused where it is read.
-        return model if a.dataset and stated_task(a.dataset) not in (None, "spectrum") else None
-    return model
+    """Name of the baseline that is to be trained."""
+    return a.model if a.model in METHODS else None
 
 
 def _check_options(a: Arguments) -> None:
@@ -146,9 +138,12 @@ def _train_field(a: Arguments) -> int:
 
 
 def _field_config(a: Arguments) -> Any:
-    from .fit.config import PRESETS, TrainConfig, with_settings
+    from .fit.config import PRESETS, default_config, with_settings
+    from .measure.registry import stated_task
 
-    config: Any = with_settings(TrainConfig(), PRESETS[a.preset or "default"])
+    # What is neither a path nor known is refused where it is read.
+    begun = default_config(stated_task(a.dataset) or "")
+    config: Any = with_settings(begun, PRESETS[a.preset or "default"])
     named = (("model", a.model), ("seed", a.seed), ("receiver", a.receiver))
     own = [f"{key}={value}" for key, value in named if value is not None]
     return with_settings(config, [*own, *(["deterministic=true"] if a.deterministic else []), *a.set])
@@ -197,7 +192,7 @@ def _settings_text() -> str:
     for name, settings in settings_of_hybrids().items():
         parts += [f"\nhybrid, {name}:", describe(settings)]
     for name, settings in settings_of_baselines().items():
-        parts += [f"\n{name}{', no spectra' if name in PAPER else ''}:", describe(settings)]
+        parts += [f"\n{name}:", describe(settings)]
     return "\n".join(parts)
 
 

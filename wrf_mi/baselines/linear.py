@@ -7,7 +7,7 @@ x and y. It has no offset: the phase of a radio is arbitrary, so that means are 
 
 Chosen here:
 
-- Weights. Other methods divide uplinks by their size and mean phase (`wrf_mi.baselines.conditions`); a linear map
+- Weights. Other methods divide uplinks by their size and mean phase (`wrf_mi.tasks.conditions`); a linear map
   commutes with that, so only the weight of each antenna in the sums would change. An antenna's squared error counts in
   units of its row's downlink energy, as the score (CEA) does. With antennas that were divided and all of one weight,
   the median CEA of validation rows was 0.13 dB lower on ``traced-csi-flat`` and 0.43 dB lower on

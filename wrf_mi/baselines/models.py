@@ -9,8 +9,6 @@ from importlib.util import find_spec
 from .method import Method
 
 MODULES = {
-    "wrf-gs": "gaussian_fields",
-    "wrf-gs+": "gaussian_fields",
     "idw": "idw",
     "kriging": "kriged",
     "trees": "trees",
@@ -23,10 +21,7 @@ MODULES = {
     "r2f2": "r2f2",
     "optml": "optml",
 }
-"""Modules of this package by the method's name: its `Method` is ``METHOD`` there, or of several ``method_of(name)``.
-"""
-PAPER = ("wrf-gs", "wrf-gs+")
-"""The paper's own, here for signal strengths and channels alone: spectra are what `wrf_mi.fit` is for."""
+"""Modules of this package by the method's name: its `Method` is ``METHOD`` there."""
 
 
 class _Methods(Mapping[str, Method]):
@@ -39,7 +34,7 @@ class _Methods(Mapping[str, Method]):
         if name not in self._names:
             raise KeyError(name)
         module = import_module(f".{MODULES[name]}", __package__)
-        method: Method = module.METHOD if hasattr(module, "METHOD") else module.method_of(name)
+        method: Method = module.METHOD
         return method
 
     def __contains__(self, name: object) -> bool:

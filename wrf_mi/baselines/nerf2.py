@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from ..backend.device import to_tensor
 from ..core import Record, Split
 from ..field.network import Weights
-from .conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
+from ..tasks.conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from .coordinates import Coordinates
 from .method import Inputs, Listen, Method, inputs_of
 from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
@@ -109,7 +109,7 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen
     outputs = outputs_of(record)
     where = record.tx_pos_m[known] if outputs.by_uplink else positions(record, "nerf2")[known]
     known_rx = np.stack([receiver.position_m for receiver in record.receivers])
-    rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs)])
+    rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
     if np.isfinite(where).all() and np.isfinite(known_rx).all():
         farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
     else:

@@ -21,7 +21,7 @@ from ..core.types import IntArray
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
 from ..tasks import Task, task_of
-from .conditions import Outputs, normalised_uplink, outputs_of, placed_receivers, uplink_of
+from ..tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
 from .coordinates import Coordinates
 from .method import Inputs
 from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
@@ -132,7 +132,7 @@ def frame_of(
     """
     everyone = tuple(range(len(record.receivers)))
     outputs = outputs_of(record)
-    receivers = placed_receivers(record, outputs)
+    receivers = placed_receivers(record, outputs.by_uplink)
     return Frame(
         coordinates,
         far_m,
@@ -280,7 +280,7 @@ def condition_of(
         InputError: no uplink, where one is needed.
     """
     if frame.outputs.by_uplink:
-        features, divisor = normalised_uplink(uplink_of(inputs))
+        features, divisor = normalised_uplink(known_uplink(inputs.uplink))
         return to_tensor(features.T), divisor
     where = frame.coordinates.features(inputs.tx_pos_m, settings.tx_octaves, settings.networks.scale_m)
     return where, float(frame.scales[receiver])

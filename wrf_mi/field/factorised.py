@@ -33,12 +33,14 @@ class Factorised:
         terms: K.
         layers: hidden layers of the network.
         width: their neurons.
+        components: complex signals of a Gaussian, each with K coefficients of its own.
     """
 
     encoding: Encoding = field(default_factory=Encoding)
     terms: int = 32
     layers: int = 3
     width: int = 128
+    components: int = 1
 
     blending = "alpha"
     still = True
@@ -51,15 +53,16 @@ class Factorised:
         Raises:
             InputError: no octaves.
         """
-        if not self.encoding.tx_octaves:
+        if not self.encoding.sizes["transmitter"]:
             raise InputError("setting encoding.tx_octaves: 0 leaves factorised nothing to see; choose 1 or more")
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
-        """Parameters as NumPy arrays; ``signal`` is C, [2 K, n]: real parts, then imaginary ones."""
+        """Parameters as NumPy arrays; ``signal`` is C, [2 K, n] a component: real, then imaginary parts."""
         weights = initial.geometry()
         weights["opacity"] = initial.opacity_logit()
         deviation = initial.signal / np.sqrt(self.terms)
-        weights["signal"] = (rng.standard_normal((2 * self.terms, initial.count)) * deviation).astype(np.float32)
+        drawn = rng.standard_normal((2 * self.terms * self.components, initial.count))
+        weights["signal"] = (drawn * deviation).astype(np.float32)
         for i in range(self.layers):
             inputs = {"hidden": self.width} if i else {"transmitter": self.encoding.sizes["transmitter"]}
             weights |= init_layer(f"terms.{i}", inputs, self.width, rng)
@@ -78,7 +81,9 @@ class Factorised:
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
         batch, k, own = tx_pos.shape[1], self.terms, params["signal"]
-        n, c_re, c_im = own.shape[1], own[0:k, :], own[k : 2 * k, :]
+        n = own.shape[1]
+        blocks = [own[i * k : (i + 1) * k, :] for i in range(2 * self.components)]
+        c_re, c_im = (dr.concat(blocks[half::2], axis=1) if len(blocks) > 2 else blocks[half] for half in (0, 1))
         # One real product of everything. In the derivative of four, Dr.Jit 1.5 on two threads now and then read a
         # part before it was written, and lost what reached phi by it.
         both = dr.concat([dr.concat([c_re, c_im], axis=1), dr.concat([-c_im, c_re], axis=1)], axis=0)
@@ -88,7 +93,7 @@ class Factorised:
             position=rows(params["position"]),
             scale=[dr.exp(s) for s in rows(params["log_scale"])],
             rotation=rows(params["rotation"]),
-            signal=[signal[:, 0:n].array, signal[:, n : 2 * n].array],
+            signal=[signal[:, i * n : (i + 1) * n].array for i in range(2 * self.components)],
             opacity=opacity,
             attenuation=None,
             batch=batch,

@@ -34,12 +34,21 @@ class Encoding:
     """Positional encoding of Gaussians and transmitters.
 
     The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.field.encoding`.
+
+    Attributes:
+        position_octaves: of Gaussian centres.
+        position_scale_m: metres that make their unit.
+        tx_octaves: of transmitter positions.
+        tx_scale_m: metres that make their unit.
+        features: number of features that take the encoded transmitter's place, as they are (the uplink channel in the
+            second case study of WRF-GS+); 0: the transmitter's position is encoded.
     """
 
     position_octaves: int = 10
     position_scale_m: float = 1.0
     tx_octaves: int = 10
     tx_scale_m: float = 1.0
+    features: int = 0
 
     def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
         """Encoded Gaussian centres [6 * octaves, n], detached.
@@ -50,13 +59,16 @@ class Encoding:
         return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
 
     def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
-        """Encoded transmitter positions [6 * octaves, batch]."""
-        return encode(points, self.tx_octaves, self.tx_scale_m)
+        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch] themselves."""
+        return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
 
     @property
     def sizes(self) -> dict[str, int]:
         """Number of features of each part."""
-        return {"position": encoded_size(self.position_octaves), "transmitter": encoded_size(self.tx_octaves)}
+        return {
+            "position": encoded_size(self.position_octaves),
+            "transmitter": self.features or encoded_size(self.tx_octaves),
+        }
 
 
 @dataclass(frozen=True)
@@ -68,12 +80,14 @@ class WrfGs:
     Where the paper is silent: the feature vector has ``width`` entries; centre, scale and rotation are
     learned as in 3D Gaussian splatting; delta = z / sqrt(1 + |z|^2) keeps |delta| < 1 and starts at
     0.9 (nearly transparent), so that Gaussians far away are seen from the first step.
+    With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
     encoding: Encoding = Encoding()
     layers: int = 8
     width: int = 128
     signal_widths: tuple[int, int] = (128, 64)
+    components: int = 1
 
     blending = "product"
     per_gaussian = GEOMETRY
@@ -91,7 +105,7 @@ class WrfGs:
         first, second = self.signal_widths
         weights |= init_layer("signal.0", {"feature": self.width, "transmitter": sizes["transmitter"]}, first, rng)
         weights |= init_layer("signal.1", {"hidden": first}, second, rng)
-        return weights | init_layer("signal.out", {"hidden": second}, 2, rng, gain=initial.signal)
+        return weights | init_layer("signal.out", {"hidden": second}, 2 * self.components, rng, gain=initial.signal)
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
@@ -129,6 +143,7 @@ class WrfGsPlus:
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
     rotation's to the quaternion before it is normalised; the heads start small, so that the static
     field is what training sees first.
+    With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
     encoding: Encoding = Encoding()
@@ -137,6 +152,7 @@ class WrfGsPlus:
     skip: int = 4
     still: bool = False
     phase_hz: float = 0.0
+    components: int = 1
 
     blending = "alpha"
     signal_parameters = ("signal", "deform.", "image")
@@ -150,13 +166,13 @@ class WrfGsPlus:
     def heads(self) -> tuple[tuple[str, int, float], ...]:
         """Name, size and starting gain of each head."""
         moving = () if self.still else (("rotation", 4, 0.05), ("scale", 3, 0.05))
-        return (("signal", 2, 0.5), *moving)
+        return (("signal", 2 * self.components, 0.5), *moving)
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
         """Parameters as NumPy arrays: static attributes from ``initial``, network drawn from ``rng``."""
         sizes, weights = self.encoding.sizes, initial.geometry()
         weights["opacity"] = initial.opacity_logit()
-        weights["signal"] = initial.static_signal(rng)
+        weights["signal"] = np.concatenate([initial.static_signal(rng) for _ in range(self.components)])
         if self.phase_hz:
             weights["image"] = initial.image()
         for i in range(self.layers):

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..field.encoding import telling_scale
-from ..graph.settings import ReceiverModel, TracedConfig
+from ..graph.receivers import AUTO
+from ..graph.settings import TracedConfig
 from ..splat.skip import Skip
 from ..trace.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 
@@ -90,6 +91,21 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
+class ViewConfig:
+    """The field as one antenna sees it: all directions end in one number, so they may be coarse.
+
+    Attributes:
+        height: elevations of each hemisphere.
+        columns: azimuths.
+        components: complex signals of a Gaussian at most, coefficients of the principal components of channels.
+    """
+
+    height: int = 9
+    columns: int = 36
+    components: int = 6
+
+
+@dataclass(frozen=True)
 class OptimiserConfig:
     """Adam (Kingma and Ba 2015): one rate a parameter group, warm-up, then a cosine to ``final`` of each rate.
 
@@ -100,6 +116,7 @@ class OptimiserConfig:
         rotation: rate of quaternions.
         opacity: rate of opacity logits.
         signal: rate of static signals.
+        level: rate of the logarithm of the unit in which each receiver sees the field, where it has one.
         warm_up: steps over which rates rise from zero.
         final: share of each rate that is left at the last step.
         averaging: decay per step of the running mean of the parameters, which is what is evaluated and stored.
@@ -111,6 +128,7 @@ class OptimiserConfig:
     rotation: float = 2e-3
     opacity: float = 2e-2
     signal: float = 5e-3
+    level: float = 2e-2
     warm_up: int = 100
     final: float = 0.01
     averaging: float = 0.999
@@ -143,6 +161,8 @@ class DensityConfig:
     reset_opacity: float = 0.05
 
 
+PATHS_ALONE = "ray-tracing"
+"""Name of the model that trains the paths of a scene without Gaussians."""
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
 OTHERWISE = 15000
@@ -159,18 +179,23 @@ class TrainConfig:
     Attributes:
         model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         steps: optimiser steps; 0: as many as the model needs, see `LONG_ENOUGH`.
-        batch: transmitters in a step.
+        batch: transmitters in a step, at most.
         seed: of starting values and of the order of rows.
         deterministic: bit-identical results from run to run, at the price of computing on one thread of the CPU.
         hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
             to the end, as every choice of settings must; less ends with a fit on all training rows.
+        patience: scores on the validation rows without a better one after which no more are waited for. From the best
+            of them the fit then goes on with all training rows, for a share of the steps that led there. 0: all steps
+            are taken, and the last ones count.
         structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
         checkpoint_every: steps between two checkpoints.
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
-        receiver: how the field becomes a spectrum: ``"pixel"``: its magnitude at each direction (the papers'),
-            ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does;
-            ``"auto"``: array with a scene, else pixel.
+        receiver: how the field becomes what is observed, a name of `wrf_mi.graph.receivers`. Of spectra ``"pixel"``:
+            its magnitude at each direction (the papers'), ``"array"``: the Bartlett spectrum of the array's element
+            signals, scaled as the instrument does; ``"auto"``: array with a scene, else pixel. Of signal strengths
+            ``"power"``, of channels ``"csi"``.
+        view: how an antenna sees the field, where observations are no spectra.
         skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
@@ -181,6 +206,7 @@ class TrainConfig:
     seed: int = 0
     deterministic: bool = False
     hold_out: float = 0.7
+    patience: int = 0
     structural_weight: float = 0.2
     checkpoint_every: int = 2000
     log_every: int = 100
@@ -190,7 +216,8 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
-    receiver: ReceiverModel = "auto"
+    receiver: str = AUTO
+    view: ViewConfig = field(default_factory=ViewConfig)
     skip: Skip = field(default_factory=Skip)
     traced: TracedConfig = field(default_factory=TracedConfig)
 
@@ -246,6 +273,9 @@ _RANGES: Mapping[str, _Range] = {
     "initial.opacity": _INSIDE,
     "encoding.position_octaves": _COUNT,
     "encoding.position_scale_m": _POSITIVE,
+    "view.height": _COUNT,
+    "view.columns": _COUNT,
+    "view.components": _COUNT,
     "optimiser.final": _SHARE,
     "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
     "density.start": _SHARE,
@@ -284,6 +314,27 @@ It states no scale of coordinates; metres are taken. The loss, the networks and 
 
 QUICK = ("steps=6000",)
 """The shorter schedule of the demo."""
+
+ONE_ANTENNA = (
+    "batch=16",
+    "steps=18000",
+    "initial.gaussians=60",
+    "initial.size_deg=15",
+    "network.width=64",
+    "network.layers=4",
+    "density.every=0",
+    "validate_every=500",
+    "patience=8",
+)
+"""What a field of signal strengths or channels departs from one of spectra in: it ends in few numbers."""
+OF_TASK: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENNA}
+"""Settings of tasks other than spectra, as ``--set`` takes them."""
+
+
+def default_config(task: str) -> TrainConfig:
+    """The settings that a fit to a task's observations begins with."""
+    return with_settings(TrainConfig(), OF_TASK.get(task, ()))
+
 
 PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick": QUICK}
 """Named sets of settings, as ``--set`` takes them."""

@@ -34,6 +34,7 @@ from ..core.antenna import AS_STATED
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 from ..core.receivers import KEYS as RECEIVER_KEYS
 from ..graph.graph import Graph
+from ..graph.receivers import Form
 from ..measure import load_split, save_split
 from ..tasks import instrument_of
 from .config import TrainConfig, from_dict, to_dict
@@ -42,9 +43,9 @@ from .predictor import Predictor
 from .state import FitState
 from .trainer import Progress, Trainer, check_rows, final_params, make_field
 
-FORMAT = 3
+FORMAT = 5
 """Version of ``checkpoint.npz``."""
-PACKED_FORMAT = 4
+PACKED_FORMAT = 6
 """Version of ``checkpoint.npz`` of a compressed run."""
 
 CONFIG, SPLIT, LOG, CHECKPOINT = "config.yaml", "split.npz", "log.jsonl", "checkpoint.npz"
@@ -190,14 +191,12 @@ def stored_parts(folder: Path) -> list[Path]:
 
 def write_checkpoint(folder: Path, trainer: Trainer) -> None:
     """Write ``checkpoint.npz``: enough to go on and enough to predict."""
-    known = trainer.record.frequencies_hz
     arrays = trainer.state.arrays() | {
         "format": np.asarray(FORMAT),
         "seconds": np.asarray(trainer.seconds),
-        "image_size": np.asarray([trainer.height, trainer.width]),
-        "carrier_hz": np.asarray(np.nan if known is None else float(known[0])),
         "tx_antenna": np.asarray(astuple(trainer.record.tx_antenna)),
-        **receiver_arrays(trainer.record.receivers),
+        **trainer.graph.form.arrays(),
+        **receiver_arrays(trainer.graph.receivers),
     }
     write_arrays(folder / CHECKPOINT, arrays)
 
@@ -216,8 +215,9 @@ def write_packed(
     Returns:
         Its size, bytes.
     """
-    kept = ("step", "seconds", "image_size", "carrier_hz", "tx_antenna", *RECEIVER_KEYS)
+    kept = ("step", "seconds", "tx_antenna", *RECEIVER_KEYS)
     arrays = {"format": np.asarray(PACKED_FORMAT)} | {key: source[key] for key in kept}
+    arrays |= Form.of(source).arrays()
     arrays |= pack_params(params, precision)
     return write_arrays(folder / CHECKPOINT, arrays, compressed=True).stat().st_size
 
@@ -312,11 +312,8 @@ def load_predictor(folder: str | Path, operator: bool = True) -> Predictor:
     """
     path = Path(folder)
     config, arrays = read_config(path), read_checkpoint(path)
-    height, width = map(int, arrays["image_size"])
-    settings, receivers, hz = config.settings, stored_receivers(arrays), float(arrays["carrier_hz"])
-    field, antenna = make_field(settings), Antenna(*map(str, arrays["tx_antenna"]))
-    known = None if np.isnan(hz) else np.array([hz])
-    scene = None if config.scene is None else open_scene_at(config.scene, hz, config.material)
-    ends = settings.receiver, known, scene, settings.traced, antenna
-    graph = Graph(field, receivers, (height, width), *ends)
-    return Predictor(field, final_params(arrays), receivers, height, width, settings.skip, operator, path, graph=graph)
+    form, receivers, settings = Form.of(arrays), stored_receivers(arrays), config.settings
+    field = make_field(settings, form.components, form.features)
+    scene = None if config.scene is None else open_scene_at(config.scene, form.carrier_hz, config.material)
+    graph = Graph(field, receivers, form, scene, settings.traced, Antenna(*map(str, arrays["tx_antenna"])))
+    return Predictor(field, final_params(arrays), receivers, *form.size, settings.skip, operator, path, graph=graph)

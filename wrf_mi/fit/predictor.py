@@ -1,25 +1,30 @@
-"""Spectra of a trained field at new transmitter positions."""
+"""What receivers report of a trained graph, for new transmitters."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import on_device, to_tensor
+from ..backend.device import to_tensor
 from ..core import InputError, Receiver
+from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..field.gaussians import Gaussians
-from ..graph.graph import Field, Graph
-from ..hybrid.combine import PixelReceiver
+from ..graph.graph import Batch, Field, Graph
+from ..graph.receivers import PIXEL, Form
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
-from .step import CompiledPredictor, Params, device_pose
+from ..tasks.conditions import known_uplink, normalised_uplink
+from .recorded import Recorded
+from .step import CompiledPredictor, Params, device_pose, evaluated
 from .still import StillField, stands_still
 
 TOGETHER = 16
@@ -45,7 +50,7 @@ class Predictor:
 
     def __init__(
         self,
-        field: Field,
+        field: Field | None,
         params: Mapping[str, NDArray[np.float32]],
         receivers: Sequence[Receiver],
         height: int,
@@ -55,63 +60,114 @@ class Predictor:
         store: Path | None = None,
         graph: Graph | None = None,
     ) -> None:
-        self.receivers, self.graph = tuple(receivers), graph or Graph(field, receivers, (height, width))
+        self.receivers = tuple(receivers)
+        self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
         # The operator and the recorded prediction are the magnitude at each direction.
-        self._pixels = self.graph.scene is None and all(type(model) is PixelReceiver for model in self.graph.models)
+        self._pixels = field is not None and self.graph.scene is None and self.graph.form.receiver == PIXEL
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
         self._by_operator, self._store = operator and self._pixels and stands_still(field), store
+        self._reports: dict[int, Recorded] = {}
         self._still: StillField | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
         """Use other parameters (Dr.Jit tensors) from now on."""
-        if params["position"].shape[1] != self._count:
+        count = params["position"].shape[1] if "position" in params else 0
+        if count != self._count:
             # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
-            self._predict, self._count = CompiledPredictor(self._field, self._skip), params["position"].shape[1]
+            self._predict = None if self._field is None else CompiledPredictor(self._field, self._skip)
+            self._count, self._reports = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
 
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
-        return self._field.gaussians(self._params, to_tensor(columns)).spread()
+        return self._gaussians.gaussians(self._params, to_tensor(columns)).spread()
+
+    @property
+    def _gaussians(self) -> Field:
+        if self._field is None:
+            raise ValueError("paths alone: there are no Gaussians")
+        return self._field
 
     def still(self) -> StillField:
         """The field as operators; forgotten when parameters change."""
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
             size = self._plane.height, self._plane.width
-            self._still = StillField(self._field, params, self.receivers, *size, self._store)
+            self._still = StillField(self._gaussians, params, self.receivers, *size, self._store)
         return self._still
 
-    def _reported(self, tx_pos_m: NDArray[np.float64], receiver: int) -> NDArray[np.float32]:
+    def _traced(self, tx_pos_m: FloatArray, receiver: int) -> Any:
         """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
         side = self.graph.trace(tx_pos_m, receiver)
-        with dr.suspend_grad():
-            if side is not None:
-                side.refresh(self._params)
-            tx = to_tensor(np.ascontiguousarray(tx_pos_m.T, np.float32))
-            slots = on_device(np.arange(len(tx_pos_m)), mi.UInt32)
-            report = self.graph.report(receiver, side)
-            found: NDArray[np.float32] = report(self._params, tx, slots, self._poses[receiver], self._plane).numpy()
-        return found
+        if side is not None:
+            side.refresh(self._params)
+        report, pose = self.graph.report(receiver, side), self._poses[receiver]
+        return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane)
 
-    def __call__(self, tx_pos_m: ArrayLike, receiver: int | str = 0) -> NDArray[np.float32]:
-        """Spectra of transmitters at one receiver.
+    def _learned(self, condition: FloatArray, receiver: int) -> Any:
+        """What a receiver reports of conditions [3 or features, at most `TOGETHER`] without a scene, flat."""
+        if receiver not in self._reports:
+            report = self.graph.report(receiver, None)
+
+            def predicted(params: Params, batch: Batch) -> Any:
+                with dr.suspend_grad():
+                    return report(params, batch)
+
+            # What is made from NumPy's memory at first use must be there before a recording.
+            evaluated(report, self._params, condition[:, :1], receiver, self._poses[receiver], self._plane)
+            self._reports[receiver] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
+        # Their number is a constant of the recorded kernels: the last ones are filled up with copies.
+        count = condition.shape[1]
+        filled = np.minimum(np.arange(TOGETHER), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
+        dr.make_opaque(slots)
+        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane)
+        found = self._reports[receiver](self._params, batch)
+        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
+
+    def _reported(self, given: FloatArray, receiver: int) -> NDArray[Any]:
+        """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
+        shape = self.graph.models[receiver].shape
+        if self.graph.form.features:  # of one antenna of the array
+            shape = shape[-2:]
+        out = np.empty((len(given), *shape), np.float32)
+        for start in range(0, len(given), TOGETHER):
+            part = given[start : start + TOGETHER]
+            found = self._traced(part, receiver) if self.graph.scene is not None else self._learned(part.T, receiver)
+            out[start : start + TOGETHER] = found.numpy().reshape(len(part), *shape)
+        return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
+
+    def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
+        """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
+        features, divisor = normalised_uplink(known_uplink(uplink))
+        found = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1) * divisor[..., None]
+        return (found if len(self.graph.form.outputs) > 1 else found[:, 0]).astype(np.complex64)
+
+    def __call__(
+        self, tx_pos_m: ArrayLike, receiver: int | str = 0, uplink: NDArray[Any] | None = None
+    ) -> NDArray[Any]:
+        """What one receiver observes of transmitters.
 
         Args:
             tx_pos_m: positions [m, 3], world frame, metres.
             receiver: name, or number from 0, of one of ``receivers``.
+            uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them; positions are not
+                looked at then.
 
         Returns:
-            Greys [m, height, width].
+            Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
 
         Raises:
-            InputError: positions of another shape or not finite, or no such receiver.
+            InputError: positions of another shape or not finite, no uplink where one is needed, or no such receiver.
         """
         index = receiver_index(self.receivers, receiver)
+        if self.graph.form.features:
+            return self._by_uplink(uplink, index)
         positions = np.asarray(tx_pos_m, np.float32)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
@@ -124,14 +180,13 @@ class Predictor:
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
+        if not self._pixels:
+            given = np.asarray(tx_pos_m, float)
+            self.graph.check(given)
+            return self._reported(given, index)
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
-        if not self._pixels:
-            self.graph.check(np.asarray(tx_pos_m, float))
-            for start in range(0, len(positions), TOGETHER):
-                part = slice(start, start + TOGETHER)
-                out[part] = self._reported(np.asarray(tx_pos_m, float)[part], index).reshape(-1, height, width)
-            return out
+        assert self._predict is not None, "a field of pixels"
         for image, position in zip(out, positions, strict=True):
             tx = to_tensor(position[:, None])
             image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)

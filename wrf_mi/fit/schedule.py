@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Split
+from ..core import InputError
 from ..core.types import IntArray
 from .config import TrainConfig
 
@@ -32,25 +33,47 @@ class Schedule:
     density: frozenset[int]
     joined: int
 
+    def after(self, best: int) -> tuple[Schedule, int]:
+        """The plan that goes on from the best of the steps before the validation rows join.
 
-def plan(config: TrainConfig, split: Split, receivers: int) -> Schedule:
-    """The plan of a fit, a function of settings, split and seed alone: a resumed run goes on with the same.
+        Args:
+            best: that step.
 
-    Each epoch visits every row at every receiver once, in random order; a batch belongs to one receiver.
-    Where the batch does not divide the rows, each epoch leaves out others at random.
+        Returns:
+            Learning rates that fall as before in as much fewer steps as led there, and the first of these steps.
+        """
+        last = len(self.rows) - self.joined
+        left = min(last, max(1, round(last * best / self.joined))) if last else 0
+        start = len(self.rows) - left
+        factor = self.factor.copy()
+        if left:
+            factor[start:] = self.factor[self.joined + np.arange(left) * last // left]
+        return replace(self, factor=factor), start
+
+
+def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[IntArray]) -> Schedule:
+    """The plan of a fit, a function of settings, rows and seed alone: a resumed run goes on with the same.
+
+    Each epoch visits every row at every receiver that observed it once, in random order; a batch belongs to one
+    receiver and is no larger than the rows of any. Where the batch does not divide the rows, each epoch leaves out
+    others at random.
+
+    Args:
+        config: settings.
+        train: rows (conditions) of each receiver that train while validation rows are held out.
+        everything: those with the validation rows.
 
     Raises:
-        InputError: fewer training rows than a batch needs.
+        InputError: a receiver without rows that train.
     """
-    steps, batch = config.steps, config.batch
+    steps = config.steps
     joined = steps if config.hold_out >= 1 else round(config.hold_out * steps)
-    rows = split.train if joined else split.all_train
-    if len(rows) < batch:
-        beside = f" beside {len(split.validation)} validation rows" if joined else ""
-        raise InputError(f"{len(rows)} training rows{beside}, batches need {batch}: use more rows or a smaller batch")
+    batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
+    if not batch:
+        beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
+        raise InputError(f"no training row at one receiver{beside}: use more rows")
     rng = np.random.default_rng([config.seed, 1])
-    plans = [_epochs(split.train, joined, batch, receivers, rng)]
-    plans.append(_epochs(split.all_train, steps - joined, batch, receivers, rng))
+    plans = [_epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)]
     t = np.arange(steps)
     o = config.optimiser
     cosine = o.final + (1 - o.final) * 0.5 * (1 + np.cos(np.pi * t / steps))
@@ -68,19 +91,17 @@ def plan(config: TrainConfig, split: Split, receivers: int) -> Schedule:
     )
 
 
-def _epochs(
-    rows: IntArray, steps: int, batch: int, receivers: int, rng: np.random.Generator
-) -> tuple[IntArray, IntArray]:
+def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
-    per_receiver = len(rows) // batch
-    epochs = -(-steps // (per_receiver * receivers))
+    counts = [len(own) // batch for own in rows]
+    epochs = -(-steps // sum(counts))
     batches, owners = [], []
     for _ in range(epochs):
         chosen = np.concatenate(
-            [rng.permutation(rows)[: per_receiver * batch].reshape(per_receiver, batch) for _ in range(receivers)]
+            [rng.permutation(own)[: n * batch].reshape(n, batch) for own, n in zip(rows, counts, strict=True)]
         )
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])
-        owners.append(np.repeat(np.arange(receivers), per_receiver)[order])
+        owners.append(np.repeat(np.arange(len(rows)), counts)[order])
     return np.concatenate(batches)[:steps], np.concatenate(owners)[:steps]

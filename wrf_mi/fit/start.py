@@ -20,7 +20,7 @@ from .config import InitialConfig
 
 
 def initial_gaussians(
-    config: InitialConfig, record: Record, rows: IntArray, rng: np.random.Generator
+    config: InitialConfig, record: Record, rows: IntArray, rng: np.random.Generator, sphere: bool = False
 ) -> InitialGaussians:
     """Starting values of the Gaussians.
 
@@ -29,6 +29,7 @@ def initial_gaussians(
         record: whose receivers look at them.
         rows: training rows: only their transmitters' paths are traced.
         rng: draws what is drawn.
+        sphere: random ones are seen in all directions, or else in the receivers' upper hemispheres.
 
     Raises:
         InputError: a file or scene that cannot be used, or paths to trace and no carrier frequency.
@@ -55,5 +56,5 @@ def initial_gaussians(
         return replace(start, opacity=config.opacity, signal=config.signal)
     distance = (config.nearest_m, config.farthest_m)
     return random_gaussians(
-        record.receivers, config.gaussians, rng, distance, config.size_deg, config.opacity, config.signal
+        record.receivers, config.gaussians, rng, distance, config.size_deg, config.opacity, config.signal, sphere
     )

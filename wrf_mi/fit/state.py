@@ -26,22 +26,28 @@ class FitState:
         step: steps taken.
         urge: sum since the last round of density control of each Gaussian's directional gradient, [n].
         urge_steps: steps in that sum.
+        chosen: step from which the fit went on, see `wrf_mi.fit.config.TrainConfig.patience`; 0: from the last one.
+        best: the state that scored best on validation rows (see `arrays`); None: none is kept.
+        best_score: its score, the higher the better.
+        waited: scores since then.
     """
 
     def __init__(self, params: Mapping[str, NDArray[np.float32]]) -> None:
         self.adam = Adam(lr=0.0)
         self.adam.update({name: to_tensor(values) for name, values in params.items()})
         self.mean = {name: to_tensor(values) for name, values in params.items()}
-        self.step = 0
+        self.step = self.chosen = 0
+        self.best: Arrays | None = None
+        self.best_score, self.waited = -np.inf, 0
         self._clear_urge()
 
     @property
     def gaussians(self) -> int:
-        """Number of Gaussians."""
-        return int(self.adam["position"].shape[1])
+        """Number of Gaussians; 0 where paths are trained alone."""
+        return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
 
     def _clear_urge(self) -> None:
-        self.urge, self.urge_steps = dr.zeros(mi.Float, self.gaussians), 0
+        self.urge, self.urge_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
         dr.make_opaque(self.urge)
 
     def params(self) -> Arrays:
@@ -89,12 +95,27 @@ class FitState:
         value, promoted, rate, (_, m, v, _) = self.adam.state[name]
         self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
 
+    def keep_best(self, score: float) -> None:
+        """Remember this moment if its score is the best so far."""
+        self.waited += 1
+        if score > self.best_score:
+            self.best, self.best_score, self.waited = self._now(), score, 0
+
+    def go_back(self) -> FitState:
+        """The moment that was kept, with nothing kept in it."""
+        return self if self.best is None else FitState.from_arrays(self.best)
+
     def arrays(self) -> Arrays:
         """All of it, for a checkpoint."""
+        kept = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
+        return self._now() | kept | {f"best/{name}": values for name, values in (self.best or {}).items()}
+
+    def _now(self) -> Arrays:
+        """All of it but what is kept."""
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        scalars = {"step": self.step, "adam_step": count, "urge_steps": self.urge_steps}
+        scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
         return flat | {"urge": self.urge.numpy()} | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod
@@ -107,6 +128,10 @@ class FitState:
         state = cls(group("param/"))
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
-        state.step, state.urge_steps = int(arrays["step"]), int(arrays["urge_steps"])
+        state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
+        state.urge_steps = int(arrays["urge_steps"])
         state.urge = to_float(arrays["urge"])
+        state.best = group("best/") or None
+        if state.best is not None:
+            state.best_score, state.waited = float(arrays["best_score"]), int(arrays["waited"])
         return state

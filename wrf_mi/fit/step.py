@@ -6,6 +6,7 @@ recorded kernels; a captured array or a changing Python number would be traced a
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,23 +15,28 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from drjit.opt import Adam
+from numpy.typing import NDArray
 
+from ..backend.device import on_device, to_tensor
 from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
-from ..graph.graph import Field, Report
+from ..graph.graph import Batch, Field, Report
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
 
-Loss = Callable[[Any, Any, int, int, int], Any]
-"""``loss(prediction, truth, batch, height, width)`` of flat arrays, a Dr.Jit float of one value."""
+Loss = Callable[..., Any]
+"""``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 Params = dict[str, Any]
 
 TRACED_NAMES = ("material.", "receiver.", "pattern.")
 """Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
+CENTRES = "position"
+"""Parameter [3, n] of every field; where it is missing there are no Gaussians."""
 DARK = 1e-8
 """Added to |R|^2 under the root, whose slope at zero is infinite: greys below 1e-4 are rounded to it."""
 
@@ -61,24 +67,27 @@ def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane
 
 @dataclass
 class TrainingData:
-    """Measurements on the device.
+    """Conditions and observations on the device, see `wrf_mi.fit.targets.Targets`.
 
     Attributes:
-        tx_pos: positions of all rows, tensor [3, n], metres.
-        truth: greys of all receivers and rows, [n_rx * n * height * width].
+        condition: of all rows, tensor [3, c] in metres or [features, c].
+        truth: observations of all receivers and conditions, one after the other.
+        scale: one over each receiver's unit, [n_rx].
     """
 
-    tx_pos: Any
+    condition: Any
     truth: Any
+    scale: Any
 
-    def select(self, rows: Any, receiver: Any, plane: Plane) -> tuple[Any, Any]:
-        """Transmitter positions [3, batch] and greys [batch * pixels] of some rows at one receiver."""
-        n, batch, index_type = self.tx_pos.shape[1], dr.width(rows), type(rows)
-        flat = self.tx_pos.array
-        tx = type(self.tx_pos)(dr.concat([dr.gather(type(flat), flat, rows + k * n) for k in range(3)]), (3, batch))
-        slot = dr.arange(index_type, batch * plane.pixels)
-        image = dr.gather(index_type, rows, slot // plane.pixels) + receiver * n
-        return tx, dr.gather(type(self.truth), self.truth, image * plane.pixels + slot % plane.pixels)
+    def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any]:
+        """Conditions [3 or features, batch] and observations [batch * values] of some conditions at one receiver."""
+        k, n = self.condition.shape
+        batch, index_type = dr.width(rows), type(rows)
+        flat = self.condition.array
+        tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
+        slot = dr.arange(index_type, batch * values)
+        one = dr.gather(index_type, rows, slot // values) + receiver * n
+        return tx, dr.gather(type(self.truth), self.truth, one * values + slot % values)
 
 
 @dataclass
@@ -137,7 +146,11 @@ def _health(param: Any) -> Any:
 
 
 def make_step(
-    report: Report, rates: Mapping[str, float], loss_of: Loss, state: Callable[[], Any] | None = None
+    report: Report,
+    rates: Mapping[str, float],
+    loss_of: Loss,
+    shape: tuple[int, ...],
+    state: Callable[[], Any] | None = None,
 ) -> Callable[..., Any]:
     """A recorded optimiser step.
 
@@ -145,6 +158,7 @@ def make_step(
         report: what a receiver reports of the graph, see `wrf_mi.graph.Graph.report`.
         rates: learning rate of each parameter.
         loss_of: loss of a batch.
+        shape: of one observation.
         state: arrays that the report reads beside its arguments; None: none.
 
     Returns:
@@ -153,6 +167,7 @@ def make_step(
         mean of the parameters. After trouble nothing changes any more.
     """
     groups = watched_groups(rates)
+    values = math.prod(shape)
 
     def step(
         adam: Adam,
@@ -171,20 +186,23 @@ def make_step(
         # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
         adam.set_learning_rate({name: factor * rates[name] for name in rates})
         params = {name: adam[name] for name in rates}
-        tx_pos, truth = data.select(rows, receiver, plane)
+        condition, truth = data.select(rows, receiver, values)
         batch = dr.width(rows)
-        prediction = report(params, tx_pos, slots, pose, plane)
-        loss = loss_of(prediction, truth, batch, plane.height, plane.width)
+        prediction = report(params, Batch(condition, slots, receiver, pose, plane))
+        scale = dr.gather(type(truth), data.scale, receiver)
+        loss = loss_of(prediction * scale, truth * scale, batch, *shape)
         dr.backward(loss)
         sums = [dr.detach(loss), *(_health(params[name]) for name in groups)]
         fine = [dr.isfinite(s) for s in sums]
         good = reduce(operator.and_, fine)
         untroubled = trouble.step == 0
         finite = good & untroubled
-        offset = [dr.detach(params["position"])[k].array - pose.position[k] for k in range(3)]
-        pull = [dr.grad(params["position"])[k].array for k in range(3)]
-        distance = dr.sqrt(sum(c * c for c in offset))
-        urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
+        urge = mi.Float(0)
+        if CENTRES in params:
+            offset = [dr.detach(params[CENTRES])[k].array - pose.position[k] for k in range(3)]
+            pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
+            distance = dr.sqrt(sum(c * c for c in offset))
+            urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
         adam.step(eval=False, active=finite)
         share = dr.select(finite, decay, 1)
         mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
@@ -197,6 +215,18 @@ def make_step(
         return mean, trouble, told
 
     return Recorded(step, state)
+
+
+def evaluated(
+    report: Report, params: Mapping[str, Any], condition: NDArray[Any], receiver: int, pose: Pose, plane: Plane
+) -> Any:
+    """A report of conditions [3 or features, m], the first m rows of its traced side, evaluated without gradients."""
+    with dr.suspend_grad():
+        slots = on_device(np.arange(condition.shape[1]), mi.UInt32)
+        batch = Batch(to_tensor(np.ascontiguousarray(condition)), slots, dr.opaque(mi.UInt32, receiver), pose, plane)
+        found = report(params, batch)
+        dr.eval(found)
+    return found
 
 
 class CompiledPredictor:

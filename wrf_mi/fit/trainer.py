@@ -5,8 +5,8 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,18 +20,30 @@ from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
-from ..graph.graph import Field, Graph, Report
-from ..loss.spectrum import spectrum_loss
-from ..loss.ssim import ssim
+from ..graph.graph import LEVEL, Field, Graph
 from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
-from ..tasks import require
-from .config import TrainConfig
+from ..tasks import task_of
+from ..tasks.conditions import placed_receivers
+from .config import PATHS_ALONE, SIGNAL_ALONE, TrainConfig
 from .predictor import Predictor
-from .schedule import plan
 from .start import initial_gaussians
 from .state import FitState
-from .step import TRACED_NAMES, Loss, TrainingData, Trouble, device_pose, make_step, no_trouble, watched_groups
+from .step import (
+    TRACED_NAMES,
+    Loss,
+    TrainingData,
+    Trouble,
+    device_pose,
+    evaluated,
+    make_step,
+    no_trouble,
+    watched_groups,
+)
+from .targets import form_of, plan_rows, targets_of
+
+AT_ONCE = 64
+"""Observations of a receiver by which its level starts."""
 
 
 class NumericsError(RuntimeError):
@@ -63,8 +75,13 @@ class Progress:
     left_s: float
 
 
-def make_field(config: TrainConfig) -> Field:
+def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> Field:
     """The model that a configuration names.
+
+    Args:
+        config: settings.
+        components: complex signals of a Gaussian.
+        features: number of features that tell of a transmitter in place of its position; 0: its position.
 
     Raises:
         InputError: no trainable model of that name, or transmitters whose scale is still open.
@@ -74,9 +91,9 @@ def make_field(config: TrainConfig) -> Field:
     e = config.encoding
     if not e.tx_scale_m:
         raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
-    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m)
+    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features)
     n = config.network
-    sizes: dict[str, Any] = {}
+    sizes: dict[str, Any] = {"components": components}
     if n.width:
         sizes["width"] = n.width
     if n.layers:
@@ -92,6 +109,8 @@ def make_field(config: TrainConfig) -> Field:
         sizes["still"], sizes["phase_hz"] = n.still, n.phase_hz
     if n.phase_hz and config.model != "wrf-gs+":
         raise InputError(f"setting network.phase_hz: {config.model} has no such phase; leave it away")
+    if n.phase_hz and (components > 1 or features):
+        raise InputError("setting network.phase_hz: belongs to one signal a Gaussian and to positions; leave it away")
     if n.terms:
         if config.model != "factorised":
             raise InputError(f"setting network.terms: {config.model} has none; leave it away")
@@ -99,35 +118,10 @@ def make_field(config: TrainConfig) -> Field:
     return FIELDS[config.model](encoding=encoding, **sizes)
 
 
-def _paper_loss(prediction: Any, truth: Any, batch: int, height: int, width: int, eta: float) -> Any:
-    return spectrum_loss(prediction, truth, batch, height, width, eta)[0]
-
-
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
-
-
-def graph_of(field: Field, record: Record, config: TrainConfig, scene: Any | None) -> Graph:
-    """The graph of a field, a record's receivers and a scene.
-
-    Raises:
-        InputError: a receiver model or a scene for which the data do not tell array or carrier.
-    """
-    size = int(record.observation.shape[-2]), int(record.observation.shape[-1])
-    ends = config.receiver, record.frequencies_hz, scene, config.traced, record.tx_antenna
-    return Graph(field, record.receivers, size, *ends)
-
-
-def require_spectra(record: Record) -> None:
-    """Refuse other records than spectra.
-
-    Raises:
-        InputError: the record holds another task's observations.
-    """
-    what = "learned fields are fitted to spectra"
-    require(record, "spectrum", why=f"{what}: choose a data set of spectra, or trace this one with `wrf-mi trace`")
 
 
 def check_rows(split: Split, record: Record, source: str) -> None:
@@ -146,13 +140,14 @@ class Trainer:
     """Fits one field to the training rows of one split.
 
     Args:
-        record: spectra [n_rx, n, height, width].
+        record: of any task that a receiver model reports.
         split: which rows train and which choose.
         config: settings.
         field: a model of your own in place of the one that ``config.model`` names.
         initial: starting values in place of those that ``config.initial`` describes.
         state: of a fit that was stopped, to go on from.
-        loss: in place of the paper's: ``loss(prediction, truth, batch, height, width)`` of flat Dr.Jit arrays.
+        loss: in place of the task's: ``loss(prediction, truth, batch, *shape)`` of flat Dr.Jit arrays in the
+            receiver's unit, NaN in the truth where nothing was received.
         scene: from `wrf_mi.trace.open_scene`, at the record's carrier: its paths are trained together with the
             Gaussians. None: Gaussians alone.
 
@@ -173,40 +168,56 @@ class Trainer:
         loss: Loss | None = None,
         scene: Any | None = None,
     ) -> None:
-        require_spectra(record)
         check_rows(split, record, f"split {split.name}")
-        check_observations(record, split, complete=True)
-        config = config.resolved(record.tx_pos_m[split.all_train], scene is not None)
+        self.task = task_of(record)
+        check_observations(record, split, complete=self.task.image)
+        known = split.all_train
+        config = config.resolved(record.tx_pos_m[known], scene is not None)
         self.record, self.split, self.config = record, split, config
-        self.height, self.width = (int(s) for s in record.observation.shape[-2:])
-        self._loss = loss or partial(_paper_loss, eta=config.structural_weight)
-        self.graph = graph_of(field or make_field(config), record, config, scene)
-        self.schedule = plan(config, split, len(record.receivers))
+        self.targets = targets_of(record, known)
+        form = form_of(record, config, self.targets, known, scene is not None)
+        receivers = placed_receivers(record, by_uplink=bool(form.features))
+        self.graph = Graph(
+            field or (None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)),
+            receivers,
+            form,
+            scene,
+            config.traced,
+            record.tx_antenna,
+        )
+        self._shape = self.targets.truth.shape[2:]
+        self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
+        self.schedule = plan_rows(config, self.targets, split)
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
         # Slots of the traced sides: all rows that train or choose.
-        self._known = split.all_train
+        self._known = known
         self.graph.check(record.tx_pos_m)
-        self._sides = [self.graph.trace(record.tx_pos_m[self._known], r) for r in range(len(record.receivers))]
-        if state is None:
-            self.graph.check_polarization(record.tx_pos_m[self._known])
-            rng = np.random.default_rng([config.seed, 0])
-            start = initial or initial_gaussians(config.initial, record, split.train, rng)
-            state = FitState(self.field.init(start, rng) | self._traced_start())
-        self.state = state
-        self._poses = [device_pose(r) for r in record.receivers]
-        self._plane = perception_plane(self.height, self.width, mi.Float)
+        self._sides = [self.graph.trace(record.tx_pos_m[known], r) for r in range(len(receivers))]
+        self._poses = [device_pose(r) for r in receivers]
+        self._plane = perception_plane(*form.size, mi.Float)
         self._data = TrainingData(
-            to_tensor(record.tx_pos_m.T),
-            to_float(record.observation),
+            to_tensor(self.targets.condition), to_float(self.targets.truth), to_float(1 / self.targets.unit)
         )
+        if state is None:
+            self.graph.check_polarization(record.tx_pos_m[known])
+            state = FitState(self._start(initial))
+        self.state = state
+        if state.chosen:
+            self.schedule, _ = self.schedule.after(state.chosen)
         self.record_functions()
         self.seconds = 0.0
 
     @property
     def field(self) -> Field:
-        """The Gaussians of the graph."""
+        """The Gaussians of the graph.
+
+        Raises:
+            ValueError: it has none.
+        """
+        if self.graph.field is None:
+            raise ValueError("paths are trained alone: there are no Gaussians")
         return self.graph.field
 
     def record_functions(self) -> None:
@@ -214,14 +225,33 @@ class Trainer:
         self._steps: dict[Any, Callable[..., Any]] = {}
         self._predictor: Predictor | None = None
 
-    def _traced_start(self) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the traced side, with gains that match the training rows."""
-        values = self.graph.parameters(self._sides)
+    def _start(self, initial: InitialGaussians | None) -> dict[str, NDArray[np.float32]]:
+        """Starting values: Gaussians, gains and levels with which each side reports what was observed, on average."""
+        rng = np.random.default_rng([self.config.seed, 0])
+        started = initial or initial_gaussians(
+            self.config.initial,
+            replace(self.record, receivers=self.graph.receivers),
+            self.split.train,
+            rng,
+            self.graph.sphere,
+        )
+        values = self.field.init(started, rng) | self.graph.parameters(self._sides)
         for r, side in enumerate(self._sides):
             if side is not None and side.gain_name in values:
-                observed = self.record.observation[r, self._known]
-                values |= self.graph.match_gain(r, side, {}, observed)
+                values |= self.graph.match_gain(r, side, {}, self.targets.truth[r, self._known])
+        if LEVEL in values:
+            values[LEVEL][0] = [self._level(values, r) for r in range(len(self.record.receivers))]
         return values
+
+    def _level(self, values: Mapping[str, NDArray[np.float32]], receiver: int) -> float:
+        """Level at which the Gaussians alone report what a receiver observed; with a scene they begin far below."""
+        rows = self.targets.received(receiver, self._known)[:AT_ONCE]
+        params = {name: to_tensor(value) for name, value in values.items()}
+        alone, own = self.graph.report(receiver, None), self.targets.condition[:, rows]
+        found = evaluated(alone, params, own, receiver, self._poses[receiver], self._plane).numpy().astype(float)
+        observed = self.targets.truth[receiver, rows].astype(float)
+        missing = self.graph.models[receiver].missing_gain(found.reshape(observed.shape), observed)
+        return missing + (np.log(self.config.initial.signal / SIGNAL_ALONE) if self.graph.scene is not None else 0.0)
 
     def _step_of(self, receiver: int) -> Callable[..., Any]:
         """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""
@@ -233,17 +263,13 @@ class Trainer:
             self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
             report = self.graph.report(receiver, side)
             state = None if key is None else partial(self.graph.arrays, receiver, side)
-            if side is not None:
-                self._warm(receiver, report)
-            self._steps[key] = make_step(report, self._rates(), self._loss, state)
+            if state is not None:
+                # What is made from NumPy's memory at first use must be there before a recording.
+                params = {name: self.state.adam[name] for name in self.state.adam}
+                first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
+                evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
+            self._steps[key] = make_step(report, self._rates(), self._loss, self._shape, state)
         return self._steps[key]
-
-    def _warm(self, receiver: int, report: Report) -> None:
-        """Evaluate a report once: what is made from NumPy's memory at first use must be there before a recording."""
-        with dr.suspend_grad():
-            params = {name: self.state.adam[name] for name in self.state.adam}
-            tx = to_tensor(self.record.tx_pos_m[self._known[:1]].T)
-            dr.eval(report(params, tx, mi.UInt32(0), self._poses[receiver], self._plane))
 
     def _rates(self) -> dict[str, float]:
         o = self.config.optimiser
@@ -254,6 +280,7 @@ class Trainer:
             "opacity": o.opacity,
             "signal": o.signal,
             "image": 0.0,
+            LEVEL: o.level,
         }
         traced = self.graph.traced
         return {
@@ -264,30 +291,24 @@ class Trainer:
     def predictor(self) -> Predictor:
         """Predictions with the running mean of the parameters as it is now."""
         if self._predictor is None:
-            self._predictor = Predictor(
-                self.field,
-                self.state.mean_params(),
-                self.record.receivers,
-                self.height,
-                self.width,
-                self.config.skip,
-                graph=self.graph,
-            )
+            params, own = self.state.mean_params(), self.graph
+            self._predictor = Predictor(own.field, params, own.receivers, *own.form.size, self.config.skip, graph=own)
         else:
             self._predictor.update(self.state.mean)
         return self._predictor
 
     def validate(self) -> float:
-        """Median SSIM on the validation rows, all receivers pooled; NaN without such rows."""
-        rows = self.split.validation
+        """Median score on the validation rows, all receivers pooled; NaN without such rows."""
+        rows, record = self.split.validation, self.record
         if len(rows) == 0:
             return float("nan")
-        scores = []
-        for r in range(len(self.record.receivers)):
-            predicted = to_float(self.predictor()(self.record.tx_pos_m[rows], r))
-            truth = to_float(self.record.observation[r, rows])
-            scores.append(ssim(predicted, truth, len(rows), self.height, self.width).numpy())
-        return float(np.median(np.concatenate(scores)))
+        uplink = None if record.uplink is None else record.uplink[rows]
+        predict = self.predictor()
+        scores = [
+            self.task.training_score(predict(record.tx_pos_m[rows], r, uplink), record.observation[r, rows])
+            for r in range(len(record.receivers))
+        ]
+        return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
     def run(
         self,
@@ -311,9 +332,9 @@ class Trainer:
         """
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
-        first, losses, trouble = state.step, dr.zeros(mi.Float), no_trouble(state.adam)
-        since = 0
-        while state.step < config.steps and not (state.step > first and stop()):
+        losses, trouble = dr.zeros(mi.Float), no_trouble(state.adam)
+        since = taken = 0
+        while state.step < config.steps and not (taken and stop()):
             t = state.step
             receiver = int(schedule.receiver[t])
             rows = schedule.rows[t]
@@ -322,7 +343,7 @@ class Trainer:
                 state.mean,
                 self._data,
                 mi.UInt32(rows.tolist()),
-                mi.UInt32(np.searchsorted(self._known, rows).tolist()),
+                mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
                 dr.opaque(mi.UInt32, receiver),
                 self._poses[receiver],
                 self._plane,
@@ -334,22 +355,25 @@ class Trainer:
             losses += report.loss
             state.urge += report.urge
             dr.eval(losses, state.urge)
-            state.step, state.urge_steps, since = t + 1, state.urge_steps + 1, since + 1
+            state.step, state.urge_steps, since, taken = t + 1, state.urge_steps + 1, since + 1, taken + 1
             if trouble.step[0]:  # one number, but reading it waits for the step
                 self._require_finite(trouble)
             self.seconds = before + time.perf_counter() - start
             last = state.step == config.steps
             if state.step in schedule.density:
                 self._adapt()
-            scored = state.step % config.validate_every == 0 or last
+            choosing = config.patience > 0 and state.step <= schedule.joined and not state.chosen
+            scored = state.step % config.validate_every == 0 or last or (choosing and state.step == schedule.joined)
             if state.step % config.log_every == 0 or scored:
                 self._require_finite(trouble)
                 score = self.validate() if scored else None
                 self.seconds = before + time.perf_counter() - start
-                left = (self.seconds - before) / (state.step - first) * (config.steps - state.step)
+                left = (self.seconds - before) / taken * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
                 listen(Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left))
                 losses, since = dr.zeros(mi.Float), 0
+                if score is not None and choosing and self._chosen(score):
+                    state, schedule = self.state, self.schedule
             if state.step % config.checkpoint_every == 0 and not last:
                 self._require_finite(trouble)
                 save()
@@ -358,6 +382,18 @@ class Trainer:
         self._require_finite(trouble)
         save()
         return state.step == config.steps
+
+    def _chosen(self, score: float) -> bool:
+        """Keep the best moment; once no better one is waited for, go on from it. Whether the fit did."""
+        state = self.state
+        state.keep_best(score if self.task.higher_is_better else -score)
+        if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
+            return False
+        self.state = state.go_back()
+        self.state.chosen = self.state.step
+        self.schedule, self.state.step = self.schedule.after(self.state.chosen)
+        self.record_functions()
+        return True
 
     def _adapt(self) -> None:
         d, state = self.config.density, self.state

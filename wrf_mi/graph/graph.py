@@ -1,20 +1,22 @@
 """One graph of both sides: Gaussians evaluated by splatting, paths evaluated on planes, receivers that report both.
 
-    tx position ─► Gaussians ─ splat ─► L(u) ─┐
-                                              ├─► receiver model ─► spectrum
-    tx position ─► chains of planes ─► T ─────┘
+    tx position or uplink ─► Gaussians ─ splat ─► L(u) ─┐
+                                                        ├─► receiver model ─► spectrum, dBm, channel
+    tx position ─► chains of planes ─► T ───────────────┘
 
-Every argument that training changes is a parameter by name: those of the field (`wrf_mi.field`), and of the traced
-side ``material.*``, ``receiver.*`` and ``pattern.*`` (`wrf_mi.hybrid.traced.TracedField`). Without a scene the tracer
-is not imported.
+Every argument that training changes is a parameter by name: those of the field (`wrf_mi.field`), ``level``, the
+logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
+``receiver.*`` and ``pattern.*`` (`wrf_mi.hybrid.traced.TracedField`). Without a scene the tracer is not imported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,61 +24,91 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
-from ..field import Factorised, WrfGs, WrfGsPlus
-from ..hybrid.combine import ArrayReceiver, PixelReceiver
+from ..field import Factorised, Gaussians, WrfGs, WrfGsPlus
+from ..field.gaussians import by_component
 from ..hybrid.learned import learned_field
 from ..hybrid.pose import receiver_pose
 from ..project.footprint import Pose
 from ..splat.tiles import Plane
-from .settings import DEFAULT, ReceiverModel, TracedConfig
+from .receivers import RECEIVERS, Form, ReceiverModel
+from .settings import DEFAULT, TracedConfig
 
 if TYPE_CHECKING:
     from ..hybrid.traced import TracedField
 
 Field = WrfGs | WrfGsPlus | Factorised
-Report = Callable[[Mapping[str, Any], Any, Any, Pose, Plane], Any]
-"""``report(params, tx_pos, slots, pose, plane)``: flat observations of a batch of transmitters, differentiable."""
+LEVEL = "level"
+"""Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
+MATCHING = 3
+"""Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
+
+
+@dataclass
+class Batch:
+    """Transmitters that one receiver hears, on the device.
+
+    Attributes:
+        condition: positions [3, batch], metres, or features [features, batch] in their place.
+        slots: rows of the traced side [batch].
+        receiver: its number from 0.
+        pose: of the receiver.
+        plane: directions of its learned signal.
+    """
+
+    condition: Any
+    slots: Any
+    receiver: Any
+    pose: Pose
+    plane: Plane
+
+
+Report = Callable[[Mapping[str, Any], Batch], Any]
+"""``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
 
 
 class Graph:
     """Gaussians, the traced paths of a scene, and receivers.
 
     Args:
-        field: the Gaussians.
+        field: the Gaussians; None: the traced paths alone.
         receivers: poses, antennas and arrays.
-        size: height and width of a spectrum.
-        receiver: receiver model; ``auto``: ``array`` with a scene, else ``pixel``.
-        frequencies_hz: of the carrier [1]; None: not known.
+        form: what observations are made of.
         scene: from `wrf_mi.trace.open_scene`, at the carrier; None: Gaussians alone.
         traced: what is traced, and rates.
         tx_antenna: antenna of the transmitters.
 
     Raises:
-        InputError: a receiver model or a scene for which array or carrier are not known.
+        InputError: a receiver model or a scene for which array or carrier are not known, or nothing to evaluate.
     """
 
     def __init__(
         self,
-        field: Field,
+        field: Field | None,
         receivers: Sequence[Receiver],
-        size: tuple[int, int],
-        receiver: ReceiverModel = "auto",
-        frequencies_hz: FloatArray | None = None,
+        form: Form,
         scene: Any | None = None,
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
     ) -> None:
-        kind = receiver if receiver != "auto" else "pixel" if scene is None else "array"
-        known = frequencies_hz is not None and all(one.array_m is not None for one in receivers)
-        if not known and (kind == "array" or scene is not None):
-            what = "a scene" if scene is not None else "setting receiver: array"
-            raise InputError(
-                f"{what} needs the antenna array and the carrier; state array and frequency_hz in the data"
-            )
+        self.kind = RECEIVERS[form.receiver]
+        array = self.kind.needs_array and any(one.array_m is None for one in receivers)
+        carrier = form.frequencies_hz is None and (self.kind.needs_carrier or scene is not None)
+        if array or carrier:
+            what = "a scene" if scene is not None else f"setting receiver: {form.receiver}"
+            needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
+            raise InputError(f"{what} needs {needed}; state array and frequency_hz in the data")
+        if scene is not None and form.features:
+            raise InputError("paths are traced from positions, not from an uplink; leave the scene or the uplink away")
+        if field is None and scene is None:
+            raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
-        self._tx_antenna = tx_antenna
-        hz = float("nan") if frequencies_hz is None else float(frequencies_hz[0])
-        self.models = tuple(_model(kind, size, one, hz) for one in receivers)
+        self.form, self.tx_antenna = form, tx_antenna
+        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, one) for one in receivers)
+
+    @property
+    def sphere(self) -> bool:
+        """Whether receivers see the full sphere, or else the upper hemisphere."""
+        return self.models[0].sphere
 
     @cached_property
     def _prepared(self) -> Any:
@@ -98,10 +130,10 @@ class Graph:
         if self.scene is not None:
             from ..trace.polarization import check_polarization
 
-            check_polarization(self.scene, tx_pos_m, self.receivers, self._tx_antenna)
+            check_polarization(self.scene, tx_pos_m, self.receivers, self.tx_antenna)
 
-    def trace(self, tx_pos_m: ArrayLike, number: int) -> TracedField | None:
-        """The traced side of transmitters [n, 3] at one receiver; None without a scene."""
+    def trace(self, tx_pos_m: ArrayLike, number: int, tx_heading_rad: ArrayLike | None = None) -> TracedField | None:
+        """The traced side of transmitters [n, 3], turned by [n], at one receiver; None without a scene."""
         if self.scene is None:
             return None
         from ..hybrid.traced import TracedField, TracedOptions
@@ -115,53 +147,76 @@ class Graph:
             reflection=t.reflections > 0,
             rays=t.rays,
         )
-        options = TracedOptions(what, t.pattern_degree, tx_antenna=self._tx_antenna)
-        return TracedField(self.scene, tx_pos_m, self.receivers[number], options, prepared=self._prepared)
+        options = TracedOptions(what, t.pattern_degree, tx_antenna=self.tx_antenna)
+        receiver = self.receivers[number]
+        return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the traced side's parameters that a rate moves, by name; sides of all receivers."""
+        """Starting values of the parameters beside the field's that a rate moves, by name; sides of all receivers."""
         values: dict[str, NDArray[np.float32]] = {}
         for side in sides:
             if side is not None:
                 values |= {name: v for name, v in side.parameters().items() if self.traced.rate(name) > 0}
+        if self.field is not None and self.kind.levels:
+            values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
 
     def moved(self, number: int) -> bool:
         """Whether training moves a receiver."""
         return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
-    def report(self, number: int, side: TracedField | None) -> Report:
-        """What a receiver reports, as a function of parameters, for transmitters of a traced side."""
+    def gaussians(self, params: Mapping[str, Any], batch: Batch) -> Gaussians:
+        """Gaussians of a batch in the receiver's unit, one signal each."""
+        assert self.field is not None
+        gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
+        if LEVEL not in params:
+            return gaussians
+        unit = dr.exp(dr.gather(type(gaussians.signal[0]), params[LEVEL].array, batch.receiver))
+        return replace(gaussians, signal=[part * unit for part in gaussians.signal])
+
+    def report(self, number: int, side: TracedField | None, learned: bool = True) -> Report:
+        """What a receiver reports, as a function of parameters, for transmitters of a traced side.
+
+        Args:
+            number: of the receiver.
+            side: its traced side, or None.
+            learned: with the learned side, where the graph has one.
+        """
         model, receiver, moved = self.models[number], self.receivers[number], self.moved(number)
 
-        def report(params: Mapping[str, Any], tx_pos: Any, slots: Any, pose: Pose, plane: Plane) -> Any:
-            paths = None if side is None else side(params, slots)
-            here = receiver_pose(receiver, params, mi.Float) if moved else pose
-            return model(paths, learned_field(self.field.gaussians(params, tx_pos), here, plane, model.sphere))
+        def report(params: Mapping[str, Any], batch: Batch) -> Any:
+            paths = None if side is None else side(params, batch.slots)
+            if self.field is None or not learned:
+                return model(paths, None)
+            here = receiver_pose(receiver, params, mi.Float) if moved else batch.pose
+            return model(paths, learned_field(self.gaussians(params, batch), here, batch.plane, model.sphere))
 
         return report
 
     def arrays(self, number: int, side: TracedField | None) -> list[Any]:
         """What a report reads on the device beside its arguments: a recording takes it as inputs."""
-        if side is None and not isinstance(self.models[number], ArrayReceiver):
+        if side is None and self.form.receiver == "pixel":
             return []
         return [self.models[number].arrays(mi.Float), [] if side is None else side.arrays]
 
     def match_gain(
         self, number: int, side: TracedField, params: Mapping[str, Any], observed: NDArray[Any]
     ) -> dict[str, NDArray[np.float32]]:
-        """The receiver's starting gain, with which the traced side alone reports what was observed, on average."""
-        from ..hybrid.joint import MATCHING, View, missing_gain
+        """The receiver's starting gain, with which the traced side alone reports what was observed, on average.
 
-        view = View(self.receivers[number], self.models[number], observed, side)
+        Args:
+            number: of the receiver.
+            side: the traced side of the observed transmitters.
+            params: values by name, in place of those stated.
+            observed: [n, *shape of a report], NaN where nothing was received.
+        """
+        model = self.models[number]
+        alone: Any = getattr(model, "unscaled", model)
+        known = np.isfinite(observed).reshape(len(observed), -1).all(axis=1)
         gain = np.zeros(2, np.float32)
         for _ in range(MATCHING):
-            gain[0] += missing_gain(view, side, {**params, side.gain_name: mi.TensorXf(gain)})
+            with dr.suspend_grad():
+                report = alone(side({**params, side.gain_name: mi.TensorXf(gain)}), None).numpy()
+            report = report.astype(float).reshape(np.shape(observed))
+            gain[0] += model.missing_gain(report[known], observed[known]) if known.any() else 0.0
         return {side.gain_name: gain}
-
-
-def _model(kind: str, size: tuple[int, int], receiver: Receiver, frequency_hz: float) -> PixelReceiver:
-    elements = np.zeros((0, 3)) if receiver.array_m is None else receiver.array_m
-    if kind == "pixel":
-        return PixelReceiver(*size, elements, frequency_hz)
-    return ArrayReceiver(*size, elements, frequency_hz, instrument_scale=True)

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
-
-ReceiverModel = Literal["auto", "pixel", "array"]
-RECEIVERS = ("pixel", "array")
-"""Receiver models of spectra, see `wrf_mi.hybrid.combine`."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ as powers (``power``: sqrt(abs(T)^2 + abs(L)^2)).
 | pixel | image of h_m, sum_m h_m exp(-j k p_m . u) | R(u) | magnitude at every pixel u |
 | array | image of h_m | image of sum_u w(u) R(u) exp(+j k p_m . u) | magnitude at every pixel u |
 | power | h at the origin | sum_u w(u) R(u) over the full sphere | power in dB |
-| csi | h at the origin, on each subcarrier | the same sum, alike on all subcarriers | T + L |
+| csi | h at each antenna, on each subcarrier | the same sum, or several: coefficients of a basis | T + L |
 
 with h_m = sum over paths of g (d / d_m) exp(-j k d_m), d_m from the path's image source to element m, and w(u) the
 solid angle of a pixel. Everything is a Dr.Jit array of one float type, that of the learned side, with derivatives;
@@ -19,19 +19,20 @@ complex numbers are pairs (re, im).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.constants import speed_of_light
+from numpy.typing import NDArray
 
 from ..backend.device import on_device
-from ..core.angles import FloatArray, pixel_directions, solid_angles
+from ..core.angles import FloatArray, pixel_directions
 from .follow import Complex
-from .traced import Float64, TracedPaths
+from .ports import Ports, Steering, direction_weights, matrix, path_sum, weighted
+from .traced import TracedPaths
 
 How = Literal["coherent", "power"]
 
@@ -39,125 +40,6 @@ DARK = 1e-8
 """Added to a squared magnitude under the root, whose slope at zero is infinite: 1e-4 is the least magnitude."""
 LEAST_POWER = 1e-20
 """Added to a power before its logarithm: the report ends at -200 dB."""
-
-
-def _wavenumber(frequency_hz: Any) -> Any:
-    return 2 * np.pi * frequency_hz / speed_of_light
-
-
-@lru_cache(maxsize=16)
-def _weights(height: int, width: int, halves: int, float_type: Any) -> Any:
-    """`solid_angles` of one or both hemispheres on the device."""
-    return on_device(np.tile(solid_angles(height, width), halves), float_type)
-
-
-class Ports:
-    """Where and at what frequency a receiver takes m complex signals, kept on the device.
-
-    Args:
-        offset_m: places in the receiver's frame, [m, 3], metres.
-        frequency_hz: of each, [m].
-    """
-
-    def __init__(self, offset_m: FloatArray, frequency_hz: FloatArray) -> None:
-        self.count = len(frequency_hz)
-        self.offset_m = [on_device(c, Float64) for c in np.transpose(np.asarray(offset_m, float))]
-        self.wavenumber = on_device(_wavenumber(np.asarray(frequency_hz, float)), Float64)
-
-    @property
-    def arrays(self) -> list[Any]:
-        """All that it keeps on the device."""
-        return [*self.offset_m, self.wavenumber]
-
-
-def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
-    """Coherent sum of a receiver's paths at m ports: sum over paths of g (d / d_m) exp(-j k_m d_m).
-
-    Each path is a spherical wave from its image source, at the unfolded length d in the direction of arrival; for flat
-    mirrors that is exact, near field included. What it leaves out: a path may be blocked for some elements only, and
-    reflects at the angle of the array's origin.
-
-    Args:
-        paths: of a batch of transmitters.
-        ports: of the receiver.
-
-    Returns:
-        Real and imaginary part, float64 [batch * m]. A fixed order of summation: the same in every run.
-
-    Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
-    """
-    each = paths.each
-    lane = dr.arange(mi.UInt32, paths.batch * ports.count * each)
-    port = (lane // each) % ports.count
-    slot = (lane // (each * ports.count)) * each + lane % each
-
-    def of_path(array: Any) -> Any:
-        return dr.gather(Float64, array, slot)
-
-    def of_port(array: Any) -> Any:
-        return dr.gather(Float64, array, port)
-
-    length = of_path(paths.length_m)
-    away = [of_path(u) * length - of_port(p) for u, p in zip(paths.arrival, ports.offset_m, strict=True)]
-    distance = dr.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
-    sine, cosine = dr.sincos(-of_port(ports.wavenumber) * distance)
-    re, im = (of_path(part) * length / distance for part in paths.gain)
-    terms = re * cosine - im * sine, re * sine + im * cosine
-    return tuple(dr.block_reduce(dr.ReduceOp.Add, term, each) for term in terms)
-
-
-class Steering:
-    """The complex matrix E = exp(+j k p . u) of m ports and n directions, kept on the device.
-
-    Args:
-        offset_m: ports [m, 3] in the receiver's frame, metres.
-        directions: unit vectors [n, 3] in that frame.
-        frequency_hz: of the carrier.
-    """
-
-    def __init__(self, offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> None:
-        phase = _wavenumber(frequency_hz) * np.asarray(offset_m, float) @ np.asarray(directions, float).T
-        self._parts: FloatArray = np.stack([np.cos(phase), np.sin(phase)])
-        self._device: dict[Any, tuple[Any, Any]] = {}
-
-    def arrays(self, float_type: Any) -> list[Any]:
-        """All that it keeps on the device for signals of a float type."""
-        return list(self._matrices(float_type))
-
-    def _matrices(self, float_type: Any) -> tuple[Any, Any]:
-        if float_type not in self._device:
-            c, s = (_matrix(on_device(part, float_type), part.shape[1]) for part in self._parts)
-            self._device[float_type] = c, s
-        return self._device[float_type]
-
-    def to_ports(self, signal: Complex) -> Complex:
-        """sum_u R(u) exp(+j k p_m . u): from directions, flat [batch * n], to ports, flat [batch * m]."""
-        c, s = self._matrices(type(signal[0]))
-        re, im = (_matrix(part, self._parts.shape[2]) for part in signal)
-        c, s = _transposed(c), _transposed(s)
-        return (re @ c - im @ s).array, (re @ s + im @ c).array
-
-    def to_directions(self, ports: Complex) -> Complex:
-        """sum_m h_m exp(-j k p_m . u): from ports, flat [batch * m], to directions, flat [batch * n] (Bartlett)."""
-        c, s = self._matrices(type(ports[0]))
-        re, im = (_matrix(part, self._parts.shape[1]) for part in ports)
-        return (re @ c + im @ s).array, (im @ c - re @ s).array
-
-
-def _matrix(flat: Any, columns: int) -> Any:
-    tensor_type: Any = dr.tensor_t(type(flat))
-    return tensor_type(flat, (dr.width(flat) // columns, columns))
-
-
-def _transposed(matrix: Any) -> Any:
-    return dr.moveaxis(matrix, 0, 1)
-
-
-def weighted(signal: Complex, weight: Any) -> Complex:
-    """A signal on directions, flat [batch * n], times a weight of each, [n] of the same float type."""
-    index = dr.arange(dr.uint32_array_t(type(weight)), dr.width(signal[0])) % dr.width(weight)
-    factor = dr.gather(type(weight), weight, index)
-    return signal[0] * factor, signal[1] * factor
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = DARK) -> Any:
@@ -215,7 +97,7 @@ class PixelReceiver:
     frequency_hz: float
     how: How = "coherent"
 
-    sphere = False
+    sphere, components = False, 1
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -232,7 +114,7 @@ class PixelReceiver:
 
     def arrays(self, float_type: Any) -> list[Any]:
         """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
-        weights = _weights(self.height, self.width, 1, float_type)
+        weights = direction_weights(self.height, self.width, 1, float_type)
         return [*self._ports.arrays, *self._steering.arrays(float_type), weights]
 
     def elements(self, traced: TracedPaths, float_type: Any) -> Complex:
@@ -245,6 +127,10 @@ class PixelReceiver:
         float_type: Any = mi.Float if learned is None else type(learned[0])
         image = None if traced is None else self._steering.to_directions(self.elements(traced, float_type))
         return magnitude(image, learned, self.how)
+
+    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the amplitude by which a report is too weak: of mean magnitudes."""
+        return float(np.log(np.nanmean(observed) / np.mean(report)))
 
 
 @dataclass(frozen=True)
@@ -264,7 +150,7 @@ class ArrayReceiver(PixelReceiver):
             None if traced is None else self.elements(traced, float_type),
             None
             if learned is None
-            else self._steering.to_ports(weighted(learned, _weights(self.height, self.width, 1, float_type))),
+            else self._steering.to_ports(weighted(learned, direction_weights(self.height, self.width, 1, float_type))),
         ]
         present = [side for side in sides if side is not None]
         if self.how == "coherent" and present:
@@ -273,57 +159,100 @@ class ArrayReceiver(PixelReceiver):
         spectrum = magnitude(images[0], images[1], self.how)
         return scaled(spectrum, self.height * self.width) if self.instrument_scale else spectrum
 
+    @property
+    def unscaled(self) -> ArrayReceiver:
+        """The same without the instrument's scaling."""
+        return replace(self, instrument_scale=False)
+
+    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the amplitude by which an unscaled report is too weak: its peaks are to be 1 if scaled."""
+        if not self.instrument_scale:
+            return super().missing_gain(report, observed)
+        return float(-np.log(np.asarray(report).reshape(len(observed), -1).max(axis=1).mean()))
+
 
 @dataclass(frozen=True)
 class CsiReceiver:
-    """A single antenna that reports its complex channel on each subcarrier.
+    """One or several antennas that report their complex channel on each subcarrier.
 
-    The learned field is one on the full sphere. Narrow band: it and the paths' gains are alike on all subcarriers, the
-    travelling phase is that of each. Complex numbers are added, so there is no choice of ``how``.
+    The learned field is one on the full sphere. Without a basis it and the paths' gains are alike at all antennas and
+    on all subcarriers, the travelling phase of paths is that of each. With a basis the field has several signals in
+    each direction, whose sums over directions are the coefficients of its vectors. Complex numbers are added, so there
+    is no choice of ``how``.
 
     Attributes:
         height: elevations of each hemisphere.
         width: azimuths.
         frequencies_hz: of the subcarriers, [k].
+        elements_m: places of several antennas [m, 3], receiver's frame, metres; None: one antenna in its origin.
+        basis: complex [components, k] or [components, m * k], antennas slowest; None: one component, all ones.
     """
 
     height: int
     width: int
     frequencies_hz: tuple[float, ...]
+    elements_m: FloatArray | None = field(default=None, repr=False)
+    basis: NDArray[np.complex128] | None = field(default=None, repr=False)
 
     sphere = True
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one report: subcarriers, real and imaginary part."""
-        return len(self.frequencies_hz), 2
+        """Of one report: antennas where there are several, subcarriers, real and imaginary part."""
+        antennas = () if self.elements_m is None else (len(self.elements_m),)
+        return *antennas, len(self.frequencies_hz), 2
+
+    @property
+    def components(self) -> int:
+        """Complex signals that the learned field has in each direction."""
+        return 1 if self.basis is None else len(self.basis)
 
     @cached_property
     def _ports(self) -> Ports:
-        return Ports(np.zeros((len(self.frequencies_hz), 3)), np.array(self.frequencies_hz))
+        places = np.zeros((1, 3)) if self.elements_m is None else np.asarray(self.elements_m, float)
+        count = len(self.frequencies_hz)
+        return Ports(np.repeat(places, count, axis=0), np.tile(self.frequencies_hz, len(places)))
+
+    @cached_property
+    def _vectors(self) -> dict[Any, tuple[Any, Any]]:
+        return {}
+
+    def _basis(self, float_type: Any) -> tuple[Any, Any]:
+        """Real and imaginary part of the basis on the device, [components, outputs]."""
+        if float_type not in self._vectors:
+            basis = np.asarray(self.basis)
+            re, im = (matrix(on_device(part, float_type), basis.shape[1]) for part in (basis.real, basis.imag))
+            self._vectors[float_type] = re, im
+        return self._vectors[float_type]
 
     def arrays(self, float_type: Any) -> list[Any]:
         """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
-        return [*self._ports.arrays, _weights(self.height, self.width, 2, float_type)]
+        basis = [] if self.basis is None else list(self._basis(float_type))
+        return [*self._ports.arrays, direction_weights(self.height, self.width, 2, float_type), *basis]
 
     def signals(self, traced: TracedPaths | None, learned: Complex | None) -> tuple[Complex | None, Complex | None]:
-        """Both sides at the antenna, [batch * k]; None where a side is None."""
+        """Both sides at the antennas, [batch * outputs]; None where a side is None."""
         float_type: Any = mi.Float if learned is None else type(learned[0])
-        count, here, there = len(self.frequencies_hz), None, None
+        here, there = None, None
         if traced is not None:
             re, im = path_sum(traced, self._ports)
             here = float_type(re), float_type(im)
         if learned is not None:
-            parts, pixels = (
-                weighted(learned, _weights(self.height, self.width, 2, float_type)),
-                self.height * self.width,
-            )
-            re, im = (dr.repeat(dr.block_reduce(dr.ReduceOp.Add, part, 2 * pixels), count) for part in parts)
-            there = re, im
+            parts = weighted(learned, direction_weights(self.height, self.width, 2, float_type))
+            re, im = (dr.block_reduce(dr.ReduceOp.Add, part, 2 * self.height * self.width) for part in parts)
+            there = self._outputs(re, im)
         return here, there
 
+    def _outputs(self, re: Any, im: Any) -> Complex:
+        """Learned signals at all outputs, from coefficients, flat [batch * components]."""
+        if self.basis is None:
+            return dr.repeat(re, self._ports.count), dr.repeat(im, self._ports.count)
+        b_re, b_im = self._basis(type(re))
+        re, im = (matrix(part, self.components) for part in (re, im))
+        return (re @ b_re - im @ b_im).array, (re @ b_im + im @ b_re).array
+
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Channels [batch * k * 2], real and imaginary part in turn, of the two sides; either may be None.
+        """Channels [batch * outputs * 2], real and imaginary part in turn, of the two sides; either may be None.
 
         Raises:
             ValueError: neither side.
@@ -335,48 +264,50 @@ class CsiReceiver:
         pair: Any = mi.Complex2f if type(re) is mi.Float else dr.float64_array_t(mi.Complex2f)
         return dr.ravel(pair(re, im))
 
+    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the amplitude by which a report is too weak: of root mean squares."""
+        return float(np.log(_mean_square(observed) / _mean_square(report)) / 2)
+
+
+def _mean_square(values: NDArray[Any]) -> float:
+    return float(np.nanmean(np.square(np.asarray(values, float))))
+
 
 @dataclass(frozen=True)
 class PowerReceiver(CsiReceiver):
     """A single antenna that reports its power in dB: RSSI. The learned field is one on the full sphere.
 
     Attributes:
-        frequencies_hz: the mean power over these is reported: of the channels that the instrument hops over.
         how: how the sides add.
         interference: traced paths interfere with each other; False: their powers add, what remains after averaging
-            over positions of a wavelength or over a wide band (then ``how`` must be ``power``).
+            over positions of a wavelength or over a wide band. Such a mean has no phase; added to the learned side as
+            a complex number (``coherent``) it is its root, a positive real, which that side raises or lowers.
     """
 
     how: How = "coherent"
     interference: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse to add complex numbers that have no phase.
-
-        Raises:
-            ValueError: ``coherent`` without interference.
-        """
-        if not self.interference and self.how != "power":
-            raise ValueError(f"PowerReceiver: how {self.how!r} without interference; add powers")
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Of one report."""
         return ()
 
+    def _mean_field(self, traced: TracedPaths, float_type: Any) -> Complex:
+        """Root of the sum of paths' powers, alike at all frequencies, as a complex signal of phase zero."""
+        re, im = traced.gain
+        amplitude = float_type(dr.sqrt(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, traced.each) + LEAST_POWER))
+        wide = dr.repeat(amplitude, self._ports.count)
+        return wide, dr.zeros(float_type, dr.width(wide))
+
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
-        count = len(self.frequencies_hz)
-        if self.interference or traced is None:
-            here, there = self.signals(traced, learned)
-            received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
-        else:
-            re, im = traced.gain
-            received = dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, traced.each)
-            if learned is not None:
-                _, there = self.signals(None, learned)
-                alone = dr.block_reduce(dr.ReduceOp.Add, power(None, there, self.how), count) / count
-                received = type(alone)(received) + alone
-            else:
-                received = mi.Float(received)
+        count = self._ports.count
+        here, there = self.signals(traced if self.interference else None, learned)
+        if traced is not None and not self.interference:
+            here = self._mean_field(traced, mi.Float if learned is None else type(learned[0]))
+        received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
         return 10 * dr.log2(received + LEAST_POWER) / math.log2(10)
+
+    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the amplitude by which a report is too weak: of mean powers in dB."""
+        return float((np.nanmean(observed) - np.mean(report)) * math.log(10) / 20)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -19,8 +19,9 @@ from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..field import InitialGaussians
 from ..field.recorded import Recorded
+from ..loss.known import absolute_error as known_error
 from ..splat.tiles import perception_plane
-from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from .combine import ArrayReceiver, CsiReceiver, PixelReceiver
 from .learned import Field, learned_field
 from .materials import physical
 from .pose import pose_parameters, receiver_pose
@@ -53,9 +54,7 @@ RATES: Mapping[str, float] = {
 
 def absolute_error(prediction: Any, truth: Any, batch: int, *shape: int) -> Any:
     """Mean absolute difference over what was received (truth not NaN)."""
-    known = dr.isfinite(truth)
-    count = dr.sum(dr.select(known, type(truth)(1), 0))
-    return dr.sum(dr.select(known, dr.abs(prediction - dr.select(known, truth, 0)), 0)) / dr.maximum(count, 1)
+    return known_error(prediction, truth)
 
 
 @dataclass(frozen=True)
@@ -350,19 +349,11 @@ def _check(view: View, tx_pos_m: FloatArray) -> None:
 
 def missing_gain(view: View, traced: TracedField, parameters: Mapping[str, Any]) -> float:
     """Logarithm of the amplitude that the traced side lacks."""
-    model, observed = view.model, np.asarray(view.observation)
-    scales = isinstance(model, ArrayReceiver) and model.instrument_scale
-    if isinstance(model, ArrayReceiver):
-        model = replace(model, instrument_scale=False)
+    model = view.model
+    alone = model.unscaled if isinstance(model, ArrayReceiver) else model
     with dr.suspend_grad():
-        report = model(traced(parameters), None).numpy().astype(float)
-    if scales:
-        return float(-np.log(report.reshape(len(observed), -1).max(axis=1).mean()))
-    if isinstance(model, PowerReceiver):
-        return float((np.nanmean(observed) - report.mean()) * np.log(10) / 20)
-    if isinstance(model, CsiReceiver):
-        return float(np.log(np.nanmean(np.abs(observed) ** 2) / (2 * (report**2).mean())) / 2)
-    return float(np.log(np.nanmean(observed) / report.mean()))
+        report = alone(traced(parameters), None).numpy()
+    return model.missing_gain(report, np.asarray(_pairs(view.observation), float))
 
 
 def _rates(values: Mapping[str, Any], asked: Mapping[str, float]) -> dict[str, float]:
@@ -374,9 +365,12 @@ def _rates(values: Mapping[str, Any], asked: Mapping[str, float]) -> dict[str, f
     return {name: next((rate for p, rate in patterns if fnmatchcase(name, p)), 0.0) for name in values}
 
 
+def _pairs(values: NDArray[Any]) -> NDArray[Any]:
+    """Complex values as real and imaginary part in turn."""
+    array = np.ascontiguousarray(values)
+    return np.stack([array.real, array.imag], axis=-1) if np.iscomplexobj(array) else array
+
+
 def _flat(values: NDArray[Any]) -> Any:
     """All values in a row on the device; complex ones as real and imaginary part in turn."""
-    array = np.ascontiguousarray(values)
-    if np.iscomplexobj(array):
-        array = np.stack([array.real, array.imag], axis=-1)
-    return to_tensor(array).array
+    return to_tensor(_pairs(values)).array

@@ -184,11 +184,11 @@ def _step(job: Job, work: Path) -> Arrays:
     trainer = Trainer(record, split, with_settings(TrainConfig(), job.settings))
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     plane, pose = perception_plane(*record.observation.shape[-2:], mi.Float), device_pose(record.receivers[0])
-    data = TrainingData(to_tensor(record.tx_pos_m.T), to_float(record.observation))
+    data = TrainingData(to_tensor(record.tx_pos_m.T), to_float(record.observation), to_float([1.0]))
     for value in params.values():
         dr.enable_grad(value)
     config = trainer.config
-    tx, truth = data.select(mi.UInt32(split.train[: config.batch].tolist()), mi.UInt32(0), plane)
+    tx, truth = data.select(mi.UInt32(split.train[: config.batch].tolist()), mi.UInt32(0), plane.pixels)
     image = grey(trainer.field, params, tx, pose, plane)
     loss = spectrum_loss(image, truth, config.batch, plane.height, plane.width, config.structural_weight)[0]
     dr.backward(loss)

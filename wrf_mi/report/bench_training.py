@@ -142,7 +142,8 @@ def work_of(of: Trainer) -> Work:
     """What a step of a fit computes and moves, from the shapes of its arrays."""
     shapes = {name: tuple(value.shape) for name, value in of.state.mean.items()}
     n, batch = shapes["position"][1], of.config.batch
-    pixels = of.height * of.width
+    height, width = of.graph.form.size
+    pixels = height * width
     flop, moved = 0.0, 0.0
     for name, shape in shapes.items():
         if "." not in name or name.endswith(".bias"):
@@ -185,7 +186,7 @@ def _visits(of: Trainer) -> float:
         gaussians = of.field.gaussians(params, to_tensor(of.record.tx_pos_m[:1].T))
         footprints = project(gaussians, device_pose(of.record.receivers[0]))
         order = depth_order(footprints.depth, gaussians.position)
-        lists = build_lists(footprints, order, perception_plane(of.height, of.width, mi.Float), 1)
+        lists = build_lists(footprints, order, perception_plane(*of.graph.form.size, mi.Float), 1)
     return float(lists.length.numpy().sum()) * TILE_ROWS * TILE_COLUMNS
 
 

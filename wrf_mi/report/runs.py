@@ -16,7 +16,7 @@ from ..baselines.method import Inputs
 from ..core import AntennaOptions, InputError, Receiver, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.types import IntArray
-from ..fit.config import TrainConfig
+from ..fit.config import TrainConfig, default_config
 from ..fit.folder import (
     RunConfig,
     append_log,
@@ -31,10 +31,11 @@ from ..fit.folder import (
     write_config,
 )
 from ..fit.predictor import Predictor
-from ..fit.trainer import Progress, Trainer, check_rows, peak_memory_mb, require_spectra
+from ..fit.trainer import Progress, Trainer, check_rows, peak_memory_mb
 from ..measure import make_splits
 from ..measure.observations import check_observations
 from ..parallel import Scheduler, row_parts
+from ..tasks import task_of
 from ..trace import load_record
 from .baseline_run import evaluate_baseline, is_baseline, open_baseline
 from .evaluate import Predict, evaluate, pool, stored_metrics, write_results
@@ -131,7 +132,7 @@ def train(
     """
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
     source = record.source or record.name if isinstance(dataset, Record) else str(dataset)
-    settings, folder = config or TrainConfig(), Path(out)
+    settings, folder = config or default_config(record.task), Path(out)
     if scene is None and (material is not None or antennas):
         raise InputError("a material and antennas belong to a scene that is traced; give it, or leave them away")
     record = antennas.of(record)
@@ -141,8 +142,7 @@ def train(
         splits, name = make_splits(record, split, settings.seed, n_train), split
     for rows in splits:
         check_rows(rows, record, f"split {rows.name}")
-        require_spectra(record)
-        check_observations(record, rows, complete=True)
+        check_observations(record, rows, complete=task_of(record).image)
     known = np.concatenate([rows.all_train for rows in splits])
     settings = settings.resolved(record.tx_pos_m[known], scene is not None)
     run = RunConfig(source, name, n_train, settings, None if scene is None else str(scene), material, antennas)
@@ -211,8 +211,8 @@ def _fit(
 def of_rows(record: Record, predictor: Predictor) -> Predict:
     """A predictor from transmitter positions as a method on a record's rows."""
 
-    def predict(rows: IntArray, receiver: int) -> NDArray[np.float32]:
-        return predictor(record.tx_pos_m[rows], receiver)
+    def predict(rows: IntArray, receiver: int) -> NDArray[Any]:
+        return predictor(record.tx_pos_m[rows], receiver, None if record.uplink is None else record.uplink[rows])
 
     return predict
 

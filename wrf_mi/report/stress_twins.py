@@ -14,7 +14,7 @@ from ..backend.device import on_device, to_uint
 from ..core import Paths, Receiver, unit_vectors
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..hybrid.combine import Ports, path_sum
+from ..hybrid.ports import Ports, path_sum
 from ..hybrid.traced import TracedPaths
 from ..receive import Lags, csi, element_signals
 from ..receive.footprints import gaussian_signals

@@ -30,9 +30,8 @@ from ..core import AntennaOptions, InputError, Split
 from ..core.files import one_line, write_atomically
 from ..fit.config import TrainConfig, with_settings
 from ..fit.folder import package_versions
-from ..fit.schedule import plan
 from ..fit.start import initial_gaussians
-from ..fit.trainer import require_spectra
+from ..fit.targets import plan_rows, targets_of
 from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..measure.observations import check_observations
@@ -205,10 +204,9 @@ def check_fit(
     record = _record(dataset)
     rows = _splits(dataset, split[0], split[1], None if split[2] == 0 and isinstance(settings, tuple) else split[2])
     if isinstance(settings, TrainConfig):
-        require_spectra(record)
         for one in rows:
-            check_observations(record, one, complete=True)
-            plan(settings, one, len(record.receivers))
+            check_observations(record, one, complete=task_of(record).image)
+            plan_rows(settings, targets_of(record, one.all_train), one)
             initial_gaussians(settings.initial, record, one.train, np.random.default_rng([settings.seed, 0]))
     else:
         for one in rows:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
@@ -17,6 +20,7 @@ class Csi(Task):
     name = "csi"
     block, label, higher_is_better = "cea_db", "CEA (dB)", True
     axes, more_axes, is_complex = 1, 1, True
+    receiver = receiver_with_scene = "csi"
     from_uplink = "copy of the uplink"
     heading, quantity = "channel coefficients", "power (dB)"
     note = (
@@ -28,6 +32,18 @@ class Csi(Task):
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """See `wrf_mi.tasks.scores.cea_db`."""
         return cea_db(prediction, truth)
+
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+        """The mean squared difference over what was received."""
+        from ..loss.known import squared_error
+
+        return squared_error(prediction, truth)
+
+    def unit(self, observed: NDArray[Any]) -> float:
+        """Root mean square of a receiver's channels: one far away counts as much as a near one."""
+        size = np.square(np.abs(np.asarray(observed, complex)))
+        power = float(np.nanmean(size)) if np.isfinite(size).any() else 0.0
+        return power**0.5 if power > 0 else 1.0
 
     def instrument(self, record: Record) -> ChannelInstrument:
         """Antennas, one or several at each receiver, that report channel coefficients."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import Record
 from ..core.angles import FloatArray
@@ -17,6 +19,7 @@ class Rssi(Task):
     name = "rssi"
     block, label, higher_is_better = "abs_error_db", "absolute error (dB)", False
     axes, in_decibel = 0, True
+    receiver = receiver_with_scene = "power"
     # Of 0 to 1.6 m the best on tenths of flat-ble's training run that were held out in turn, in the order of time.
     neighbours, softening_m = 100, 0.4
     heading, quantity = "received signal strength", "RSSI (dBm)"
@@ -28,6 +31,10 @@ class Rssi(Task):
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """See `wrf_mi.tasks.scores.abs_error_db`."""
         return abs_error_db(prediction, truth)
+
+    def unit(self, observed: NDArray[Any]) -> float:
+        """Ten decibels: errors are then of the size that learning rates are for."""
+        return 10.0
 
     def instrument(self, record: Record) -> PowerInstrument:
         """Single antennas that report received power."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
@@ -17,6 +20,7 @@ class Spectrum(Task):
     name = "spectrum"
     block, label, digits, higher_is_better = "ssim", "SSIM", 3, True
     axes, image = 2, True
+    receiver, receiver_with_scene = "pixel", "array"
     heading, quantity = "spatial spectra", "grey"
     note = (
         "SSIM is scikit-image's structural similarity with a data range of one; the blend mixes the four nearest "
@@ -26,6 +30,21 @@ class Spectrum(Task):
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """See `wrf_mi.tasks.scores.ssim`."""
         return ssim(prediction, truth)
+
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+        """The papers' loss, see `wrf_mi.loss.spectrum.spectrum_loss`."""
+        from ..loss.spectrum import spectrum_loss
+
+        return spectrum_loss(prediction, truth, batch, shape[0], shape[1], structural_weight)[0]
+
+    def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
+        """Structural similarity on the device, equal to scikit-image's."""
+        from ..backend.device import to_float
+        from ..loss.ssim import ssim as on_device
+
+        shape = np.shape(truth)
+        scores = on_device(to_float(prediction), to_float(truth), shape[0], shape[1], shape[2])
+        return np.asarray(scores.numpy(), float)
 
     def instrument(self, record: Record) -> SpectrumInstrument:
         """An array that reports scaled Bartlett spectra."""

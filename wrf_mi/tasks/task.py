@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Container
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
@@ -32,6 +32,8 @@ class Task(ABC):
         more_axes: that it may have beside these (antennas); all of them together are one observation.
         image: whether an observation is an image, which pictures show as such; else its level is drawn over positions.
         is_complex: whether observations are complex.
+        receiver: name of the receiver model by which a field is trained (`wrf_mi.graph.receivers`).
+        receiver_with_scene: of that with which paths of a scene are trained beside it.
         in_decibel: whether observations are powers in decibels, whose level each receiver counts from an origin of its
             own: a propagation law describes them, and offsets are fitted to training rows.
         neighbours: training rows that the reference interpolates between (inverse-distance weighting).
@@ -51,6 +53,8 @@ class Task(ABC):
     more_axes: ClassVar[int] = 0
     image: ClassVar[bool] = False
     is_complex: ClassVar[bool] = False
+    receiver: ClassVar[str] = ""
+    receiver_with_scene: ClassVar[str] = ""
     in_decibel: ClassVar[bool] = False
     neighbours: ClassVar[int] = 4
     softening_m: ClassVar[float] = 0.0
@@ -97,6 +101,28 @@ class Task(ABC):
     def headline(self, stored: Container[str]) -> str | None:
         """The reference that stands for all: the first of `references` among those stored; None without any."""
         return next((key for key in self.references if key in stored), None)
+
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+        """What training makes small, a Dr.Jit float of one value: the mean absolute difference over what was received.
+
+        Args:
+            prediction: flat Dr.Jit floats of a batch, divided by the receiver's `unit`.
+            truth: the same; NaN where nothing was received.
+            batch: number of observations.
+            shape: of one; complex ones with a last axis of real and imaginary part.
+            structural_weight: weight of an image's structure, 0 to 1.
+        """
+        from ..loss.known import absolute_error
+
+        return absolute_error(prediction, truth)
+
+    def unit(self, observed: NDArray[Any]) -> float:
+        """What observations of one receiver [n, ...], NaN where nothing was received, are divided by in the loss."""
+        return 1.0
+
+    def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
+        """Scores of observations [n, ...] while a model is trained: those of `of_rows`, by any faster way."""
+        return np.asarray(self.of_rows(np.asarray(prediction)[None], np.asarray(truth)[None])[0], float)
 
     def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Score of each receiver and row.

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tasks import task_of
-from .method import Inputs
+from . import task_of
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 """The quaternion x, y, z, w of a receiver whose frame is the world's."""
@@ -102,7 +101,7 @@ def outputs_of(record: Record) -> Outputs:
     return Outputs(True, antennas, known)
 
 
-def placed_receivers(record: Record, outputs: Outputs) -> tuple[Receiver, ...]:
+def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
     """The receivers of a record, with poses that are finite.
 
     With an uplink in the transmitter's place nothing is told in the world's frame, so a receiver whose position is not
@@ -115,7 +114,7 @@ def placed_receivers(record: Record, outputs: Outputs) -> tuple[Receiver, ...]:
     for receiver in record.receivers:
         position, turned = np.asarray(receiver.position_m, float), np.asarray(receiver.orientation_xyzw, float)
         if not (np.isfinite(position).all() and np.isfinite(turned).all()):
-            if not outputs.by_uplink:
+            if not by_uplink:
                 raise InputError(
                     f"{record.name}: the pose of receiver {receiver.name} is not known, which fields over positions "
                     "need; give its position and orientation, or channels with an uplink"
@@ -126,29 +125,23 @@ def placed_receivers(record: Record, outputs: Outputs) -> tuple[Receiver, ...]:
     return tuple(placed)
 
 
-def uplink_of(inputs: Inputs) -> NDArray[Any]:
+def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
     """The uplink of rows that are predicted.
 
     Raises:
         InputError: they have none.
     """
-    if inputs.uplink is None:
+    if uplink is None:
         raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
-    return inputs.uplink
+    return uplink
 
 
 def channel_scales(record: Record, rows: IntArray) -> FloatArray:
-    """Root mean square of each receiver's channels in given rows [n_rx], in whose units they are learned.
-
-    One for each, so that a receiver far away counts as much as a near one; 1 where there is nothing to measure by.
-    """
-    power = np.ones(len(record.receivers))
-    if task_of(record).is_complex:
-        for r, seen in enumerate(record.observation):
-            size = np.abs(seen[rows].astype(complex))
-            if np.isfinite(size).any():
-                power[r] = np.nanmean(np.square(size))
-    return np.sqrt(np.where(power > 0, power, 1.0))
+    """Units of each receiver's channels in given rows [n_rx] (see `wrf_mi.tasks.Task.unit`); 1 for other tasks."""
+    task = task_of(record)
+    if not task.is_complex:
+        return np.ones(len(record.receivers))
+    return np.array([task.unit(seen[rows]) for seen in record.observation])
 
 
 def truth_of(
