@@ -20,12 +20,12 @@ from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
-from ..graph.graph import LEVEL, Field, Graph
+from ..graph.graph import LEVEL, SHARE, Field, Graph
 from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from .config import PATHS_ALONE, SIGNAL_ALONE, TrainConfig
+from .config import PATHS_ALONE, TrainConfig
 from .predictor import Predictor
 from .start import initial_gaussians
 from .state import FitState
@@ -172,7 +172,7 @@ class Trainer:
         self.task = task_of(record)
         check_observations(record, split, complete=self.task.image)
         known = split.all_train
-        config = config.resolved(record.tx_pos_m[known], scene is not None)
+        config = config.resolved(record.tx_pos_m[known], scene is not None and self.task.image)
         self.record, self.split, self.config = record, split, config
         self.targets = targets_of(record, known)
         form = form_of(record, config, self.targets, known, scene is not None)
@@ -227,15 +227,13 @@ class Trainer:
 
     def _start(self, initial: InitialGaussians | None) -> dict[str, NDArray[np.float32]]:
         """Starting values: Gaussians, gains and levels with which each side reports what was observed, on average."""
-        rng = np.random.default_rng([self.config.seed, 0])
-        started = initial or initial_gaussians(
-            self.config.initial,
-            replace(self.record, receivers=self.graph.receivers),
-            self.split.train,
-            rng,
-            self.graph.sphere,
-        )
-        values = self.field.init(started, rng) | self.graph.parameters(self._sides)
+        rng, own = np.random.default_rng([self.config.seed, 0]), self.config.initial
+        values: dict[str, NDArray[np.float32]] = {}
+        if self.graph.field is not None:
+            seen = replace(self.record, receivers=self.graph.receivers)
+            drawn = initial or initial_gaussians(own, seen, self.split.train, rng, self.graph.sphere)
+            values = self.graph.field.init(drawn, rng)
+        values |= self.graph.parameters(self._sides)
         for r, side in enumerate(self._sides):
             if side is not None and side.gain_name in values:
                 values |= self.graph.match_gain(r, side, {}, self.targets.truth[r, self._known])
@@ -244,14 +242,15 @@ class Trainer:
         return values
 
     def _level(self, values: Mapping[str, NDArray[np.float32]], receiver: int) -> float:
-        """Level at which the Gaussians alone report what a receiver observed; with a scene they begin far below."""
-        rows = self.targets.received(receiver, self._known)[:AT_ONCE]
+        """Level at which Gaussians alone report what a receiver observed, or far below what its paths bring."""
         params = {name: to_tensor(value) for name, value in values.items()}
+        if (side := self._sides[receiver]) is not None:
+            return self.graph.power_level(side, params) + float(np.log(SHARE))
+        rows = self.targets.received(receiver, self._known)[:AT_ONCE]
         alone, own = self.graph.report(receiver, None), self.targets.condition[:, rows]
         found = evaluated(alone, params, own, receiver, self._poses[receiver], self._plane).numpy().astype(float)
         observed = self.targets.truth[receiver, rows].astype(float)
-        missing = self.graph.models[receiver].missing_gain(found.reshape(observed.shape), observed)
-        return missing + (np.log(self.config.initial.signal / SIGNAL_ALONE) if self.graph.scene is not None else 0.0)
+        return self.graph.models[receiver].missing_gain(found.reshape(observed.shape), observed)
 
     def _step_of(self, receiver: int) -> Callable[..., Any]:
         """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""

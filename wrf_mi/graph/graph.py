@@ -34,11 +34,13 @@ from .receivers import RECEIVERS, Form, ReceiverModel
 from .settings import DEFAULT, TracedConfig
 
 if TYPE_CHECKING:
-    from ..hybrid.traced import TracedField
+    from ..hybrid.traced import TracedField, TracedPaths
 
 Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
 """Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
+SHARE = 0.1
+"""Unit of the learned side beside paths, as a share of their amplitude: it begins as a correction."""
 MATCHING = 3
 """Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
 
@@ -165,13 +167,25 @@ class Graph:
         """Whether training moves a receiver."""
         return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
-    def gaussians(self, params: Mapping[str, Any], batch: Batch) -> Gaussians:
-        """Gaussians of a batch in the receiver's unit, one signal each."""
+    def gaussians(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Gaussians:
+        """Gaussians of a batch in the receiver's unit, one signal each.
+
+        Where observations have a unit of their own it is exp(``level``), and beside paths at least a share of their
+        amplitude: what a mesh leaves out goes with what it tells, near and far.
+        """
         assert self.field is not None
         gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
         if LEVEL not in params:
             return gaussians
-        unit = dr.exp(dr.gather(type(gaussians.signal[0]), params[LEVEL].array, batch.receiver))
+        kind: Any = type(gaussians.signal[0])
+        unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
+        if paths is not None:
+            re, im = paths.gain
+            power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
+            each = dr.width(gaussians.signal[0]) // paths.batch
+            unit = dr.gather(
+                kind, dr.sqrt(SHARE**2 * power + unit * unit), dr.arange(mi.UInt32, paths.batch * each) // each
+            )
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
     def report(self, number: int, side: TracedField | None, learned: bool = True) -> Report:
@@ -189,7 +203,7 @@ class Graph:
             if self.field is None or not learned:
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if moved else batch.pose
-            return model(paths, learned_field(self.gaussians(params, batch), here, batch.plane, model.sphere))
+            return model(paths, learned_field(self.gaussians(params, batch, paths), here, batch.plane, model.sphere))
 
         return report
 
@@ -198,6 +212,13 @@ class Graph:
         if side is None and self.form.receiver == "pixel":
             return []
         return [self.models[number].arrays(mi.Float), [] if side is None else side.arrays]
+
+    def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
+        """Logarithm of the amplitude that paths bring, by their mean power over all transmitters of a side."""
+        with dr.suspend_grad():
+            re, im = side(params).gain
+            power = float(dr.sum(re * re + im * im)[0]) / len(side)
+        return float(np.log(power) / 2) if power > 0 else 0.0
 
     def match_gain(
         self, number: int, side: TracedField, params: Mapping[str, Any], observed: NDArray[Any]

@@ -144,7 +144,7 @@ def train(
         check_rows(rows, record, f"split {rows.name}")
         check_observations(record, rows, complete=task_of(record).image)
     known = np.concatenate([rows.all_train for rows in splits])
-    settings = settings.resolved(record.tx_pos_m[known], scene is not None)
+    settings = settings.resolved(record.tx_pos_m[known], scene is not None and task_of(record).image)
     run = RunConfig(source, name, n_train, settings, None if scene is None else str(scene), material, antennas)
     if len(splits) == 1:
         _fit(start_run(folder, record, splits[0], run), folder, run, "", listen, stop)
