@@ -115,7 +115,8 @@ class Graph:
             reflection=t.reflections > 0,
             rays=t.rays,
         )
-        options = TracedOptions(what, t.pattern_degree, tx_antenna=self._tx_antenna)
+        ends: dict[str, Any] = {"tx_antenna": self._tx_antenna, "materials": t.materials, "planes": t.moves_planes}
+        options = TracedOptions(what, t.pattern_degree, **ends)
         return TracedField(self.scene, tx_pos_m, self.receivers[number], options, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:

@@ -87,8 +87,8 @@ def no_walls() -> Walls:
     return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
 
 
-def walls_of(surfaces: Surfaces) -> Walls:
-    """The planes of a scene's surfaces."""
+def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
+    """Centroids of the planes' faces, [q, 3] in metres, and the faces' areas [q] in square metres."""
     triangles, plane = surfaces.triangles, surfaces.plane
     count = len(surfaces.normal)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -100,6 +100,14 @@ def walls_of(surfaces: Surfaces) -> Walls:
     )
     # On the plane itself: the centroid of faces that lie in it within rounding.
     centre -= surfaces.normal * ((centre * surfaces.normal).sum(axis=1) - surfaces.offset)[:, None]
+    return centre, total
+
+
+def walls_of(surfaces: Surfaces) -> Walls:
+    """The planes of a scene's surfaces."""
+    triangles, plane = surfaces.triangles, surfaces.plane
+    count = len(surfaces.normal)
+    centre, total = plane_centres(surfaces)
     flat = np.einsum("fad,fcd->fca", surfaces.axes[plane], triangles - centre[plane, None])
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, plane, flat.min(axis=1))
