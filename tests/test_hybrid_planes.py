@@ -144,7 +144,7 @@ def test_each_surface_has_a_material(scene: Any) -> None:
     """Walls of one material differ once theirs do; a path that meets none of them stays as it is."""
     options = TracedOptions(replace(OPTIONS, max_depth=1), materials="surface")
     traced = TracedField(scene, transmitters(2), receiver(), options)
-    names = [name.partition("/")[0] for name in traced.material_names]
+    names = [name.partition("/")[0] for name in traced.slabs.names]
     assert sorted(names) == sorted({**WALLS, **CEILING, **PARTITION})
     values = traced.parameters()
     shape = values["material.surface.permittivity"].shape

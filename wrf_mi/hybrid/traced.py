@@ -35,7 +35,7 @@ from ..trace.buffer import SPECULAR, TRANSMISSION
 from ..trace.solve import Prepared
 from ..trace.surfaces import Surfaces, scene_surfaces
 from .follow import Chains, Complex, Level, Tables, Vector, follow
-from .materials import Materials, slabs_of_faces
+from .materials import Materials, SlabMaterials, slabs_of_faces
 from .patterns import pattern_coefficients, pattern_factor
 from .planes import PlaneTables
 from .pose import component, moved_m, pose_parameters, receiver_pose
@@ -168,9 +168,19 @@ class TracedField:
         return [self._chains, self._constants, self._planes]
 
     @property
-    def material_names(self) -> tuple[str, ...]:
-        """Of each material, or ``<object>/<plane>`` of each surface, in the order of parameters of all surfaces."""
-        return self._materials.names
+    def chains(self) -> Chains:
+        """What each path meets, planes as stated."""
+        return self._chains
+
+    @property
+    def slabs(self) -> SlabMaterials:
+        """The scene's materials as stated, or those of its surfaces in the order of their parameters."""
+        return self._materials
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """The scene's surfaces, whose planes those of the parameters are."""
+        return self._surfaces
 
     @property
     def gain_name(self) -> str:
