@@ -20,10 +20,11 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.hybrid.corrected import write_corrected_scene
 from wrf_mi.hybrid.materials import Materials
 from wrf_mi.hybrid.planes import SHIFT, TILT, PlaneTables
 from wrf_mi.hybrid.walls import walls_of
-from wrf_mi.trace import TraceOptions
+from wrf_mi.trace import TraceOptions, open_scene
 from wrf_mi.trace.surfaces import scene_surfaces
 
 Float64 = dr.float64_array_t(mi.Float)
@@ -238,3 +239,25 @@ def test_rates_of_the_configuration(scene: Any) -> None:
     assert (free.rate(SHIFT), free.rate(TILT)) == (0.01, 0.02)
     assert free.moves_planes
     assert not TracedConfig().moves_planes
+
+
+def test_a_corrected_scene_has_its_planes_there_and_stays_closed(scene: Any, tmp_path: Path) -> None:
+    """Paths of the folder that is written are those of the parameters; edges of the room are shared as before."""
+    rng, options = np.random.default_rng(2), TracedOptions(replace(OPTIONS, max_depth=1))
+    traced = TracedField(scene, transmitters(3), receiver((30, 20, 10)), replace(options, planes=True))
+    count = len(traced.surfaces.normal)
+    values = {SHIFT: rng.normal(0, 0.02, count), TILT: rng.normal(0, 0.01, (count, 2))}
+    folder = write_corrected_scene(tmp_path / "corrected", scene, values)
+    again = open_scene(folder, FREQUENCY_HZ)
+    length, gain = strongest(traced, {name: Tensor64(value) for name, value in values.items()})
+    expected = strongest(TracedField(again, transmitters(3), receiver((30, 20, 10)), options), {})
+    np.testing.assert_allclose(length, expected[0], atol=FILE_M)
+    np.testing.assert_allclose(gain, expected[1], rtol=GAIN, atol=GAIN * np.abs(gain).max())
+
+    def corners(of: Any) -> int:
+        return len(np.unique(np.round(scene_surfaces(of).triangles.reshape(-1, 3), 4), axis=0))
+
+    # Eight of the room and four of the partition, before as after.
+    assert corners(scene) == corners(again) == 12
+    with pytest.raises(ValueError, match="planes"):
+        write_corrected_scene(tmp_path / "other", scene, {SHIFT: np.zeros(count + 1)})

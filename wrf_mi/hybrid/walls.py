@@ -55,10 +55,7 @@ class Walls:
         Args:
             change: shift in metres, and tilts in rad towards either axis [q, 3].
         """
-        tilt = np.einsum("qa,qad->qd", change[:, 1:], self.axes)
-        normal = self.normal + tilt
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        offset = (normal * self.centre_m).sum(axis=1) + change[:, 0]
+        normal, offset = moved_planes(self.normal, self.axes, self.centre_m, change)
         return replace(self, normal=normal, offset_m=offset)
 
     def inside_m(self, plane: IntArray, flat_m: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -85,6 +82,15 @@ def no_walls() -> Walls:
     none, flat = np.zeros((0, 3)), np.zeros((0, 2))
     axes, edges = np.zeros((0, 2, 3)), np.zeros((0, 2, 2))
     return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
+
+
+def moved_planes(
+    normal: FloatArray, axes: FloatArray, centre_m: FloatArray, change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Normals [q, 3] and offsets [q] of planes after a change, see `Walls.moved`."""
+    result = normal + np.einsum("qa,qad->qd", change[:, 1:], axes)
+    result /= np.linalg.norm(result, axis=1, keepdims=True)
+    return result, (result * centre_m).sum(axis=1) + change[:, 0]
 
 
 def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
