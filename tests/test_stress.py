@@ -117,7 +117,7 @@ def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         return moved(self, {name: value for name, value in parameters.items() if name != SHIFT})
 
     monkeypatch.setattr(PlaneTables, "moved", unshifted)
-    value, slope = joint(1, ["coplanar planes"], ["CSI"])
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
     assert not held(value)
     assert not held(slope)
 
@@ -125,7 +125,7 @@ def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         return moved(self, {**parameters, TILT: dr.detach(parameters[TILT])})
 
     monkeypatch.setattr(PlaneTables, "moved", untilted)
-    value, slope = joint(1, ["coplanar planes"], ["CSI"])
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
     assert held(value)
     assert not held(slope)
     assert "plane.tilt" in slope["value"]

@@ -76,6 +76,8 @@ PLACE = Receiver(
 NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
 """Two transmitters."""
 
+COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
+
 Parts = dict[str, tuple[str, Mesh]]
 
 
@@ -143,10 +145,10 @@ def _many(count: int) -> Case:
 def cases(many: int = MANY) -> dict[str, Callable[[], Case]]:
     """All by name; ``many``: transmitters of the last."""
     return {
-        "coplanar planes": _coplanar,
+        COPLANAR: _coplanar,
         "grazing paths": _grazing,
         "antenna on a wall": _mounted,
-        f"T + L that cancel to {LEFT:.0%}": _cancelling,
+        CANCELLING: _cancelling,
         "many paths": lambda: _many(many),
     }
 
