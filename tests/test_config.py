@@ -49,6 +49,8 @@ def good_values(name: str, default: Any) -> st.SearchStrategy[Any]:
         return st.integers(1, int(LARGEST.get(name, 10**9)))
     if name == "receiver":
         return st.sampled_from(["auto", "pixel", "array"])
+    if name == "traced.materials":
+        return st.sampled_from(["named", "surface"])
     if isinstance(default, str):
         return st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
     if name == "initial.nearest_m":  # not beyond the farthest

@@ -1,8 +1,9 @@
-"""Gradients of both sides of a hybrid in one graph, against finite differences in float64."""
+"""Gradients of both sides of a hybrid in one graph by every kind of parameter, against differences in float64."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -44,14 +45,25 @@ MODELS: dict[str, Any] = {
 }
 
 
-@pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
+KINDS = (
+    *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
+    *("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter"),
+    *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal"),
+)
+"""Of parameters; beside them the field has networks."""
+
+
+@pytest.fixture(scope="module", params=["named", "surface"])
+def both(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
     """A traced side with reflections and transmissions, a learned one, and all their parameters, none round."""
     rng = np.random.default_rng(5)
     scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
     own = receiver((30, 20, 10))
     options = TraceOptions(max_depth=2, transmission=True, rays=4096)
-    traced = TracedField(scene, transmitters(BATCH), own, TracedOptions(options, pattern_degree=2, gain=300.0))
+    how = TracedOptions(options, pattern_degree=2, gain=300.0, materials=request.param, planes=True)
+    traced = TracedField(scene, transmitters(BATCH), own, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it.
     encoding = Encoding(position_octaves=1, position_scale_m=1e12, tx_octaves=2)
@@ -60,7 +72,8 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[TracedField, WrfGsPl
     start["log_scale"] += rng.normal(0, 0.3, start["log_scale"].shape).astype(np.float32)
     start["rotation"] = rng.standard_normal(start["rotation"].shape).astype(np.float32)
     values |= {f"field.{name}": value.astype(float) for name, value in start.items()}
-    for name in ("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter"):
+    moved = ("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter")
+    for name in (*moved, "receiver.array.gain", "plane.shift", "plane.tilt"):
         values[name] += rng.normal(0, 0.02, values[name].shape)
     return traced, field, values
 
@@ -100,6 +113,7 @@ def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, 
             ends = [terms(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)}).numpy().sum() for s in (1, -1)]
             numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[n] * direction).sum())
             errors[n, k] = abs(numeric - analytic) / (TOLERANCE * np.linalg.norm(gradient[n]) + rounding)
+    assert all(any(fnmatchcase(n, kind) for n in gradient) for kind in KINDS)
     # Differences see every slope but a metal's, which waves do not enter.
     drowned = {n for n, slope in gradient.items() if rounding > 0.01 * np.linalg.norm(slope)}
     assert drowned <= {"material.itu_metal.permittivity", "material.itu_metal.conductivity"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,21 @@ from wrf_mi.backend import init
 
 init()
 
+import drjit as dr  # noqa: E402
+
 from wrf_mi import cli  # noqa: E402
-from wrf_mi.report import bench_stress, stress_fields, stress_plugins, stress_receivers, stress_rows  # noqa: E402
+from wrf_mi.hybrid.planes import SHIFT, TILT, PlaneTables  # noqa: E402
+from wrf_mi.report import (  # noqa: E402
+    bench_stress,
+    stress_fields,
+    stress_joint,
+    stress_plugins,
+    stress_receivers,
+    stress_rows,
+)
 from wrf_mi.report.bench_stress import held, worst_of  # noqa: E402
 from wrf_mi.report.stress_fields import HARD, Field, image, made, reference  # noqa: E402
+from wrf_mi.report.stress_joint import joint  # noqa: E402
 from wrf_mi.report.stress_losses import losses  # noqa: E402
 from wrf_mi.report.stress_plugins import plugin_gradients, plugin_images  # noqa: E402
 from wrf_mi.report.stress_receivers import derivatives, of_fields  # noqa: E402
@@ -87,6 +99,36 @@ def test_receivers() -> None:
 def test_derivatives_of_what_is_traced() -> None:
     for row in traced_gradients(1):
         assert held(row), row
+
+
+def test_the_joint_graph() -> None:
+    """Values and derivatives of all receiver models."""
+    rows = joint(2)
+    assert len(rows) == 2 * len(stress_joint.cases())
+    for row in rows:
+        assert held(row), row
+
+
+def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values see a shift that the graph forgets, derivatives a tilt that it holds."""
+    moved = PlaneTables.moved
+
+    def unshifted(self: PlaneTables, parameters: Any) -> Any:
+        return moved(self, {name: value for name, value in parameters.items() if name != SHIFT})
+
+    monkeypatch.setattr(PlaneTables, "moved", unshifted)
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
+    assert not held(value)
+    assert not held(slope)
+
+    def untilted(self: PlaneTables, parameters: Any) -> Any:
+        return moved(self, {**parameters, TILT: dr.detach(parameters[TILT])})
+
+    monkeypatch.setattr(PlaneTables, "moved", untilted)
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
+    assert held(value)
+    assert not held(slope)
+    assert "plane.tilt" in slope["value"]
 
 
 def test_the_integrator_of_the_plugins() -> None:

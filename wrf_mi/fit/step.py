@@ -24,6 +24,7 @@ from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
 from ..graph.graph import Batch, Field, Report
+from ..graph.settings import TRACED_NAMES
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.skip import NOTHING, Skip
@@ -33,8 +34,6 @@ Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 Params = dict[str, Any]
 
-TRACED_NAMES = ("material.", "receiver.", "pattern.")
-"""Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
 CENTRES = "position"
 """Parameter [3, n] of every field; where it is missing there are no Gaussians."""
 DARK = 1e-8

@@ -21,6 +21,7 @@ from ..core import InputError, Record, Split
 from ..field import FIELDS, Encoding, InitialGaussians
 from ..field.density import adapt, reset_opacity
 from ..graph.graph import LEVEL, SHARE, Field, Graph
+from ..graph.settings import TRACED_NAMES
 from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from ..tasks import task_of
@@ -30,7 +31,6 @@ from .predictor import Predictor
 from .start import initial_gaussians
 from .state import FitState
 from .step import (
-    TRACED_NAMES,
     Loss,
     TrainingData,
     Trouble,

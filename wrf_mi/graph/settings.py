@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.")
+"""Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
 
 
 @dataclass(frozen=True)
@@ -17,11 +21,15 @@ class TracedConfig:
         transmission: paths through surfaces.
         rays: that search from each receiver.
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
+        materials: ``named``: each named material has a permittivity and a conductivity; ``surface``: each surface has
+            its own, the faces of one object in one plane, started from the named material.
         material: rate of permittivities and conductivities (of their logarithms).
         gain: rate of each receiver's gain (of its logarithm, and of its phase in rad).
         pattern: rate of the patterns' coefficients.
         position: rate of the receivers' positions, metres.
         turn: rate of the receivers' orientations, rad.
+        shift: rate of the planes' shifts along their normals, metres.
+        tilt: rate of the planes' tilts, rad.
     """
 
     depth: int = 3
@@ -29,11 +37,14 @@ class TracedConfig:
     transmission: bool = True
     rays: int = 1 << 16
     pattern_degree: int = 0
+    materials: Literal["named", "surface"] = "named"
     material: float = 0.02
     gain: float = 0.01
     pattern: float = 0.01
     position: float = 0.0
     turn: float = 0.0
+    shift: float = 0.0
+    tilt: float = 0.0
 
     def rate(self, name: str) -> float:
         """Learning rate of a parameter of `wrf_mi.hybrid.traced.TracedField.parameters`."""
@@ -42,7 +53,14 @@ class TracedConfig:
             return self.material
         if kind == "pattern":
             return self.pattern
+        if kind == "plane":
+            return {"shift": self.shift, "tilt": self.tilt}[last]
         return {"gain": self.gain, "position": self.position, "turn": self.turn}[last]
+
+    @property
+    def moves_planes(self) -> bool:
+        """Whether training moves the scene's planes."""
+        return self.shift > 0 or self.tilt > 0
 
 
 DEFAULT = TracedConfig()

@@ -41,6 +41,7 @@ class Level:
         reflects: the wave is mirrored there.
         transmits: the wave passes through.
         material: index into the materials' tables.
+        plane: index into the scene's planes.
     """
 
     normal: Vector
@@ -48,6 +49,7 @@ class Level:
     reflects: Any
     transmits: Any
     material: Any
+    plane: Any
 
 
 @dataclass

@@ -40,6 +40,8 @@ MATCHING = 3
 """Passes of `JointFit.match_gain`: in the first, magnitudes may be below the receiver's floor."""
 RATES: Mapping[str, float] = {
     "material.*": 0.05,
+    "plane.shift": 0.002,
+    "plane.tilt": 0.001,
     "receiver.*.gain": 0.02,
     "pattern.*": 0.01,
     "field.position": 0.005,

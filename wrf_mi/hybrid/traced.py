@@ -2,14 +2,14 @@
 
 Which surfaces a wave meets is searched for by `wrf_mi.trace` and has no derivative; it is kept. What has one, the image
 method and the field along each path, is evaluated anew in each call (`wrf_mi.hybrid.follow`) with the present
-parameters: materials, the instrument's gain, antenna patterns and the receiver's pose.
+parameters: materials, the scene's planes, the instrument's gain, antenna patterns and the receiver's pose.
 
 All of it is float64 over planes in float64, so that phases k d are exact to 1e-12 rad for the scene as its file states
 it; the file's float32 corners, 5e-7 m at 10 m, are what the real walls are known to at best.
 
 Paths appear and vanish as a receiver moves, without a derivative. The rule: the set of paths stays as it is until the
 receiver is further than ``search_again_m`` (a quarter of a wavelength) from where they were searched for;
-`TracedField.refresh` then searches again.
+`TracedField.refresh` then searches again. Planes that move keep their paths (`wrf_mi.hybrid.planes` says why).
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from ..trace.buffer import SPECULAR, TRANSMISSION
 from ..trace.solve import Prepared
 from ..trace.surfaces import Surfaces, scene_surfaces
 from .follow import Chains, Complex, Level, Tables, Vector, follow
-from .materials import read_materials
+from .materials import Materials, SlabMaterials, slabs_of_faces
 from .patterns import pattern_coefficients, pattern_factor
+from .planes import PlaneTables
 from .pose import component, moved_m, pose_parameters, receiver_pose
 
 Float64: Any = dr.float64_array_t(mi.Float)
@@ -53,6 +54,9 @@ class TracedOptions:
         pattern_degree: of the trainable factors of both antennas' patterns, 0 for none (see `wrf_mi.hybrid.patterns`).
         gain: amplitude by which every path is multiplied at first: from the channel's units to the instrument's.
         tx_antenna: antenna of the transmitters, turned with their heading; the receiver states its own.
+        materials: whether each named material has a permittivity and a conductivity of its own, or each surface, the
+            faces of one object in one plane, started from its named material.
+        planes: list shifts and tilts of the scene's planes among the parameters (`wrf_mi.hybrid.planes`).
         search_again_m: how far the receiver may move before paths are searched again; None: a quarter of a wavelength.
     """
 
@@ -61,6 +65,8 @@ class TracedOptions:
     gain: float = 1.0
     search_again_m: float | None = None
     tx_antenna: Antenna = ANTENNA
+    materials: Materials = "named"
+    planes: bool = False
 
     def __post_init__(self) -> None:
         """Reject what cannot be followed.
@@ -139,8 +145,9 @@ class TracedField:
         quarter_m = speed_of_light / self.frequency_hz / 4
         self._again_m = quarter_m if options.search_again_m is None else options.search_again_m
         self._surfaces: Surfaces = scene_surfaces(scene)
-        self._materials = read_materials(scene)
-        self._constants = [on_device(c, Float64) for c in (self._materials.thickness_m, self._materials.reflected)]
+        self._materials, self._slab_of_face = slabs_of_faces(scene, self._surfaces, options.materials)
+        self._constants = self._materials.constants(Float64)
+        self._planes = PlaneTables.of(self._surfaces)
         if traced is None:
             self._search(receiver.position_m)
         else:
@@ -158,7 +165,22 @@ class TracedField:
     @property
     def arrays(self) -> list[Any]:
         """What a call reads on the device beside its arguments: a recording takes it as inputs."""
-        return [self._chains, self._constants]
+        return [self._chains, self._constants, self._planes]
+
+    @property
+    def chains(self) -> Chains:
+        """What each path meets, planes as stated."""
+        return self._chains
+
+    @property
+    def slabs(self) -> SlabMaterials:
+        """The scene's materials as stated, or those of its surfaces in the order of their parameters."""
+        return self._materials
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """The scene's surfaces, whose planes those of the parameters are."""
+        return self._surfaces
 
     @property
     def gain_name(self) -> str:
@@ -168,7 +190,9 @@ class TracedField:
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Starting values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
-        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.hybrid.materials`);
+        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.hybrid.materials`), or of n surfaces
+        ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m and
+        ``plane.tilt`` [q, 2] in rad (see `wrf_mi.hybrid.planes`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``pattern.receiver`` and ``pattern.transmitter`` [2, c].
         """
@@ -176,6 +200,8 @@ class TracedField:
         values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
         if self.options.pattern_degree:
             values |= {name: pattern_coefficients(self.options.pattern_degree) for name in (RX_PATTERN, TX_PATTERN)}
+        if self.options.planes:
+            values |= self._planes.parameters()
         return values
 
     def at(self, tx_pos_m: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> TracedField:
@@ -207,7 +233,9 @@ class TracedField:
             slot = dr.arange(mi.UInt32, batch * self._each)
             row = dr.gather(mi.UInt32, rows, slot // self._each)
             chains = chains.select(row * self._each + slot % self._each)
-        tables = Tables(*self._materials.tables(parameters, Float64), *self._constants)
+        chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
+        stated, fixed = self._constants[:2], self._constants[2:]
+        tables = Tables(*self._materials.tables(parameters, stated), *fixed)
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         followed = follow(chains, pose, tables, self.frequency_hz, *antennas)
@@ -244,7 +272,7 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         tx, used = traced.paths.tx, types != 0
-        material = self._material_of_face(face, used)
+        material = self._slab(face, used)
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         place = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
         count = len(self) * each
@@ -269,6 +297,7 @@ class TracedField:
                     laid_out(types[:, k] == SPECULAR, mi.Bool),
                     laid_out(types[:, k] == TRANSMISSION, mi.Bool),
                     laid_out(material[:, k].astype(np.uint32), mi.UInt32),
+                    laid_out(plane.astype(np.uint32), mi.UInt32),
                 )
             )
         self._each, self.searched_at_m = each, np.array(here_m, float)
@@ -279,16 +308,17 @@ class TracedField:
             levels,
         )
 
-    def _material_of_face(self, face: IntArray, used: NDArray[np.bool_]) -> IntArray:
+    def _slab(self, face: IntArray, used: NDArray[np.bool_]) -> IntArray:
         """Number of the material at each interaction, 0 where there is none."""
-        names = [self.scene.objects[name].radio_material.name for name in self._surfaces.names]
-        thing = self._surfaces.object_of(np.where(used, face, 0)) if used.any() else np.zeros(face.shape, np.int64)
-        for index in np.unique(thing[used]):
-            if names[index] not in self._materials.names:
-                what, kind = self._surfaces.names[index], names[index]
-                raise InputError(f"object {what}: material {kind} is not a slab; give it one of ITU-R P.2040")
-        number = np.array([self._materials.names.index(n) if n in self._materials.names else 0 for n in names] or [0])
-        return np.where(used, number[thing], 0)
+        if not used.any():
+            return np.zeros(face.shape, np.int64)
+        number = np.where(used, self._slab_of_face[np.where(used, face, 0)], 0)
+        if (number < 0).any():
+            index = self._surfaces.object_of(face[number < 0][:1])[0]
+            what = self._surfaces.names[index]
+            kind = self.scene.objects[what].radio_material.name
+            raise InputError(f"object {what}: material {kind} is not a slab; give it one of ITU-R P.2040")
+        return number
 
 
 def _same_devices(traced: TraceResult, tx_pos_m: FloatArray, receiver: Receiver) -> bool:

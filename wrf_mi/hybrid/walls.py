@@ -55,10 +55,7 @@ class Walls:
         Args:
             change: shift in metres, and tilts in rad towards either axis [q, 3].
         """
-        tilt = np.einsum("qa,qad->qd", change[:, 1:], self.axes)
-        normal = self.normal + tilt
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        offset = (normal * self.centre_m).sum(axis=1) + change[:, 0]
+        normal, offset = moved_planes(self.normal, self.axes, self.centre_m, change)
         return replace(self, normal=normal, offset_m=offset)
 
     def inside_m(self, plane: IntArray, flat_m: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -87,8 +84,17 @@ def no_walls() -> Walls:
     return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
 
 
-def walls_of(surfaces: Surfaces) -> Walls:
-    """The planes of a scene's surfaces."""
+def moved_planes(
+    normal: FloatArray, axes: FloatArray, centre_m: FloatArray, change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Normals [q, 3] and offsets [q] of planes after a change, see `Walls.moved`."""
+    result = normal + np.einsum("qa,qad->qd", change[:, 1:], axes)
+    result /= np.linalg.norm(result, axis=1, keepdims=True)
+    return result, (result * centre_m).sum(axis=1) + change[:, 0]
+
+
+def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
+    """Centroids of the planes' faces, [q, 3] in metres, and the faces' areas [q] in square metres."""
     triangles, plane = surfaces.triangles, surfaces.plane
     count = len(surfaces.normal)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -100,6 +106,14 @@ def walls_of(surfaces: Surfaces) -> Walls:
     )
     # On the plane itself: the centroid of faces that lie in it within rounding.
     centre -= surfaces.normal * ((centre * surfaces.normal).sum(axis=1) - surfaces.offset)[:, None]
+    return centre, total
+
+
+def walls_of(surfaces: Surfaces) -> Walls:
+    """The planes of a scene's surfaces."""
+    triangles, plane = surfaces.triangles, surfaces.plane
+    count = len(surfaces.normal)
+    centre, total = plane_centres(surfaces)
     flat = np.einsum("fad,fcd->fca", surfaces.axes[plane], triangles - centre[plane, None])
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, plane, flat.min(axis=1))

@@ -24,6 +24,7 @@ from ..measure import make_splits
 from .bench import BenchFailed
 from .stress_curves import curves, draw
 from .stress_fields import BLENDINGS, HARD, RECEIVER, Field, felt_values, gradient, image, layers, made, reference
+from .stress_joint import CANCELLING, COPLANAR, joint
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
 from .stress_receivers import derivatives, of_fields
@@ -200,6 +201,7 @@ def main() -> dict[str, Any]:
         *losses(10),
         *phases(),
         *traced_gradients(),
+        *joint(),
         *plugin_images(50, 5),
         *plugin_gradients(2),
         fits(100),
@@ -220,6 +222,7 @@ QUICK: Sequence[Callable[[], list[Row]]] = (
     lambda: losses(1),
     lambda: phases(5),
     lambda: traced_gradients(2),
+    lambda: joint(1, (COPLANAR, CANCELLING), ("RSSI",)),
     lambda: plugin_images(2, 1, 0),
     lambda: plugin_gradients(1, HARDEST[:1]),
     lambda: [fits(4)],

@@ -47,7 +47,7 @@ LEAST_SLOPE = 0.05
 """Of the median slope: a smaller one, a metal's, is compared with that; roundings would drown it."""
 
 
-def _sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
+def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
     """The six sides of a box."""
     spans = [(0.0, side) for side in size_m]
     return {
@@ -67,7 +67,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     rng = np.random.default_rng(0)
     tx, rx = rng.uniform(0.1, 0.9, (count, 3)) * size_m, rng.uniform(0.1, 0.9, 3) * size_m
     with tempfile.TemporaryDirectory() as work:
-        parts = {name: ("itu_metal", wall) for name, wall in _sheets(size_m).items()}
+        parts = {name: ("itu_metal", wall) for name, wall in box_sheets(size_m).items()}
         scene = open_scene(write_scene(Path(work), parts, "Hall of metal"), frequency_hz)
         options = TraceOptions(max_depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
@@ -134,7 +134,7 @@ def traced_gradients(count: int = 6) -> list[Row]:
     """
     with tempfile.TemporaryDirectory() as work:
         kinds = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_concrete")
-        parts = {n: (kind, wall) for kind, (n, wall) in zip(kinds, _sheets(ROOM).items(), strict=True)}
+        parts = {n: (kind, wall) for kind, (n, wall) in zip(kinds, box_sheets(ROOM).items(), strict=True)}
         parts["partition"] = ("itu_chipboard", sheet(0, 3.1, (0.0, 2.36), (0.0, 2.0)))
         thickness = {kind: 0.02 for kind in (*kinds, "itu_chipboard")}
         scene = open_scene(write_scene(Path(work), parts, "Room"), CARRIER_HZ, thickness)
