@@ -327,6 +327,17 @@ ONE_ANTENNA = (
     "patience=8",
 )
 """What a field of signal strengths or channels departs from one of spectra in: it ends in few numbers."""
+PATHS = ("steps=400", "batch=8", "validate_every=50", "patience=8", "density.every=0")
+"""What paths alone depart in: few parameters are fitted, soon."""
+HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0")
+CALIBRATED: Mapping[str, tuple[str, ...]] = {
+    "gain": ("traced.gain=0.02",),
+    "materials": ("traced.material=0.05",),
+    "planes": ("traced.shift=1e-3", "traced.tilt=5e-4"),
+    "patterns": ("traced.pattern=0.01", "traced.pattern_degree=4"),
+    "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
+}
+"""What of the traced side can be fitted, by name; rates as ``--set`` takes them."""
 OF_TASK: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENNA}
 """Settings of tasks other than spectra, as ``--set`` takes them."""
 
@@ -334,6 +345,24 @@ OF_TASK: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENN
 def default_config(task: str) -> TrainConfig:
     """The settings that a fit to a task's observations begins with."""
     return with_settings(TrainConfig(), OF_TASK.get(task, ()))
+
+
+def calibration_config(task: str, parts: Iterable[str]) -> TrainConfig:
+    """The settings of a fit of paths alone.
+
+    Args:
+        task: whose observations they are fitted to.
+        parts: what is fitted, of `CALIBRATED`; all else is held.
+
+    Raises:
+        InputError: none of these, or nothing.
+    """
+    chosen = tuple(parts)
+    unknown = [part for part in chosen if part not in CALIBRATED]
+    if unknown or not chosen:
+        raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
+    moved = [setting for part in chosen for setting in CALIBRATED[part]]
+    return with_settings(default_config(task), [f"model={PATHS_ALONE}", *PATHS, *HELD, *moved])
 
 
 PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick": QUICK}

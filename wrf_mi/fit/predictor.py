@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.device import to_tensor
-from ..core import InputError, Receiver
+from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
+from ..core.types import IntArray
 from ..field.gaussians import Gaussians
 from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
@@ -101,9 +102,32 @@ class Predictor:
             self._still = StillField(self._gaussians, params, self.receivers, *size, self._store)
         return self._still
 
-    def _traced(self, tx_pos_m: FloatArray, receiver: int) -> Any:
+    @property
+    def uses_heading(self) -> bool:
+        """Whether predictions depend on the transmitters' headings: a trained pattern turns with them."""
+        return self.graph.form.headings
+
+    def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
+        """What a receiver observes in rows of a record, see `__call__`."""
+        uplink = None if record.uplink is None else record.uplink[rows]
+        heading = record.tx_heading_rad[rows] if self.uses_heading and record.tx_heading_rad is not None else None
+        return self(record.tx_pos_m[rows], receiver, uplink, heading)
+
+    def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
+        """Headings as an array, where they are used."""
+        if (tx_heading_rad is not None) != self.uses_heading:
+            text = "needs headings; give heading_rad" if self.uses_heading else "does not know how it is turned"
+            raise InputError(f"transmitter: the model {text}{'' if self.uses_heading else '; leave heading_rad away'}")
+        if tx_heading_rad is None:
+            return None
+        heading = np.asarray(tx_heading_rad, float)
+        if heading.shape != (count,) or not np.isfinite(heading).all():
+            raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
+        return heading
+
+    def _traced(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> Any:
         """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
-        side = self.graph.trace(tx_pos_m, receiver)
+        side = self.graph.trace(tx_pos_m, receiver, heading_rad)
         if side is not None:
             side.refresh(self._params)
         report, pose = self.graph.report(receiver, side), self._poses[receiver]
@@ -130,7 +154,7 @@ class Predictor:
         found = self._reports[receiver](self._params, batch)
         return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
 
-    def _reported(self, given: FloatArray, receiver: int) -> NDArray[Any]:
+    def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
@@ -138,7 +162,9 @@ class Predictor:
         out = np.empty((len(given), *shape), np.float32)
         for start in range(0, len(given), TOGETHER):
             part = given[start : start + TOGETHER]
-            found = self._traced(part, receiver) if self.graph.scene is not None else self._learned(part.T, receiver)
+            turned = None if heading_rad is None else heading_rad[start : start + TOGETHER]
+            traced = self.graph.scene is not None
+            found = self._traced(part, receiver, turned) if traced else self._learned(part.T, receiver)
             out[start : start + TOGETHER] = found.numpy().reshape(len(part), *shape)
         return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 
@@ -149,7 +175,11 @@ class Predictor:
         return (found if len(self.graph.form.outputs) > 1 else found[:, 0]).astype(np.complex64)
 
     def __call__(
-        self, tx_pos_m: ArrayLike, receiver: int | str = 0, uplink: NDArray[Any] | None = None
+        self,
+        tx_pos_m: ArrayLike,
+        receiver: int | str = 0,
+        uplink: NDArray[Any] | None = None,
+        tx_heading_rad: ArrayLike | None = None,
     ) -> NDArray[Any]:
         """What one receiver observes of transmitters.
 
@@ -158,12 +188,14 @@ class Predictor:
             receiver: name, or number from 0, of one of ``receivers``.
             uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them; positions are not
                 looked at then.
+            tx_heading_rad: yaw of each transmitter [m], radians, if and only if ``uses_heading``.
 
         Returns:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
 
         Raises:
-            InputError: positions of another shape or not finite, no uplink where one is needed, or no such receiver.
+            InputError: positions of another shape or not finite, no uplink or headings where they are needed, headings where
+                they are not used, or no such receiver.
         """
         index = receiver_index(self.receivers, receiver)
         if self.graph.form.features:
@@ -182,8 +214,9 @@ class Predictor:
                 self._by_operator = False
         if not self._pixels:
             given = np.asarray(tx_pos_m, float)
+            turned = self._headings(tx_heading_rad, len(given))
             self.graph.check(given)
-            return self._reported(given, index)
+            return self._reported(given, index, turned)
         height, width = self._plane.height, self._plane.width
         out = np.empty((len(positions), height, width), np.float32)
         assert self._predict is not None, "a field of pixels"

@@ -105,9 +105,10 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
     basis = _basis(targets, rows, config.view.components) if task.is_complex else None
     outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
     features = 0 if record.uplink is None else len(targets.condition)
+    headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
     if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
-    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features)
+    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features, headings)
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:

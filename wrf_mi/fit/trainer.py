@@ -194,7 +194,8 @@ class Trainer:
         # Slots of the traced sides: all rows that train or choose.
         self._known = known
         self.graph.check(record.tx_pos_m)
-        self._sides = [self.graph.trace(record.tx_pos_m[known], r) for r in range(len(receivers))]
+        turned = record.tx_heading_rad[known] if form.headings and record.tx_heading_rad is not None else None
+        self._sides = [self.graph.trace(record.tx_pos_m[known], r, turned) for r in range(len(receivers))]
         self._poses = [device_pose(r) for r in receivers]
         self._plane = perception_plane(*form.size, mi.Float)
         self._data = TrainingData(
@@ -301,10 +302,9 @@ class Trainer:
         rows, record = self.split.validation, self.record
         if len(rows) == 0:
             return float("nan")
-        uplink = None if record.uplink is None else record.uplink[rows]
         predict = self.predictor()
         scores = [
-            self.task.training_score(predict(record.tx_pos_m[rows], r, uplink), record.observation[r, rows])
+            self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
             for r in range(len(record.receivers))
         ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))

@@ -69,6 +69,7 @@ class Form:
         outputs: shape of a channel: subcarriers, or antennas and subcarriers; () for other observations.
         basis: complex [components, outputs] that learned channels are sums of; None: no channels.
         features: number of features that tell of a transmitter in place of its position; 0: its position.
+        headings: whether the transmitters' antenna turns with their headings, which then are known.
     """
 
     receiver: str
@@ -77,6 +78,7 @@ class Form:
     outputs: tuple[int, ...] = ()
     basis: NDArray[np.complex128] | None = field(default=None, repr=False)
     features: int = 0
+    headings: bool = False
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a file."""
@@ -88,6 +90,7 @@ class Form:
             "form/outputs": np.asarray(self.outputs, np.int64),
             "form/basis": np.zeros((0, 0), complex) if self.basis is None else self.basis,
             "form/features": np.asarray(self.features),
+            "form/headings": np.asarray(self.headings),
         }
 
     @classmethod
@@ -102,6 +105,7 @@ class Form:
             tuple(map(int, arrays["form/outputs"])),
             basis if basis.size else None,
             int(arrays["form/features"]),
+            bool(arrays["form/headings"]),
         )
 
     @property

@@ -212,7 +212,7 @@ def of_rows(record: Record, predictor: Predictor) -> Predict:
     """A predictor from transmitter positions as a method on a record's rows."""
 
     def predict(rows: IntArray, receiver: int) -> NDArray[Any]:
-        return predictor(record.tx_pos_m[rows], receiver, None if record.uplink is None else record.uplink[rows])
+        return predictor.of_rows(record, rows, receiver)
 
     return predict
 
