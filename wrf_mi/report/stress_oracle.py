@@ -1,8 +1,9 @@
 """The traced side of the joint graph in NumPy, complex128: what the stress rows compare `wrf_mi.hybrid.follow` with.
 
-It shares the chains of planes with the graph and nothing else. The receiver, not the transmitter, is mirrored on the
-way back, so each leg's direction is that from an image of the transmitter to an image of the receiver; slabs are sums
-of multiple reflections between two Fresnel interfaces, patterns are SciPy's spherical harmonics.
+It shares the chains of planes and the stated constants with the graph, no device code: planes move by `Walls.moved`,
+antennas are `wrf_mi.core.Antenna`. The receiver is mirrored backwards as the transmitter is forwards, so each leg's
+direction is that from an image of the one to an image of the other; slabs are sums of multiple reflections between two
+Fresnel interfaces, patterns are SciPy's spherical harmonics.
 """
 
 from __future__ import annotations

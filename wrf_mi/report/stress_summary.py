@@ -14,6 +14,8 @@ STAGES = (
     ("losses", r"loss: (?!.*differences)"),
     ("phase of paths to 10 km, rad", r"phase"),
     ("derivatives of the tracer, against differences", r"derivatives of (Sionna|the traced)"),
+    ("paths and Gaussians together", r"joint: (?!derivatives)"),
+    ("their derivatives, against float64", r"joint: derivatives"),
     ("Mitsuba plugins: images", r"plugin: image"),
     ("Mitsuba plugins: derivatives", r"plugin: derivatives"),
 )
@@ -26,7 +28,8 @@ def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
     lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
     for words, begins in STAGES:
         own = [row for row in rows if re.match(begins, row["what"])]
-        cases = sum(int(found[1]) for row in own if (found := re.search(r"(\d+) (?:cases|paths)", row["what"])))
+        # Of a row that states both, cases come last.
+        cases = sum(int(found[-1]) for row in own if (found := re.findall(r"(\d+) (?:cases|paths)", row["what"])))
         worst = max((_worst(row) for row in own), default=float("nan"))
         bound = max((float(row["asked"].removeprefix("at most ")) for row in own), default=float("nan"))
         lines.append(f"| {words} | {cases or ''} | **{worst:.1e}** | {bound:g} |")
