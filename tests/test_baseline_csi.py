@@ -15,8 +15,6 @@ init()
 from wrf_mi.baselines import fire, linear, nerf2, optml, r2f2  # noqa: E402
 from wrf_mi.baselines.csi_bands import Bands, bands_of  # noqa: E402
 from wrf_mi.baselines.fire import FireSettings  # noqa: E402
-from wrf_mi.baselines.gaussian_evaluation import GaussianSettings  # noqa: E402
-from wrf_mi.baselines.gaussian_fields import method_of  # noqa: E402
 from wrf_mi.baselines.linear import LinearSettings  # noqa: E402
 from wrf_mi.baselines.method import Inputs, inputs_of  # noqa: E402
 from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
@@ -40,7 +38,7 @@ EXACT_DB = 60.0
 some; a wrong path, or one of them missing, gives less than 30."""
 METHODS = {"linear": linear.METHOD, "fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
 """That need the uplink alone."""
-FIELDS = {"wrf-gs": method_of("wrf-gs"), "wrf-gs+": method_of("wrf-gs+"), "nerf2": nerf2.METHOD}
+FIELDS = {"nerf2": nerf2.METHOD}
 QUICK = Training(steps=10, batch=8, rounds=2)
 SMALL = {
     "linear": LinearSettings(),
@@ -53,9 +51,6 @@ SMALL = {
         rounds=1,
         wavefront="plane",
         max_distance_m=30.0,
-    ),
-    **dict.fromkeys(
-        ("wrf-gs", "wrf-gs+"), GaussianSettings(QUICK, gaussians=8, layers=2, width=8, height=4, columns=8)
     ),
     "nerf2": Nerf2Settings(QUICK, Networks(layers=2, width=8), sphere_rays=8, samples=2),
 }

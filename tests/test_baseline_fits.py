@@ -22,7 +22,6 @@ init()
 
 from wrf_mi.baselines import dcgan, nerf2, vae  # noqa: E402
 from wrf_mi.baselines.dcgan import DcganSettings  # noqa: E402
-from wrf_mi.baselines.gaussian_evaluation import GaussianSettings  # noqa: E402
 from wrf_mi.baselines.method import Method, inputs_of  # noqa: E402
 from wrf_mi.baselines.nerf2 import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
@@ -154,10 +153,6 @@ def test_what_cannot_be_learned_from_is_refused(name: str, one_gateway: Record):
         lambda: Nerf2Settings(samples=0),
         lambda: Nerf2Settings(near_m=2.0, far_m=1.0),
         lambda: Networks(layers=0),
-        lambda: GaussianSettings(scale_m=0.0),
-        lambda: GaussianSettings(tx_scale_m=-1.0),
-        lambda: GaussianSettings(gaussians=0),
-        lambda: GaussianSettings(near_m=9.0),
         lambda: Networks(scale_m=0.0),
     ],
 )

@@ -192,6 +192,18 @@ def test_channels_are_learned_from_the_uplink_and_kept(model: str, tmp_path) -> 
         trainer.predictor()(nowhere, 0)
 
 
+@pytest.mark.parametrize("known", [(), ("position_m",), ("orientation_xyzw",)])
+def test_an_uplink_needs_no_pose_of_the_station(known: tuple[str, ...]) -> None:
+    record = channels()
+    lost = {"position_m": np.full(3, np.nan), "orientation_xyzw": np.full(4, np.nan)}
+    for name in known:
+        del lost[name]
+    unknown = replace(record, receivers=(replace(record.receivers[0], **lost),))
+    assert unknown.uplink is not None
+    predict = fitted(unknown, halves(record), "steps=5")
+    assert np.isfinite(predict(unknown.tx_pos_m[:3], 0, unknown.uplink[:3])).all()
+
+
 def two_stations(rows: int = 60, antennas: int = 1) -> Record:
     """Channels over positions; the second station's are 20 dB weaker and orthogonal to the first's, some unheard."""
     rng = np.random.default_rng(4)

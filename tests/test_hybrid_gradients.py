@@ -47,7 +47,7 @@ MODELS: dict[str, Any] = {
 
 KINDS = (
     *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
-    *("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter"),
+    *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),
     *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal"),
 )
 """Of parameters; beside them the field has networks."""
@@ -72,7 +72,7 @@ def both(
     start["log_scale"] += rng.normal(0, 0.3, start["log_scale"].shape).astype(np.float32)
     start["rotation"] = rng.standard_normal(start["rotation"].shape).astype(np.float32)
     values |= {f"field.{name}": value.astype(float) for name, value in start.items()}
-    moved = ("receiver.array.position", "receiver.array.turn", "pattern.receiver", "pattern.transmitter")
+    moved = ("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter")
     for name in (*moved, "receiver.array.gain", "plane.shift", "plane.tilt"):
         values[name] += rng.normal(0, 0.02, values[name].shape)
     return traced, field, values

@@ -146,7 +146,12 @@ def test_receivers_poses_are_trained_where_a_rate_is_given(rooms: dict[str, Path
     own = config("steps=20", "traced.position=0.001", "traced.turn=0.001", "traced.pattern_degree=1", "receiver=pixel")
     train(str(data), tmp_path / "run", own, scene=rooms["known"])
     arrays = read_checkpoint(tmp_path / "run")
-    for name in ("receiver.gateway1.position", "receiver.gateway1.turn", "pattern.receiver", "pattern.transmitter"):
+    for name in (
+        "receiver.gateway1.position",
+        "receiver.gateway1.turn",
+        "receiver.gateway1.pattern",
+        "pattern.transmitter",
+    ):
         assert np.abs(arrays[f"param/{name}"]).max() > 0, name
 
 

@@ -194,8 +194,8 @@ class Predictor:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
 
         Raises:
-            InputError: positions of another shape or not finite, no uplink or headings where they are needed, headings where
-                they are not used, or no such receiver.
+            InputError: positions of another shape or not finite, no uplink or headings where they are needed, headings
+                where they are not used, or no such receiver.
         """
         index = receiver_index(self.receivers, receiver)
         if self.graph.form.features:

@@ -55,7 +55,7 @@ class TracedConfig:
             return self.pattern
         if kind == "plane":
             return {"shift": self.shift, "tilt": self.tilt}[last]
-        return {"gain": self.gain, "position": self.position, "turn": self.turn}[last]
+        return {"gain": self.gain, "position": self.position, "turn": self.turn, "pattern": self.pattern}[last]
 
     @property
     def moves_planes(self) -> bool:

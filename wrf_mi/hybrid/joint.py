@@ -43,6 +43,7 @@ RATES: Mapping[str, float] = {
     "plane.shift": 0.002,
     "plane.tilt": 0.001,
     "receiver.*.gain": 0.02,
+    "receiver.*.pattern": 0.01,
     "pattern.*": 0.01,
     "field.position": 0.005,
     "field.log_scale": 0.005,

@@ -41,7 +41,7 @@ from .planes import PlaneTables
 from .pose import component, moved_m, pose_parameters, receiver_pose
 
 Float64: Any = dr.float64_array_t(mi.Float)
-RX_PATTERN, TX_PATTERN = "pattern.receiver", "pattern.transmitter"
+TX_PATTERN = "pattern.transmitter"
 
 
 @dataclass(frozen=True)
@@ -187,6 +187,11 @@ class TracedField:
         """Parameter [2]: logarithm of the instrument's amplitude, and its phase in rad."""
         return f"receiver.{self.receiver.name}.gain"
 
+    @property
+    def pattern_name(self) -> str:
+        """Parameter [2, c]: factor of the receiver's pattern, see `wrf_mi.hybrid.patterns`."""
+        return f"receiver.{self.receiver.name}.pattern"
+
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Starting values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
@@ -194,12 +199,13 @@ class TracedField:
         ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m and
         ``plane.tilt`` [q, 2] in rad (see `wrf_mi.hybrid.planes`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
-        ``pattern.receiver`` and ``pattern.transmitter`` [2, c].
+        ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
         values = self._materials.parameters() | pose_parameters(self.receiver)
         values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
         if self.options.pattern_degree:
-            values |= {name: pattern_coefficients(self.options.pattern_degree) for name in (RX_PATTERN, TX_PATTERN)}
+            names = self.pattern_name, TX_PATTERN
+            values |= {name: pattern_coefficients(self.options.pattern_degree) for name in names}
         if self.options.planes:
             values |= self._planes.parameters()
         return values
@@ -246,7 +252,7 @@ class TracedField:
             amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
         sine, cosine = dr.sincos(phase)
         gain = _times(followed.gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
-        for name, direction in ((RX_PATTERN, followed.arrival), (TX_PATTERN, followed.departure)):
+        for name, direction in ((self.pattern_name, followed.arrival), (TX_PATTERN, followed.departure)):
             if name in parameters:
                 gain = _times(gain, pattern_factor(parameters[name], direction))
         return TracedPaths(gain, followed.length_m, followed.arrival, batch, self._each)

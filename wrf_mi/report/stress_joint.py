@@ -185,7 +185,7 @@ class _Joint:
         values = {f"field.{name}": value.astype(float) for name, value in start.items()}
         values["field.rotation"] = rng.normal(size=values["field.rotation"].shape)
         values |= {name: value.astype(float) for name, value in self._traced.parameters().items()}
-        deviation = {"pattern.receiver": 0.01, "pattern.transmitter": 0.01}
+        deviation = {self._traced.pattern_name: 0.01, "pattern.transmitter": 0.01}
         if case.moved:
             deviation |= {"plane.shift": 1e-3, "plane.tilt": 0.01}
         for name, size in deviation.items():

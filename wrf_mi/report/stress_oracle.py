@@ -21,7 +21,7 @@ from scipy.special import sph_harm_y
 from ..core.angles import FloatArray
 from ..hybrid import TracedField
 from ..hybrid.materials import SURFACE, name_of
-from ..hybrid.traced import RX_PATTERN, TX_PATTERN
+from ..hybrid.traced import TX_PATTERN
 from ..hybrid.walls import Walls, walls_of
 
 ComplexArray = NDArray[np.complex128]
@@ -103,7 +103,7 @@ class TracedOracle:
         amplitude, phase = values.get(traced.gain_name, np.array([np.log(traced.options.gain), 0.0]))
         gain = gain * np.exp(amplitude + 1j * phase)
         arrival = -ways[-1] @ to_world
-        for name, direction in ((RX_PATTERN, arrival), (TX_PATTERN, departure)):
+        for name, direction in ((traced.pattern_name, arrival), (TX_PATTERN, departure)):
             if name in values:
                 gain = gain * pattern(values[name], direction)
         return OraclePaths(gain, length, arrival, len(length) // len(traced))

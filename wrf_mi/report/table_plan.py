@@ -53,17 +53,11 @@ ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5"
 """As the channels were traced, but for what the rough surfaces scatter, which no mesh tells."""
 FEWER, SIXTY = (_set(f"training.steps={steps}", "training.rounds=2") for steps in (200, 60))
 """Of every network in the small version; of those with long steps."""
-LONGER = _set("training.steps=6000")
-"""With 104 antennas there are 60,000 samples: twice the steps were 0.1 dB better on validation rows."""
-FOR_ALL = _set("shared=true", "gaussians=360", "training.batch=96")
-"""As many Gaussians and samples a step as six receivers have that are fitted one by one."""
+SHORT = _set("steps=400", "validate_every=200")
+"""Of every field of Gaussians in the small version."""
 SPECTRUM: Mapping[str, Entry] = {
-    "wrf-gs+": Entry(
-        "WRF-GS+", _model("wrf-gs+"), _set("steps=400", "validate_every=400"), SEEDS, published="0.90, p90 0.95"
-    ),
-    "wrf-gs": Entry(
-        "WRF-GS", _model("wrf-gs"), _set("steps=400", "validate_every=400"), SEEDS, published="0.82, p90 0.88"
-    ),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
     "hybrid": Entry("hybrid", _model("hybrid"), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
     "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
@@ -91,10 +85,9 @@ UNSEEN = {
 }
 """Where nobody has a mesh: all that can be traced is the direct path."""
 RSSI: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+, one a receiver", _model("wrf-gs+"), FEWER, SEEDS, published="2.4, p10 1.1, p90 4.6"),
-    "wrf-gs": Entry("WRF-GS, one a receiver", _model("wrf-gs"), FEWER, SEEDS, published="2.9"),
-    "wrf-gs+-shared": Entry("WRF-GS+, one for all", _model("wrf-gs+", *FOR_ALL), FEWER, SEEDS),
-    "wrf-gs-shared": Entry("WRF-GS, one for all", _model("wrf-gs", *FOR_ALL), FEWER, SEEDS),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
+    "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
     "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
@@ -106,8 +99,8 @@ RSSI: Mapping[str, Entry] = {
     "mri": Entry("MRI", _model("mri"), published="8.3"),
 }
 POSITION: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), FEWER, SEEDS),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), FEWER, SEEDS),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
     "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
@@ -115,8 +108,8 @@ POSITION: Mapping[str, Entry] = {
     "idw": Entry("blend", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+", *LONGER), FEWER, SEEDS, published="23.91, p10 20.85, p90 25.52"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs", *LONGER), FEWER, SEEDS, published="22.98, p10 20.82, p90 24.33"),
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="23.91, p10 20.85, p90 25.52"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="22.98, p10 20.82, p90 24.33"),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
     "fire": Entry("FIRE", _model("fire"), FEWER, SEEDS, published="15.29"),
     "r2f2": Entry("R2F2", _model("r2f2"), (), SEEDS, published="8.57"),
@@ -164,7 +157,7 @@ PARTS = (
     Part(
         "spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room", once=("wrf-gs+", "wrf-gs", "hybrid")
     ),
-    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-shared",)),
+    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
     Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
