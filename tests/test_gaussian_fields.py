@@ -18,7 +18,6 @@ from wrf_mi.baselines.band_fields import spread  # noqa: E402
 from wrf_mi.baselines.gaussian_evaluation import AT_ONCE, Evaluation, GaussianSettings, frame_of  # noqa: E402
 from wrf_mi.baselines.gaussian_fields import components_of, method_of  # noqa: E402
 from wrf_mi.baselines.method import inputs_of  # noqa: E402
-from wrf_mi.baselines.models import METHODS  # noqa: E402
 from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.training import Training  # noqa: E402
@@ -192,7 +191,7 @@ def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(name):
     record, weak = two_stations(), 2.0**-7
     fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
     split, quick = halves(record), Training(steps=10, batch=8, rounds=1)
-    method = METHODS[name]
+    method = nerf2.METHOD if name == "nerf2" else method_of(name)
     settings = (
         Nerf2Settings(training=quick, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
         if name == "nerf2"
