@@ -10,7 +10,7 @@ from small_fits import official, settings
 
 from wrf_mi.core import Receiver, Record
 from wrf_mi.field import Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.fit.folder import RunConfig, start_run, write_checkpoint
+from wrf_mi.report.runs import train
 
 RECEIVER = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
@@ -33,11 +33,7 @@ def weights_of(model: str, count: int = 6, seed: int = 0) -> dict[str, np.ndarra
 def write_run(folder: Path, record: Record, model: str, *own: str) -> Path:
     """A run folder after two steps of training, with settings of one's own."""
     config = settings("steps=2", "log_every=1", "validate_every=2", *own, model=model)
-    split = official(record)
-    trainer = start_run(folder, record, split, RunConfig("made-here", split.name, None, config))
-    trainer.run()
-    write_checkpoint(folder, trainer)
-    return folder
+    return train(record, folder, model, settings=config, split=official(record)).folder
 
 
 def plain(array: Any) -> np.ndarray:

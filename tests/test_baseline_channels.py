@@ -13,14 +13,13 @@ import pytest
 from calling import refused, stored
 from made_channels import ANTENNAS, SUBCARRIERS, channels
 
+from wrf_mi import models
 from wrf_mi.baselines.method import Inputs, Listen, Method
-from wrf_mi.baselines.models import METHODS
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.measure import load, write_nerf2_csi
-from wrf_mi.report import baseline_run
-from wrf_mi.report.baseline_run import open_baseline, train_baseline
 from wrf_mi.report.compare import compare
-from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.results import read_run
+from wrf_mi.report.runs import open_run, train
 
 ROUNDING = 1e-4
 """Powers of tens of dBm are stored in single precision."""
@@ -39,7 +38,7 @@ def unplaced_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_baseline(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri")
+    return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
 
 
 class Turned:
@@ -65,7 +64,7 @@ def fit_turned(record: Record, split: Split, settings: Any, seed: int, listen: L
 TURNED = Method(
     "turned",
     ("csi",),
-    METHODS["mri"].settings,
+    models.MODELS["mri"].settings,
     fit_turned,
     lambda arrays, record: Turned(float(arrays["angle"])),
     "this test",
@@ -76,11 +75,11 @@ TURNED = Method(
 @pytest.fixture
 def turned(monkeypatch: pytest.MonkeyPatch) -> None:
     """A method that predicts from the uplink, among the others."""
-    monkeypatch.setattr(baseline_run, "METHODS", {**{name: METHODS[name] for name in METHODS}, "turned": TURNED})
+    monkeypatch.setitem(models._MODELS._known, "turned", TURNED)
 
 
 def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folder: Path, tmp_path: Path) -> None:
-    out = train_baseline(csi_folder, tmp_path / "run", "idw")
+    out = train(csi_folder, tmp_path / "run", "idw").folder
     metrics, arrays, record = json.loads((out / "metrics.json").read_text()), stored(out), load(csi_folder)
     assert arrays["prediction"].shape == arrays["truth"].shape == (10, ANTENNAS, SUBCARRIERS)
     error = np.square(np.abs(arrays["prediction"] - arrays["truth"])).sum(axis=(1, 2))
@@ -105,7 +104,7 @@ def test_predictions_are_held_against_the_truth_and_fitted_to_what_was_measured(
     record = channels()
     measured = (record.observation * np.exp(0.1j)).astype(np.complex64)
     data = write_nerf2_csi(tmp_path / "noisy", replace(record, observation=measured, truth=record.observation))
-    metrics = json.loads((train_baseline(data, tmp_path / "run", "turned") / "metrics.json").read_text())
+    metrics = json.loads((train(data, tmp_path / "run", "turned").folder / "metrics.json").read_text())
     expected = -20 * np.log10(2 * np.sin(0.05))
     assert metrics["cea_db"]["median"] == pytest.approx(expected, abs=1e-3)
     assert metrics["reference"]["uplink"]["median"] == pytest.approx(expected, abs=1e-3)
@@ -119,7 +118,7 @@ def test_several_receivers_of_arrays_are_told_from_antennas(tmp_path: Path) -> N
     )
     single = replace(two, observation=two.observation[:, :, 0], uplink=two.uplink[:, :1])
     for record, shape in ((one, (1, 10, 3, 4)), (two, (2, 10, 3, 4)), (single, (2, 10, 4))):
-        out = train_baseline(record, tmp_path / "x".join(map(str, shape)), "idw")
+        out = train(record, tmp_path / "x".join(map(str, shape)), "idw").folder
         assert read_run(out).prediction.shape == shape
         assert read_run(out).score.shape == shape[:2]
 
@@ -127,7 +126,7 @@ def test_several_receivers_of_arrays_are_told_from_antennas(tmp_path: Path) -> N
 def test_uplink_predicts_where_no_position_is_known(
     turned: None, unplaced_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = train_baseline(unplaced_folder, tmp_path / "run", "turned")
+    out = train(unplaced_folder, tmp_path / "run", "turned").folder
     metrics, arrays = json.loads((out / "metrics.json").read_text()), stored(out)
     assert metrics["cea_db"]["median"] > 100  # exact but for single precision
     assert list(metrics["reference"]) == ["uplink"]
@@ -136,8 +135,8 @@ def test_uplink_predicts_where_no_position_is_known(
     uplink = load(unplaced_folder).uplink[arrays["row"]]
     np.savez(tmp_path / "up.npz", uplink=uplink)
     call_out = ["--out", tmp_path / "out.npz"]
-    opened = open_baseline(out)
-    np.testing.assert_allclose(opened.predict(uplink=uplink), arrays["prediction"], rtol=1e-6)
+    opened = open_run(out)
+    np.testing.assert_allclose(opened.predict(uplink=uplink).mean, arrays["prediction"], rtol=1e-6)
     for wrong, message in (
         (uplink[:, :, :2], r"uplink \[10, 3, 2\]; fitted to 3 antennas and 4 subcarriers, so give \[10, 3, 4\]"),
         (uplink[:, :1], r"uplink \[10, 1, 4\]; fitted to 3 antennas"),
@@ -165,7 +164,7 @@ def test_inputs_of_uplinks_that_are_refused(
     ):
         np.savez(tmp_path / "in.npz", **arrays)
         refused(["predict", run, "--input", tmp_path / "in.npz", "--out", tmp_path / "out.npz"], message, capsys)
-    placed = train_baseline(csi_folder, tmp_path / "idw", "idw")
+    placed = train(csi_folder, tmp_path / "idw", "idw").folder
     np.savez(tmp_path / "in.npz", uplink=good)
     asked = ["predict", placed, "--input", tmp_path / "in.npz", "--out", tmp_path / "out.npz"]
     refused(asked, "idw: predicts from positions; give finite x, y, z", capsys)
@@ -215,7 +214,7 @@ def test_data_that_are_refused(what: str, turned: None, flat_folder: Path, tmp_p
         record = replace(record, frequencies_hz=np.arange(1.0, 6)) if what == "frequencies" else record
         record = replace(record, uplink_hz=np.arange(1.0, 4)) if what == "uplink frequencies" else record
     with pytest.raises(InputError, match=message) as error:
-        train_baseline(record, tmp_path / "run", "mri" if task == "rssi" else "turned", split=split)
+        train(record, tmp_path / "run", "mri" if task == "rssi" else "turned", split=split)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
 
@@ -239,6 +238,6 @@ def test_data_that_were_read_are_named_by_their_place(
     if change:
         observation[change["at"]] = change["value"]
     with pytest.raises(InputError) as error:
-        train_baseline(replace(record, name="other", observation=observation), tmp_path / "run", method)
+        train(replace(record, name="other", observation=observation), tmp_path / "run", method)
     assert str(error.value).startswith(f"{flat_folder}{message}")
     assert not (tmp_path / "run").exists()

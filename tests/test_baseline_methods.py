@@ -15,27 +15,35 @@ from calling import call, stored
 from made_channels import channels
 
 import wrf_mi
-from wrf_mi.baselines.models import METHODS, MODULES
 from wrf_mi.core import InputError, Record
 from wrf_mi.fit.config import describe, settings_from
 from wrf_mi.measure import load, make_splits, write_nerf2_csi, write_spectrum_folder
-from wrf_mi.report.baseline_run import train_baseline
-from wrf_mi.report.fitted_run import _plain
+from wrf_mi.models import MODELS, known_model
+from wrf_mi.report.run_folder import _plain
+from wrf_mi.report.runs import train
 from wrf_mi.tasks import TASKS
 
+SETTINGS = {
+    f"{name} {what}": kind
+    for name, model in MODELS.items()
+    for what, kind in (model.settings.items() if isinstance(model.settings, dict) else [("", model.settings)])
+}
 ROUNDING = 1e-4
 """Powers of tens of dBm are stored in single precision."""
 
 
 def test_registry_lists_what_is_there_and_each_entry_is_what_it_says() -> None:
-    assert {"idw", "kriging", "trees", "mri"} <= set(METHODS) <= set(MODULES)
-    for name, method in METHODS.items():
-        assert method.name == name
-        assert set(method.tasks or ()) <= set(TASKS)
-        assert method.source
-        method.settings()
-    with pytest.raises(KeyError):
-        METHODS["hybrid"]
+    assert {"wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", "idw", "kriging"} <= set(MODELS)
+    for name, model in MODELS.items():
+        assert model.name == name
+        assert set(model.tasks or ()) <= set(TASKS)
+        assert model.source
+        for task in model.tasks or TASKS:
+            kind = model.serving(task, model.scene != "none").settings
+            assert isinstance(kind, type)
+            kind()
+    with pytest.raises(InputError, match="model 'no-such': no such model; choose from wrf-gs, wrf-gs"):
+        known_model("no-such")
 
 
 def test_settings_are_listed_and_null_is_a_value(flat_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -44,16 +52,16 @@ def test_settings_are_listed_and_null_is_a_value(flat_folder: Path, capsys: pyte
     for line in ("idw:", "neighbours=null", "kriging:", "length_m=null", "mri:", "shared=False"):
         assert line in out.splitlines(), line
     given = wrf_mi.with_settings(
-        METHODS["kriging"].settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
+        MODELS["kriging"].settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
     )
     assert (given.length_m, given.noise, given.trend) == (None, 1.0, "constant")
     assert isinstance(given.noise, float)
 
 
-@pytest.mark.parametrize("name", list(METHODS))
+@pytest.mark.parametrize("name", SETTINGS)
 def test_settings_survive_the_configuration_and_the_list(name: str) -> None:
     """As ``config.yaml`` keeps them and as ``--help-settings`` shows them, lists, choices and null included."""
-    settings = METHODS[name].settings()
+    settings = SETTINGS[name]()
     kept = yaml.safe_load(yaml.safe_dump(_plain(asdict(settings))))
     assert settings_from(type(settings), kept, "config.yaml") == settings
     assert wrf_mi.with_settings(settings, describe(settings).splitlines()) == settings
@@ -92,8 +100,8 @@ def test_mri_finds_the_law_that_strengths_were_made_by(flat_folder: Path, tmp_pa
     observation[1, 3:9] = np.nan
     made = replace(record, observation=observation)
     for shared in ("false", "true"):
-        out = train_baseline(made, tmp_path / shared, "mri", settings=(f"shared={shared}",))
-        with np.load(out / "fitted.npz") as arrays:
+        out = train(made, tmp_path / shared, "mri", settings=(f"shared={shared}",)).folder
+        with np.load(out / "model.npz") as arrays:
             np.testing.assert_allclose(arrays["1/law"], [-45, -2], atol=ROUNDING)
         np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
 
@@ -103,7 +111,7 @@ def test_kriging_of_every_task_is_that_of_the_library(folder: Path, tmp_path: Pa
     from wrf_mi.baselines.kriging import Kriging
 
     for data in (folder, write_nerf2_csi(tmp_path / "stations", channels())):
-        out = train_baseline(data, tmp_path / f"run-{data.name}", "kriging", settings=("length_m=0.5", "noise=0.1"))
+        out = train(data, tmp_path / f"run-{data.name}", "kriging", settings=("length_m=0.5", "noise=0.1")).folder
         record, arrays = load(data), stored(out)
         (split,) = make_splits(record, "official")
         model = Kriging(0.5, 0.1).fit(record.tx_pos_m[split.all_train], record.observation[0, split.all_train])
@@ -123,7 +131,7 @@ def test_strengths_are_predicted_with_headings(flat_folder: Path, tmp_path: Path
         "trees": ("trees=20", "leaf_rows=2"),
     }
     for name, settings in given.items():
-        found = stored(train_baseline(flat_folder, tmp_path / name, name, settings=settings))["prediction"]
+        found = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):
             law = log_distance(receiver.position_m)
             model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
@@ -152,7 +160,7 @@ def test_published_figure_of_mri(tmp_path: Path) -> None:
     """Median 4.17 dB, 90th percentile 10.2 dB, over all anchors and test rows: the data's description."""
     if not (Path(os.environ.get("WRF_MI_DATA", "/nowhere")) / "flat-ble").is_dir():
         pytest.skip("WRF_MI_DATA names no folder with flat-ble/")
-    score = json.loads((train_baseline("flat-ble", tmp_path / "run", "mri") / "metrics.json").read_text())
+    score = json.loads((train("flat-ble", tmp_path / "run", "mri").folder / "metrics.json").read_text())
     assert score["abs_error_db"]["median"] == pytest.approx(4.17, abs=0.01)
     assert score["abs_error_db"]["p90"] == pytest.approx(10.2, abs=0.05)
 
@@ -160,7 +168,7 @@ def test_published_figure_of_mri(tmp_path: Path) -> None:
 def test_one_training_row_is_copied_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
     """Spectra of two receivers, and the least that a blend needs."""
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    out = train_baseline(data, tmp_path / "run", "idw", n_train=1)
+    out = train(data, tmp_path / "run", "idw", n_train=1).folder
     arrays = stored(out)
     assert arrays["prediction"].shape == arrays["truth"].shape
     assert (arrays["prediction"] == arrays["prediction"][:, :1]).all()

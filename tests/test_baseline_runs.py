@@ -14,21 +14,20 @@ import yaml
 from calling import call, refused, stored
 from made_channels import channels
 
-import wrf_mi
 from wrf_mi.core import InputError
 from wrf_mi.measure import load, make_splits, write_nerf2_csi
-from wrf_mi.report.baseline_run import evaluate_baseline, open_baseline, train_baseline
 from wrf_mi.report.compare import compare
-from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.results import read_run
+from wrf_mi.report.runs import evaluate_run, open_run, train
 
-FILES = {"config.yaml", "split.npz", "fitted.npz", "metrics.json", "predictions.npz"}
+FILES = {"config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"}
 ROUNDING = 1e-4
 """Powers of tens of dBm are stored in single precision."""
 
 
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_baseline(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri")
+    return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
 
 
 def contents(folder: Path) -> set[str]:
@@ -42,7 +41,7 @@ def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
     assert known.items() <= config.items()
     assert config["settings"] == {"shared": False}
     assert {"wrf-mi", "scipy", "scikit-learn"} <= set(config["versions"])
-    with np.load(run / "fitted.npz", allow_pickle=False) as arrays:
+    with np.load(run / "model.npz", allow_pickle=False) as arrays:
         assert set(arrays) == {"run/format", "run/train_seconds", "heading", "0/law", "1/law"}
     metrics = json.loads((run / "metrics.json").read_text())
     assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("mri", "rssi", 24, 6)
@@ -57,12 +56,12 @@ def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
 def test_stored_models_predict_what_was_scored(name: str, flat_folder: Path, tmp_path: Path) -> None:
     """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
     few = ("trees=20",) if name == "trees" else ()
-    out = train_baseline(flat_folder, tmp_path / "run", name, settings=few)
-    record, arrays, opened = load(flat_folder), stored(out), open_baseline(out)
+    out = train(flat_folder, tmp_path / "run", name, settings=few).folder
+    record, arrays, opened = load(flat_folder), stored(out), open_run(out)
     assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
     heading = record.tx_heading_rad[arrays["row"]]
     for r in range(2):
-        found = opened.predict(arrays["tx_pos"], r, heading)
+        found = opened.predict(arrays["tx_pos"], r, heading).mean
         assert found.dtype == np.float32
         np.testing.assert_array_equal(found, arrays["prediction"][r])
     if name == "idw":
@@ -91,7 +90,7 @@ def test_command_trains_as_the_function_does(
     status, table, _ = call(given, capsys)
     metrics = json.loads(table)
     assert (status, metrics["seed"], metrics["split"], metrics["n_train"]) == (0, 4, "random", 12)
-    with np.load(tmp_path / "few" / "fitted.npz") as arrays:
+    with np.load(tmp_path / "few" / "model.npz") as arrays:
         np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
 
 
@@ -104,7 +103,7 @@ def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[st
         assert again[name] == before[name], name
     for name, values in stored(run).items():
         np.testing.assert_array_equal(values, arrays[name])
-    other = evaluate_baseline(run, "random")
+    other = evaluate_run(run, "random")
     assert other["split"] == "random (rows unseen by official)"
     record = load(json.loads((run / "metrics.json").read_text())["dataset"])
     (drawn,) = make_splits(record, "random")
@@ -115,18 +114,18 @@ def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[st
 def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = train_baseline(folder, tmp_path / "run", "kriging", split="blocked")
-    assert contents(out) == FILES - {"split.npz", "fitted.npz"} | {"fold0", "fold1", "fold2"}
+    out = train(folder, tmp_path / "run", "kriging", split="blocked").folder
+    assert contents(out) == FILES - {"split.npz", "model.npz"} | {"fold0", "fold1", "fold2"}
     whole = read_run(out)
     assert sorted(whole.row) == list(range(24))
-    for name in ("fitted.npz", "metrics.json", "predictions.npz"):
+    for name in ("model.npz", "metrics.json", "predictions.npz"):
         (out / "fold1" / name).unlink()
     (out / "metrics.json").unlink()
-    kept = (out / "fold0" / "fitted.npz").stat().st_mtime_ns
-    refused(["evaluate", out], "fitted.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    kept = (out / "fold0" / "model.npz").stat().st_mtime_ns
+    refused(["evaluate", out], "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     status, _, err = call(["train", "--resume", out], capsys)
     assert (status, err.splitlines()) == (0, ["fold1: kriging: receivers"])
-    assert (out / "fold0" / "fitted.npz").stat().st_mtime_ns == kept
+    assert (out / "fold0" / "model.npz").stat().st_mtime_ns == kept
     np.testing.assert_array_equal(read_run(out).prediction, whole.prediction)
     (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
     asked = ["--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.npz"]
@@ -149,7 +148,7 @@ def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_comparison_shows_baselines_beside_the_blend(run: Path, flat_folder: Path, tmp_path: Path) -> None:
-    other = train_baseline(flat_folder, tmp_path / "idw", "idw")
+    other = train(flat_folder, tmp_path / "idw", "idw").folder
     compare([run, other], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -196,13 +195,16 @@ def test_calls_that_are_refused(
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
         (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
-        ([*train, "--scene", "x"], "mri on .*flat: takes --split, --n-train, --seed and --set"),
-        ([*train, "--preset", "quick"], "mri on .*flat: takes --split"),
+        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; leave --scene away"),
+        (
+            [*train, "--preset", "quick"],
+            "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
+        ),
         (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
         (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
         (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
         (["train", "--resume", run, "--model", "mri"], "leave data set and settings away"),
-        (["compress", run, *out], "not a learned field alone"),
+        (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
     ):
         refused(arguments, message, capsys)
         assert not (tmp_path / "out").exists(), arguments
@@ -212,22 +214,22 @@ def test_what_cannot_be_fitted_leaves_nothing_behind(flat_folder: Path, tmp_path
     record = load(flat_folder)
     still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
     with pytest.raises(InputError, match="rows at one distance"):
-        train_baseline(still, tmp_path / "run", "mri")
+        train(still, tmp_path / "run", "mri")
     assert not (tmp_path / "run").exists()
 
 
 def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damaged = Path(shutil.copytree(run, tmp_path / "run"))
-    model, asked = damaged / "fitted.npz", ["evaluate", damaged]
+    model, asked = damaged / "model.npz", ["evaluate", damaged]
     whole = model.read_bytes()
     with np.load(model) as stored_model:
         arrays = dict(stored_model)
     model.write_bytes(whole[: len(whole) // 2])
-    refused(asked, "fitted.npz: not readable .*; train the run anew", capsys)
+    refused(asked, "model.npz: not readable .*; train the run anew", capsys)
     np.savez(model, **{key: value for key, value in arrays.items() if key != "1/law"})
-    refused(asked, "fitted.npz: not readable .*law.*; train the run anew", capsys)
+    refused(asked, "model.npz: not readable .*law.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "fitted.npz: format 99, this version reads 1; use the version that wrote it", capsys)
+    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)
     model.unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")
@@ -240,11 +242,5 @@ def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.Capt
     refused(asked, "setting shared: expected bool, got 3", capsys)
     config.write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "settings"}))
     refused(asked, "config.yaml: not readable .*settings.*; restore it", capsys)
-    config.write_text(yaml.safe_dump(content | {"model": "hybrid"}))
-    with pytest.raises(InputError, match="a run of hybrid, not of a baseline"):
-        evaluate_baseline(damaged)
-
-
-def test_public_names() -> None:
-    assert wrf_mi.train_baseline is train_baseline
-    assert wrf_mi.open_baseline is open_baseline
+    config.write_text(yaml.safe_dump(content | {"model": "no-such"}))
+    refused(asked, "model 'no-such': no such model; choose from", capsys)

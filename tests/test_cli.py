@@ -23,9 +23,10 @@ from made_spectra import SIZE
 
 from wrf_mi.cli import _parser, main
 from wrf_mi.core import InputError
-from wrf_mi.fit.folder import load_predictor, read_checkpoint
+from wrf_mi.fit.checkpoint import read_checkpoint
 from wrf_mi.fit.trainer import Progress
 from wrf_mi.report import demo, runs
+from wrf_mi.report.runs import open_run
 from wrf_mi.report.watch import Watch
 
 SECONDS_TO_START = 120
@@ -181,7 +182,7 @@ def test_predict(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         np.testing.assert_array_equal(a["tx_pos"], positions)
         np.testing.assert_array_equal(a["receiver_name"], ["gateway1"])
         assert a["prediction"].shape == (3, *SIZE)
-        np.testing.assert_allclose(a["prediction"], load_predictor(run)(positions), atol=1e-6)
+        np.testing.assert_allclose(a["prediction"], open_run(run).predictor()(positions), atol=1e-6)
 
 
 def test_compare(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -216,7 +217,7 @@ def test_a_stopped_run_ends_with_130(
     status, out, err = call(["train", folder, "--out", tmp_path / "run", *SET], capsys)
     assert (status, out) == (130, "")
     assert err == f"wrf-mi: stopped after step 1 of 4; go on with: wrf-mi train --resume {tmp_path / 'run'}\n"
-    refused(["evaluate", tmp_path / "run"], "stopped after step 1 of 4; finish it with train --resume", capsys)
+    refused(["evaluate", tmp_path / "run"], "model.npz: missing, the fit was stopped; finish it with train", capsys)
     refused(["compare", tmp_path / "run", "--out", tmp_path / "out"], "finish it with train --resume", capsys)
     monkeypatch.undo()
     status, out, _ = call(["train", "--resume", tmp_path / "run", "--json"], capsys)
@@ -272,10 +273,10 @@ def progress(**values: Any) -> Progress:
 
 def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with Watch() as watch:
-        watch.listen("", 40, progress())
-        watch.listen("", 40, progress(step=20, validation_ssim=0.5))
-        watch.listen("fold1", 40, progress(step=20, validation_ssim=0.75, held_out=False))
-        watch.listen("fold2", 40, progress(step=20, validation_ssim=float("nan")))
+        watch.listen("training", 0.25, progress())
+        watch.listen("training", 0.5, progress(step=20, validation_ssim=0.5))
+        watch.listen("fold1", 0.5, progress(step=20, validation_ssim=0.75, held_out=False))
+        watch.listen("fold2", 0.5, progress(step=20, validation_ssim=float("nan")))
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
@@ -291,7 +292,7 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     with Watch() as watch:
         for fold in ("fold0", "fold1"):
             for step in (20, 40):
-                watch.listen(fold, 40, progress(step=step, validation_ssim=0.5))
+                watch.listen(fold, step / 40, progress(step=step, validation_ssim=0.5))
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
     assert "fold0" in shown
     assert "fold1" in shown

@@ -15,7 +15,7 @@ from PIL import Image
 from wrf_mi.core import InputError
 from wrf_mi.report import figures
 from wrf_mi.report.compare import COLUMNS, compare
-from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.results import read_run
 from wrf_mi.tasks.scores import ssim, summary
 
 SHAPE = (10, 24)
@@ -45,6 +45,7 @@ def make_run(
         "dataset": "made/room",
         "model": model,
         "split": split,
+        "seed": seed,
         "n_train": 20,
         "n_test": len(rows),
         "ssim": summary(ssim(prediction, truth)),
@@ -54,7 +55,6 @@ def make_run(
         "reference": {"idw4": {"median": summary(ssim(blend, truth))["median"]}},
     }
     (path / "metrics.json").write_text(json.dumps(metrics))
-    (path / "config.yaml").write_text(f"seed: {seed}\n")
     if trained:
         write_log(path)
     return path
@@ -234,7 +234,7 @@ def cut_truth(run):
             replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_ssim": 1, "held_out": true}\n{"st'),
             "line 2 is no log entry",
         ),
-        (replace("config.yaml", "seed: [1"), "not readable as YAML"),
+        (replace("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),
         (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw4"),

@@ -12,7 +12,7 @@ import pytest
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.measure import make_splits
 from wrf_mi.report.evaluate import evaluate, pool, write_results
-from wrf_mi.report.run_folder import Run, read_run
+from wrf_mi.report.results import Results, read_run
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import abs_error_db, cea_db
 
@@ -62,7 +62,7 @@ def scored(task: str, receivers: int, split: str = "official") -> tuple[Record, 
     return truth, [evaluate(truth, part, Off(truth)) for part in make_splits(truth, split)]
 
 
-def stored(folder: Path, metrics: dict, arrays: dict) -> Run:
+def stored(folder: Path, metrics: dict, arrays: dict) -> Results:
     folder.mkdir()
     write_results(folder, HEADER | metrics, arrays)
     return read_run(folder)
@@ -200,10 +200,10 @@ def test_predictions_of_another_shape_are_named(tmp_path: Path):
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 @pytest.mark.parametrize("split", ["official", "blocked"])
-def test_fields_are_fitted_to_spectra_alone(tmp_path: Path, task: str, split: str):
+def test_factorised_fields_are_fitted_to_spectra_alone(tmp_path: Path, task: str, split: str):
     from wrf_mi.report.runs import train
 
-    with pytest.raises(InputError, match=f"made-up: holds {task}; .* spectra") as error:
-        train(record(task, 1), tmp_path / "run", split=split)
+    with pytest.raises(InputError, match=f"made-up: holds {task}; factorised serves spectrum, so choose") as error:
+        train(record(task, 1), tmp_path / "run", "factorised", split=split)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()

@@ -36,7 +36,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Folders that fields were fitted into."""
     folders: list[Path] = []
 
-    def train(record: Record, folder: Path, config: Any, n_train: int) -> None:
+    def train(record: Record, folder: Path, model: str, settings: Any, n_train: int) -> None:
         folder.mkdir(parents=True)
         (folder / "metrics.json").write_text("{}")
         folders.append(folder)
@@ -108,7 +108,7 @@ def test_budgets_of_other_seeds_or_schedules_are_fitted_anew(
 ) -> None:
     folders = []
 
-    def train(record: Record, folder: Path, config: Any) -> None:
+    def train(record: Record, folder: Path, model: str, settings: Any) -> None:
         folders.append(folder)
         raise InputError("far enough")
 

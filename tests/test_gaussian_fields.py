@@ -21,13 +21,15 @@ from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.field import FIELDS  # noqa: E402
 from wrf_mi.field.gaussians import by_component  # noqa: E402
+from wrf_mi.fit.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from wrf_mi.fit.config import TrainConfig, default_config, with_settings  # noqa: E402
-from wrf_mi.fit.folder import RunConfig, load_predictor, resume_run, start_run, write_checkpoint  # noqa: E402
 from wrf_mi.fit.predictor import TOGETHER, Predictor  # noqa: E402
+from wrf_mi.fit.state import FitState  # noqa: E402
 from wrf_mi.fit.step import device_pose  # noqa: E402
 from wrf_mi.fit.targets import targets_of  # noqa: E402
 from wrf_mi.fit.trainer import Trainer  # noqa: E402
 from wrf_mi.receive.operator import SectorOperator  # noqa: E402
+from wrf_mi.report.runs import train  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
 
 MODELS = tuple(FIELDS)
@@ -159,37 +161,35 @@ def test_components_hold_what_channels_are_made_of() -> None:
 def test_strengths_are_learned_and_kept(model: str, tmp_path) -> None:
     record = strengths()
     split = halves(record)
-    trainer = start_run(tmp_path, record, split, RunConfig("made", "halves", None, config(record, f"model={model}")))
-    trainer.run()
-    write_checkpoint(tmp_path, trainer)
-    predict, again = trainer.predictor(), load_predictor(tmp_path)
+    run = train(record, tmp_path / "run", model, split=split, settings=SMALL)
+    with np.load(tmp_path / "run" / "predictions.npz") as stored:
+        scored = stored["prediction"]
     for r in range(2):
-        found, truth = predict(record.tx_pos_m[split.test], r), record.observation[r, split.test]
+        found, truth = run.predict(record.tx_pos_m[split.test], r).mean, record.observation[r, split.test]
         mean = np.abs(np.nanmean(record.observation[r, split.all_train]) - truth)
         assert np.median(np.abs(found - truth)) < np.median(mean)
-        np.testing.assert_array_equal(again(record.tx_pos_m[split.test], r), found)
+        np.testing.assert_array_equal(scored[r], found)
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_channels_are_learned_from_the_uplink_and_kept(model: str, tmp_path) -> None:
     record = channels()
     split = halves(record)
-    own = config(record, f"model={model}", "steps=400", "batch=32", "optimiser.network=3e-3")
-    trainer = start_run(tmp_path, record, split, RunConfig("made", "halves", None, own))
-    trainer.run()
-    write_checkpoint(tmp_path, trainer)
+    own = (*SMALL, "steps=400", "batch=32", "optimiser.network=3e-3")
+    run = train(record, tmp_path / "run", model, split=split, settings=own)
     assert record.uplink is not None
-    nowhere, uplink, truth = record.tx_pos_m[split.test], record.uplink[split.test], record.observation[0, split.test]
-    found = trainer.predictor()(nowhere, 0, uplink)
+    uplink, truth = record.uplink[split.test], record.observation[0, split.test]
+    found = run.predict(uplink=uplink).mean
     assert found.shape == truth.shape
 
     def error(prediction):
         return np.median(np.square(np.abs(prediction - truth)).sum((1, 2)) / np.square(np.abs(truth)).sum((1, 2)))
 
     assert error(found) < 0.3 * error(uplink)
-    np.testing.assert_array_equal(load_predictor(tmp_path)(nowhere, 0, uplink), found)
+    with np.load(tmp_path / "run" / "predictions.npz") as stored:
+        np.testing.assert_array_equal(stored["prediction"], found)
     with pytest.raises(InputError, match="the rows to predict have none; give `uplink`"):
-        trainer.predictor()(nowhere, 0)
+        run.predict(record.tx_pos_m[split.test])
 
 
 @pytest.mark.parametrize("known", [(), ("position_m",), ("orientation_xyzw",)])
@@ -290,11 +290,10 @@ def test_a_fit_goes_on_from_its_best_moment(hold_out: float) -> None:
 def test_a_stopped_fit_chooses_as_one_that_was_not(stop: int, tmp_path) -> None:
     record = strengths()
     own = config(record, "steps=160", "validate_every=10", "patience=2", "deterministic=true")
-    whole = start_run(tmp_path / "whole", record, halves(record), RunConfig("made", "halves", None, own))
+    whole, part = (Trainer(record, halves(record), own) for _ in range(2))
     whole.run()
-    part = start_run(tmp_path / "part", record, halves(record), RunConfig("made", "halves", None, own))
-    part.run(save=lambda: write_checkpoint(tmp_path / "part", part), stop=lambda: part.state.step >= stop)
-    again = resume_run(tmp_path / "part", record)
+    part.run(save=lambda: write_checkpoint(tmp_path, part), stop=lambda: part.state.step >= stop)
+    again = Trainer(record, halves(record), own, state=FitState.from_arrays(read_checkpoint(tmp_path)))
     again.run()
     assert again.state.chosen == whole.state.chosen
     for name, values in whole.state.mean_params().items():

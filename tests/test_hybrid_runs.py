@@ -18,18 +18,18 @@ from traced_rooms import FREQUENCY_HZ, inside, write_xml
 from traced_rooms import SHOEBOX as ROOM
 from wrf_mi_scenes.build_laboratory import box
 
-from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core import Receiver, Record
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.report.compare import compare
-from wrf_mi.report.hybrid_run import HybridRun, evaluate_hybrid, open_hybrid, train_hybrid
-from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.results import read_run
+from wrf_mi.report.runs import evaluate_run, open_run, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks.scores import inside_interval, ssim
 
 QUICK = ("directions=20", "lengths=2")
 """Of spectra without a mesh: a fit of a second."""
 SET = [part for setting in QUICK for part in ("--set", setting)]
-FILES = {"config.yaml", "split.npz", "hybrid.npz", "metrics.json", "predictions.npz"}
+FILES = {"config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"}
 ROUNDING = 1e-5
 """Predictions are float32."""
 
@@ -42,18 +42,20 @@ def waves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_hybrid(waves, tmp_path_factory.mktemp("runs") / "run", settings=QUICK)
+    return train(waves, tmp_path_factory.mktemp("runs") / "run", "hybrid", settings=QUICK).folder
 
 
 @pytest.fixture(scope="module")
 def blocked(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_hybrid(waves, tmp_path_factory.mktemp("runs") / "blocked", split="blocked", seed=3, settings=QUICK)
+    return train(
+        waves, tmp_path_factory.mktemp("runs") / "blocked", "hybrid", split="blocked", seed=3, settings=QUICK
+    ).folder
 
 
 @pytest.fixture(scope="module")
 def strengths(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on signal strengths with headings, without a mesh."""
-    return train_hybrid(flat_folder, tmp_path_factory.mktemp("runs") / "strengths")
+    return train(flat_folder, tmp_path_factory.mktemp("runs") / "strengths", "hybrid").folder
 
 
 def contents(folder: Path) -> set[str]:
@@ -73,8 +75,9 @@ def test_run_folder_holds_the_model_and_what_it_is_sure_of(waves: Path, run: Pat
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
     known = {"model": "hybrid", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
+    known |= {"format": 2, "task": "spectrum", "material": None, "deterministic": False}
     assert known.items() <= config.items()
-    assert config["settings"] == list(QUICK)
+    assert (config["settings"]["directions"], config["settings"]["lengths"]) == (20, 2)
     record, arrays = load(waves), stored(run)
     assert record.official is not None
     np.testing.assert_array_equal(arrays["row"], record.official[1])
@@ -177,7 +180,7 @@ def test_heading_changes_signal_strengths(
 
 
 def test_every_block_is_held_out_in_turn(waves: Path, blocked: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert contents(blocked) == FILES - {"split.npz", "hybrid.npz"} | {"fold0", "fold1"}
+    assert contents(blocked) == FILES - {"split.npz", "model.npz"} | {"fold0", "fold1"}
     assert contents(blocked / "fold1") == FILES
     read = read_run(blocked)
     assert sorted(read.row) == list(range(36))
@@ -187,7 +190,7 @@ def test_every_block_is_held_out_in_turn(waves: Path, blocked: Path, capsys: pyt
     assert read.metrics["train_seconds"] == pytest.approx(sum(m["train_seconds"] for m in own))
     arrays = stored(blocked)
     assert read.metrics["inside_90"] == inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
-    again = evaluate_hybrid(blocked)
+    again = evaluate_run(blocked)
     for name in read.metrics.keys() - {"ms_per_sample"}:
         assert again[name] == read.metrics[name], name
     # A fold is a run of its own.
@@ -211,14 +214,14 @@ def test_resuming_keeps_the_folds_that_were_fitted(
     blocked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = copied(blocked, tmp_path / "run")
-    for name in ("hybrid.npz", "metrics.json", "predictions.npz"):
+    for name in ("model.npz", "metrics.json", "predictions.npz"):
         (run / "fold1" / name).unlink()
     (run / "metrics.json").unlink()
-    kept = (run / "fold0" / "hybrid.npz").stat().st_mtime_ns
-    refused(["evaluate", run], "hybrid.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    kept = (run / "fold0" / "model.npz").stat().st_mtime_ns
+    refused(["evaluate", run], "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     status, out, err = call(["train", "--resume", run, "--json"], capsys)
     assert status == 0, err
-    assert (run / "fold0" / "hybrid.npz").stat().st_mtime_ns == kept
+    assert (run / "fold0" / "model.npz").stat().st_mtime_ns == kept
     assert "fold1: one: element signals of spectra" in err.splitlines()
     assert "fold0" not in err
     before, after = read_run(blocked), read_run(run)
@@ -257,9 +260,9 @@ def test_mesh_alone_predicts_signal_strengths(
     metrics = json.loads(printed)
     assert (metrics["n_train"], metrics["scene"]) == (0, str(flat_scene))
     assert metrics["reference"]["idw100"]["median"] > 0  # the blend keeps its rows
-    again = evaluate_hybrid(out)
+    again = evaluate_run(out)
     assert (again["n_train"], again["abs_error_db"]) == (0, metrics["abs_error_db"])
-    assert evaluate_hybrid(out, "random")["n_test"] == 6  # it has seen no row: a fifth of all
+    assert evaluate_run(out, "random")["n_test"] == 6  # it has seen no row: a fifth of all
     # Strengths are not calibrated: without any row the scale is not known.
     assert stored(out)["std"].min() > 5
 
@@ -274,9 +277,9 @@ def test_mesh_alone_predicts_spectra(tmp_path: Path) -> None:
     found = []
     for name, parts in (("room", ROOM), ("half", {k: v for k, v in ROOM.items() if k in ("floor", "west")})):
         scene = write_xml(tmp_path / name, parts)
-        out = train_hybrid(folder, tmp_path / f"run-{name}", scene, n_train=0, settings=("rays=4096",))
+        out = train(folder, tmp_path / f"run-{name}", "hybrid", scene=scene, n_train=0, settings=("rays=4096",)).folder
         assert json.loads((out / "metrics.json").read_text())["n_train"] == 0
-        assert evaluate_hybrid(out)["ssim"] == read_run(out).metrics["ssim"]
+        assert evaluate_run(out)["ssim"] == read_run(out).metrics["ssim"]
         found.append(stored(out)["prediction"])
     assert np.abs(found[0] - found[1]).mean() > 0.02
 
@@ -292,7 +295,7 @@ def test_antennas_are_checked_once_and_as_the_ray_tracer_does(
     scene = write_xml(tmp_path / "hall", {**ROOM, "column": ("itu_concrete", box((4.8, 3.6, 0), (5.3, 4.1, 3)))})
     plain = ("rays=1024", "reflections=1", "surfaces=0", "amplitudes=false", "rest=false", "steps=1")
     folder = write_spectrum_folder(tmp_path / "waves", record)
-    train_hybrid(folder, tmp_path / "run", scene, split="blocked", settings=plain)
+    train(folder, tmp_path / "run", "hybrid", scene=scene, split="blocked", settings=plain)
     said = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
     assert [text.partition(" (first: receiver one)")[0] for text in said] == [
         "1 of 1 antennas lie up to 1 cm behind an outer wall",
@@ -325,7 +328,7 @@ def test_channels_are_predicted_from_a_mesh(tmp_path: Path) -> None:
         csi += np.exp(-1j * wavenumber * distance) / (2 * wavenumber * distance)
     np.savez(tmp_path / "hall.npz", tx_pos=tx_pos, rx_pos=where, frequency_hz=FREQUENCY_HZ, csi=csi)
     quick = ("rays=8192", "reflections=1", "repair_rounds=2", "visibility_rounds=1", "folds=2")
-    out = train_hybrid(tmp_path / "hall.npz", tmp_path / "run", scene, settings=quick)
+    out = train(tmp_path / "hall.npz", tmp_path / "run", "hybrid", scene=scene, settings=quick).folder
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cea_db"]["median"] > 20
     assert metrics["cea_db"]["median"] > metrics["reference"]["idw4"]["median"] + 15
@@ -354,10 +357,16 @@ def test_calls_that_are_refused(
         ([*train, "--set", "steps=3"], "unknown setting steps"),
         ([*train, "--set", "lengths=0"], "setting lengths: 0; choose 1 or more"),
         ([*train, "--set", "lengths=many"], "expected int, got 'many'"),
-        ([*train, "--material", "concrete"], "--material belongs to a bare mesh; give it with --scene"),
+        (
+            [*train, "--material", "concrete"],
+            "--material and antenna options belong to a scene that is traced; give --scene",
+        ),
         ([*train, "--scene", tmp_path / "none.xml"], "none.xml"),
-        ([*train, "--depth", 2], "takes --scene, --material, --split, --n-train, --seed and --set"),
-        ([*train, "--preset", "quick"], "takes --scene, --material"),
+        (
+            [*train, "--depth", 2],
+            "--paths, --depth, --reflections, --rays and --calibrate belong to --model ray-tracing",
+        ),
+        ([*train, "--preset", "quick"], "hybrid on .*waves: takes no preset"),
         (["train", waves, "--model", "hybrid"], "train needs DATASET and --out RUN"),
         (["train", waves, "--model", "hybrid", "--out", waves], "exists and is not empty; choose another --out"),
         (["train", "--resume", run, "--model", "hybrid"], "leave data set and settings away"),
@@ -372,31 +381,23 @@ def test_calls_that_are_refused(
 
 def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damaged = copied(run, tmp_path / "run")
-    model = damaged / "hybrid.npz"
+    model = damaged / "model.npz"
     whole = model.read_bytes()
     with np.load(model) as stored:
         arrays = dict(stored)
     asked = ["evaluate", damaged]
     model.write_bytes(whole[: len(whole) // 2])
-    refused(asked, "hybrid.npz: not readable .*; train the run anew", capsys)
+    refused(asked, "model.npz: not readable .*; train the run anew", capsys)
     np.savez(model, **{key: value for key, value in arrays.items() if key != "0/weights"})
-    refused(asked, "hybrid.npz: not readable .*0/weights.*; train the run anew", capsys)
+    refused(asked, "model.npz: not readable .*0/weights.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "hybrid.npz: format 99, this version reads 1; use the version that wrote it", capsys)
+    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)
     model.unlink()
-    refused(asked, "hybrid.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    refused(asked, "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     config = damaged / "config.yaml"
     content = yaml.safe_load(config.read_text())
     config.write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "seed"}))
     refused(asked, "config.yaml: not readable .*seed.*; restore it", capsys)
-
-
-def test_runs_of_other_models_are_refused(run: Path, tmp_path: Path) -> None:
-    other = copied(run, tmp_path / "run")
-    config = yaml.safe_load((other / "config.yaml").read_text())
-    (other / "config.yaml").write_text(yaml.safe_dump(config | {"model": "ray-tracing"}))
-    with pytest.raises(InputError, match="a run of ray-tracing, not of the hybrid"):
-        evaluate_hybrid(other)
 
 
 BAD_HEADINGS = {
@@ -420,7 +421,7 @@ def test_headings_that_are_refused(name: str, run: Path, tmp_path: Path, capsys:
 def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     heard: list[tuple[str, float]] = []
     record = wave_record(36, 10, receivers=1)
-    out = train_hybrid(record, tmp_path / "run", settings=QUICK, listen=lambda *told: heard.append(told))
+    out = train(record, tmp_path / "run", "hybrid", settings=QUICK, listen=lambda *told: heard.append(told[:2])).folder
     assert {what for what, _ in heard} == {"one: element signals of spectra", "one: signals", "one: weights"}
     assert stored(out)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
 
@@ -433,9 +434,7 @@ def test_settings_of_every_hybrid_are_listed(capsys: pytest.CaptureFixture[str])
 
 
 def test_model_is_read_as_it_was_fitted(run: Path) -> None:
-    model, seconds = HybridRun.stored(run).model_of(run)
-    assert seconds == json.loads((run / "metrics.json").read_text())["train_seconds"]
     arrays: Any = stored(run)
-    np.testing.assert_allclose(model.predict(arrays["tx_pos"], 1).mean, arrays["prediction"][1], atol=ROUNDING)
-    opened = open_hybrid(run).predict(arrays["tx_pos"], 1)
+    np.testing.assert_allclose(open_run(run).predict(arrays["tx_pos"], 1).mean, arrays["prediction"][1], atol=ROUNDING)
+    opened = open_run(run).predict(arrays["tx_pos"], 1)
     np.testing.assert_allclose(opened.std, arrays["std"][1], atol=ROUNDING)

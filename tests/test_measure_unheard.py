@@ -5,6 +5,7 @@ Whatever is refused is refused in one line that names the data, before anything 
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from calling import call, refused
 
 from wrf_mi.core import InputError
 from wrf_mi.measure import load
-from wrf_mi.report import traced
-from wrf_mi.report.hybrid_run import train_hybrid
-from wrf_mi.report.run_folder import read_run
-from wrf_mi.report.traced import trace_run
+from wrf_mi.models import ray_tracing
+from wrf_mi.report import runs
+from wrf_mi.report.results import read_run
+from wrf_mi.report.runs import train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.trace import TraceOptions
 
@@ -68,8 +69,8 @@ def test_every_split_is_looked_at(unheard: Path, room: Path, tmp_path: Path) -> 
     object.__setattr__(record, "observation", observation)
     told: list[str] = []
     for start in (
-        lambda: trace_run(room, record, tmp_path / "run", DIRECT, split="blocked"),
-        lambda: train_hybrid(record, tmp_path / "run", split="blocked", listen=lambda what, share: told.append(what)),
+        lambda: train(record, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked"),
+        lambda: train(record, tmp_path / "run", "hybrid", split="blocked", listen=lambda *said: told.append(said[0])),
     ):
         with pytest.raises(InputError, match="receiver far: received none of"):
             start()
@@ -82,13 +83,14 @@ def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path,
     nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, max_depth=1)
     (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match="no training row is both received and reached by a path"):
-        trace_run(room, flat_folder, tmp_path / "run", nothing)
+        train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=nothing)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("stage", ["calibrate", "_score"])
+@pytest.mark.parametrize(("module", "stage"), [(ray_tracing, "calibrate"), (runs, "score_part")])
 @pytest.mark.parametrize("split", ["official", "blocked"])
-def test_what_is_left_of_a_stopped_trace_is_no_run(
+def test_a_stopped_trace_goes_on_with_its_paths(
+    module: Any,
     stage: str,
     split: str,
     flat_folder: Path,
@@ -100,18 +102,16 @@ def test_what_is_left_of_a_stopped_trace_is_no_run(
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    out = tmp_path / "run"
+    out, settings = tmp_path / "run", ray_tracing.TracingSettings(**asdict(DIRECT), calibration="patterns")
     with monkeypatch.context() as patch:
-        patch.setattr(traced, stage, stopped)
+        patch.setattr(module, stage, stopped)
         with pytest.raises(KeyboardInterrupt):
-            trace_run(room, flat_folder, out, DIRECT, calibration="patterns", split=split)
-    assert (out / "paths.npz").exists()  # an hour's work may lie there
-    for command in (["train", "--resume", out], ["evaluate", out]):
-        refused(command, f"{out}: no config.yaml, so not a run folder; give one made by train", capsys)
+            train(flat_folder, out, "ray-tracing", scene=room, settings=settings, split=split)
+    written = (out / "paths.npz").stat().st_mtime_ns  # an hour's work may lie there
     again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
     refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)
-    status, _, err = call([*again, "--out", tmp_path / "new"], capsys)
+    refused(["compare", out, "--out", tmp_path / "page"], "no metrics.json, so no finished run; finish it", capsys)
+    status, _, err = call(["train", "--resume", out], capsys)
     assert status == 0, err
-    assert (tmp_path / "new" / "config.yaml").exists()
-    assert read_run(tmp_path / "new").metrics["model"] == "ray-tracing"
-    refused(["train", "--resume", tmp_path / "new"], "ray tracing has nothing to go on from; start it anew", capsys)
+    assert (out / "paths.npz").stat().st_mtime_ns == written
+    assert read_run(out).metrics["calibration"] == "patterns"

@@ -14,12 +14,11 @@ from calling import stored
 from small_fits import official, settings
 
 from wrf_mi.core import InputError, Record
-from wrf_mi.fit.config import TrainConfig
 from wrf_mi.measure.observations import scorable
 from wrf_mi.report import sweep
-from wrf_mi.report.baseline_run import train_baseline
 from wrf_mi.report.compare import compare
 from wrf_mi.report.evaluate import evaluate
+from wrf_mi.report.runs import train
 
 
 def changed(record: Record, *changes: tuple[Any, float]) -> Record:
@@ -31,13 +30,11 @@ def changed(record: Record, *changes: tuple[Any, float]) -> Record:
 
 
 def train_field(record: Record, out: Path, split: str = "official") -> Path:
-    from wrf_mi.report.runs import train
-
-    return train(record, out, settings("steps=2", "deterministic=true"), split).folder
+    return train(record, out, settings=settings("steps=2", "deterministic=true"), split=split).folder
 
 
 def train_idw(record: Record, out: Path, split: str = "official") -> Path:
-    return train_baseline(record, out, "idw", split=split)
+    return train(record, out, "idw", split=split).folder
 
 
 BOTH = pytest.mark.parametrize("train", [train_field, train_idw])
@@ -107,15 +104,12 @@ def test_what_is_finite_or_missing_stays(two_gateways: Record) -> None:
     assert count == 0
 
 
-@pytest.mark.parametrize("kind", ["field", "trace", "hybrid"])
+@pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "hybrid"}], ids=str)
 def test_a_sweep_is_refused_before_its_first_run(
-    kind: str, two_gateways: Record, monkeypatch: pytest.MonkeyPatch
+    arguments: dict[str, str], two_gateways: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from wrf_mi.trace import TraceOptions
-
     row = int(official(two_gateways).train[0])
     broken = changed(two_gateways, ((0, row, 0, 0), np.nan))
     monkeypatch.setattr(sweep, "_record", lambda dataset: broken)
-    given = {"field": TrainConfig(), "trace": TraceOptions(), "hybrid": ()}[kind]
     with pytest.raises(InputError, match=f"row {row}: 1 of 800 values are not finite"):
-        sweep.check_fit(f"broken-{kind}", given, None, None, ("official", 0, None), None)
+        sweep.check_run("broken", arguments)

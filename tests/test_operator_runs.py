@@ -18,10 +18,9 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.field import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.field.host import host_signals
 from wrf_mi.fit import still
-from wrf_mi.fit.folder import load_predictor
 from wrf_mi.fit.predictor import Predictor
 from wrf_mi.fit.still import RecordedSignals, StillField, read_weights
-from wrf_mi.report.runs import predict_to_file, train
+from wrf_mi.report.runs import open_run, predict_to_file, train
 
 GREYS = 1e-5
 """Largest difference of greys up to about one: float32 sums of some ten terms in another order."""
@@ -99,7 +98,7 @@ def test_networks_in_numpy_are_those_of_the_field(field: Any, monkeypatch: pytes
 @pytest.fixture(scope="module")
 def run(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = settings("steps=5", model="factorised")
-    return train(one_gateway, tmp_path_factory.mktemp("runs") / "run", config).folder
+    return train(one_gateway, tmp_path_factory.mktemp("runs") / "run", config.model, settings=config).folder
 
 
 def test_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,18 +106,18 @@ def test_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.Monk
     first = stored.read_bytes()
     with np.load(stored, allow_pickle=False) as arrays:
         assert set(arrays.files) == {"format", "key", "data", "indices", "indptr"}
-    built = load_predictor(run)(TX)
+    built = open_run(run).predictor()(TX)
 
     def never(*_: Any) -> None:
         raise AssertionError("built although it is stored")
 
     monkeypatch.setattr(still, "pixel_weights", never)
-    np.testing.assert_array_equal(load_predictor(run)(TX), built)
+    np.testing.assert_array_equal(open_run(run).predictor()(TX), built)
     assert stored.read_bytes() == first
-    np.testing.assert_allclose(load_predictor(run, operator=False)(TX), built, atol=GREYS)
+    np.testing.assert_allclose(open_run(run, operator=False).predictor()(TX), built, atol=GREYS)
     stored.unlink()
     with pytest.raises(AssertionError, match="although"):
-        load_predictor(run)(TX)
+        open_run(run).predictor()(TX)
     stored.write_bytes(first)
     for name, operator in (("with.npz", True), ("without.npz", False)):
         predict_to_file(run, TX, tmp_path / name, operator=operator)

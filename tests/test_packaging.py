@@ -101,16 +101,16 @@ def test_installed_package_trains_a_step(site: Path, tmp_path: Path) -> None:
 import json
 from pathlib import Path
 import numpy as np
-from wrf_mi import Receiver, Record, Split, TrainConfig, train, with_settings
+from wrf_mi import Receiver, Record, Split, train
 rng = np.random.default_rng(0)
 receiver = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 spectra = rng.random((1, 6, 8, 16)).astype(np.float32)
 record = Record("noise", "spectrum", rng.normal(size=(6, 3)), (receiver,), spectra)
-config = with_settings(TrainConfig(), ["steps=2", "initial.gaussians=5"])
-run = train(record, "run", config, split=Split("own", 0, np.arange(3), np.arange(3, 4), np.arange(4, 6)))
+split = Split("own", 0, np.arange(3), np.arange(3, 4), np.arange(4, 6))
+run = train(record, "run", settings=["steps=2", "initial.gaussians=5"], split=split)
 assert run.metrics["steps"] == 2 and run.metrics["n_test"] == 2
 assert [json.loads(line)["step"] for line in Path("run/log.jsonl").read_text().splitlines()] == [2]
 assert run.predictor()(record.tx_pos_m[:1]).shape == (1, 8, 16)
 """
     run_installed(site, code, tmp_path)
-    assert (tmp_path / "run" / "checkpoint.npz").is_file()
+    assert (tmp_path / "run" / "model.npz").is_file()

@@ -20,12 +20,10 @@ from worker_tasks import Lossy
 from wrf_mi import parallel
 from wrf_mi.core import InputError, Record
 from wrf_mi.measure import load, write_spectrum_folder
+from wrf_mi.models import ray_tracing
 from wrf_mi.parallel import Scheduler, open_scheduler
-from wrf_mi.report import traced
 from wrf_mi.report.bench import BenchFailed, bench, case_folder
-from wrf_mi.report.hybrid_run import train_hybrid
 from wrf_mi.report.runs import predict_to_file, train
-from wrf_mi.report.traced import trace_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.trace import TraceOptions
 
@@ -50,7 +48,7 @@ def flat(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several parts of few positions."""
-    monkeypatch.setattr(traced, "TRACED_AT_LEAST", 2)
+    monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 2)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +99,9 @@ def test_field_predicts_the_same(model: str, two_gateways: Record, two: Schedule
     """One is splatted; the other is a product of matrices."""
     folder = write_spectrum_folder(tmp_path / "made-here", two_gateways, bits=16)
     record = load(folder)
-    run = train(record, tmp_path / "run", settings("steps=4", model=model), official(record)).folder
+    run = train(
+        record, tmp_path / "run", model, settings=settings("steps=4", model=model), split=official(record)
+    ).folder
     serial, parallel = both(run, positions(record), two, tmp_path)
     assert serial["prediction"].shape == (2, POSITIONS, *record.observation.shape[-2:])
     assert np.ptp(serial["prediction"]) > 0
@@ -114,9 +114,9 @@ def test_field_predicts_the_same(model: str, two_gateways: Record, two: Schedule
 def test_traced_run_is_the_same_and_predicts_the_same(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """With the number of rays settled by the search itself, which looks at all positions."""
     options = TraceOptions(max_depth=1, rays="auto")
-    serial = trace_run(room, flat, tmp_path / "serial", options)
+    serial = train(flat, tmp_path / "serial", "ray-tracing", scene=room, settings=options).folder
     lossy = Lossy(two, tmp_path)
-    parallel = trace_run(room, flat, tmp_path / "parallel", options, scheduler=lossy)
+    parallel = train(flat, tmp_path / "parallel", "ray-tracing", scene=room, settings=options, scheduler=lossy).folder
     lossy.assert_one_was_lost()
     for file in ("paths.npz", "predictions.npz", "split.npz"):
         assert_same_bits(stored(serial / file), stored(parallel / file))
@@ -130,8 +130,10 @@ def test_paths_drawn_at_random_are_the_same(flat: Path, room: Path, two: Schedul
     for kind in ({"scattering": True}, {"diffraction": True}):
         options = TraceOptions(max_depth=1, rays=1 << 8, **kind)
         name = next(iter(kind))
-        serial = trace_run(room, flat, tmp_path / f"{name}-serial", options)
-        parallel = trace_run(room, flat, tmp_path / f"{name}-parallel", options, scheduler=two)
+        serial = train(flat, tmp_path / f"{name}-serial", "ray-tracing", scene=room, settings=options).folder
+        parallel = train(
+            flat, tmp_path / f"{name}-parallel", "ray-tracing", scene=room, settings=options, scheduler=two
+        ).folder
         arrays = stored(serial / "paths.npz")
         assert (arrays["interactions"] == {"scattering": 2, "diffraction": 8}[name]).any()
         assert_same_bits(arrays, stored(parallel / "paths.npz"))
@@ -141,7 +143,7 @@ def test_hybrids_predict_the_same(flat: Path, two: Scheduler, tmp_path: Path) ->
     waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
     for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
         folder = tmp_path / name
-        run = train_hybrid(data, folder / "run", settings=given)
+        run = train(data, folder / "run", "hybrid", settings=given).folder
         places = positions(load(data))
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)
@@ -156,7 +158,9 @@ def test_command_names_the_row_of_the_whole_in_one_line(
     box.apply_translation((50.0, 50.0, 1.0))
     box.export(tmp_path / "box.ply")
     direct = TraceOptions(reflection=False, max_depth=0)
-    run = trace_run(tmp_path / "box.ply", flat, tmp_path / "run", direct, material="concrete")
+    run = train(
+        flat, tmp_path / "run", "ray-tracing", scene=tmp_path / "box.ply", settings=direct, material="concrete"
+    ).folder
     places = np.concatenate([positions(load(flat)), [[50.0, 50.0, 1.0]]])
     with pytest.raises(InputError, match=f"^transmitter {POSITIONS + 1} at .* is inside the solid 'box'"):
         predict_to_file(run, places, tmp_path / "p.npz", scheduler=two)

@@ -13,9 +13,9 @@ from made_flat import NAMED_ANCHORS_M
 from wrf_mi.core import Record
 from wrf_mi.measure import load, write_spectrum_folder
 from wrf_mi.measure.csv_table import read_csv
-from wrf_mi.report.baseline_run import train_baseline
 from wrf_mi.report.compare import compare
 from wrf_mi.report.prediction_file import write_prediction_file
+from wrf_mi.report.runs import train
 from wrf_mi.report.tx_file import read_inputs
 
 NAMES = list(NAMED_ANCHORS_M)
@@ -115,7 +115,7 @@ def test_files_of_other_forms_are_refused(
 
 def test_table_of_spectra_is_refused(one_gateway: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_spectrum_folder(tmp_path / "data", one_gateway)
-    run = train_baseline(data, tmp_path / "run", "idw")
+    run = train(data, tmp_path / "run", "idw").folder
     (tmp_path / "tx.csv").write_text("x,y,z\n0.1,2,0.5\n")
     given = ["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.csv"]
     refused(given, r"out\.csv: \.csv holds signal strengths \(rssi\), .* predicts spectrum; give out\.npz", capsys)

@@ -22,8 +22,7 @@ from wrf_mi_plugins.shape import shape_parameters  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import Record  # noqa: E402
-from wrf_mi.fit.folder import read_checkpoint, read_config  # noqa: E402
-from wrf_mi.fit.trainer import final_params, make_field  # noqa: E402
+from wrf_mi.report.runs import open_run  # noqa: E402
 
 wrf_mi_plugins.register_all()
 
@@ -96,7 +95,7 @@ def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.Mo
     xml.write_text(XML.format(run="runs/first"))
     monkeypatch.chdir(tmp_path)
     from_file = mi.load_file(str(xml))
-    from_text = mi.load_string(XML.format(run=run / "checkpoint.npz"))
+    from_text = mi.load_string(XML.format(run=run / "model.npz"))
     from_dict = mi.load_dict(as_dict(str(run)))
     expected = held(from_dict)
     assert {"transmitter.tx_position", "gaussians.data", "gaussians.signal", "stencil.interior_medium.scale"} <= {
@@ -115,11 +114,11 @@ def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.Mo
 
 
 def test_run_folder_says_what_the_shape_holds(run: Path) -> None:
-    """The mean parameters of the checkpoint, through the model that the configuration names."""
+    """The parameters of the fitted model, through the model that the configuration names."""
     scene = mi.load_dict(as_dict(str(run)))
-    params = {name: to_tensor(values) for name, values in final_params(read_checkpoint(run)).items()}
-    field = make_field(read_config(run).settings)
-    gaussians = field.gaussians(params, to_tensor(np.array(TX)[:, None]))
+    trained = open_run(run).field
+    params = {name: to_tensor(values) for name, values in trained.params.items()}
+    gaussians = trained.field.gaussians(params, to_tensor(np.array(TX)[:, None]))
     got = mi.traverse(scene)
     for name, values in shape_parameters(gaussians).items():
         np.testing.assert_allclose(plain(got[f"gaussians.{name}"]), plain(values), rtol=1e-5, atol=1e-6)
@@ -130,12 +129,12 @@ def test_bad_runs_are_named(run: Path, tmp_path: Path) -> None:
     empty.mkdir()
     damaged = tmp_path / "damaged"
     shutil.copytree(run, damaged)
-    (damaged / "checkpoint.npz").write_bytes(b"nonsense")
+    (damaged / "model.npz").write_bytes(b"nonsense")
     other = tmp_path / "other"
     shutil.copytree(run, other)
-    unknown = (other / "config.yaml").read_text().replace("model:", "modell:")
+    unknown = (other / "config.yaml").read_text().replace("  model:", "  modell:")
     (other / "config.yaml").write_text(unknown)
-    for folder, message in ((empty, "no config.yaml"), (damaged, "checkpoint.npz: not readable"), (other, "modell")):
+    for folder, message in ((empty, "no config.yaml"), (damaged, "model.npz: not readable"), (other, "modell")):
         with pytest.raises(RuntimeError, match=message):
             mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(folder), "tx_position": list(TX)})
     with pytest.raises(RuntimeError, match="no tx_position; give x, y, z in metres"):

@@ -57,9 +57,9 @@ def public_functions() -> dict[str, Callable[..., Any]]:
     from wrf_mi.hybrid.rssi import RssiHybrid
     from wrf_mi.hybrid.spectrum import SpectrumHybrid
     from wrf_mi.receive.calibrate import fit_array
-    from wrf_mi.report.baseline_run import Baseline
+    from wrf_mi.report.runs import Run
 
-    models = (CsiHybrid, MeasuredSpectrumHybrid, RssiHybrid, SpectrumHybrid, HybridModel, Baseline, JointFit)
+    models = (CsiHybrid, MeasuredSpectrumHybrid, RssiHybrid, SpectrumHybrid, HybridModel, Run, JointFit)
     found = {model.__name__: model.predict for model in models}
     return {**found, "Predictor": Predictor.__call__, "learned": JointFit.learned, "fit_array": fit_array}
 
@@ -74,9 +74,9 @@ def test_runs_predict_for_a_receiver_by_name(plain_flat_folder: Path, tmp_path: 
     import wrf_mi
 
     at = [[1.0, 2.0, 0.5]]
-    baseline = wrf_mi.open_baseline(wrf_mi.train_baseline(plain_flat_folder, tmp_path / "mri", "mri"))
-    hybrid = wrf_mi.open_hybrid(wrf_mi.train_hybrid(plain_flat_folder, tmp_path / "hybrid"))
-    np.testing.assert_array_equal(baseline.predict(at, "hall $_$"), baseline.predict(at, 1))
+    baseline = wrf_mi.train(plain_flat_folder, tmp_path / "mri", "mri")
+    hybrid = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, tmp_path / "hybrid", "hybrid").folder)
+    np.testing.assert_array_equal(baseline.predict(at, "hall $_$").mean, baseline.predict(at, 1).mean)
     np.testing.assert_array_equal(hybrid.predict(at, "hall $_$").mean, hybrid.predict(at, 1).mean)
     assert hybrid.predict(at, "hall $_$").mean != hybrid.predict(at, "kitchen").mean
     for model in (baseline, hybrid):

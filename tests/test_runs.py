@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,11 @@ import drjit as dr  # noqa: E402
 
 from wrf_mi.core import InputError, Record, Split  # noqa: E402
 from wrf_mi.fit import trainer  # noqa: E402
+from wrf_mi.fit.checkpoint import read_checkpoint  # noqa: E402
 from wrf_mi.fit.config import TrainConfig  # noqa: E402
-from wrf_mi.fit.folder import load_predictor, read_checkpoint  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
 from wrf_mi.measure import load, load_split, make_splits, write_spectrum_folder  # noqa: E402
-from wrf_mi.report.runs import Interrupted, Run, evaluate_run, resume, train  # noqa: E402
+from wrf_mi.report.runs import Interrupted, Run, evaluate_run, open_run, resume, train  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402
 
 PARALLEL_TOLERANCE = 1e-3
@@ -40,9 +41,7 @@ def log_of(path: Path) -> list[dict[str, Any]]:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
-    arrays = read_checkpoint(path)
-    del arrays["seconds"]
-    return arrays
+    return open_run(path).field.arrays()
 
 
 RESUMED = (
@@ -55,27 +54,50 @@ RESUMED = (
 )
 
 
+def keep_checkpoint(run: Path, progress: Progress) -> None:
+    """Keep the checkpoint of step 32, which is removed when the training has ended."""
+    if progress.step == 35:
+        (run / "kept").mkdir()
+        shutil.copy(run / "checkpoint.npz", run / "kept")
+
+
+def checkpoint_of(run: Path) -> dict[str, np.ndarray]:
+    arrays = read_checkpoint(run / "kept")
+    del arrays["seconds"]
+    return arrays
+
+
 def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -> None:
     with pytest.raises(Interrupted, match=rf"stopped after step {at} of 40; .* train --resume {out}"):
-        train(folder, out, config, stop=stop_after(at))
+        train(folder, out, settings=config, stop=stop_after(at))
     assert not (out / "metrics.json").exists()
     assert int(read_checkpoint(out)["step"]) == at
     assert [entry["step"] for entry in log_of(out)] == [s for s in range(5, 41, 5) if s <= at]
     heard: list[int] = []
-    resume(out, listen=lambda fold, steps, progress: heard.append(progress.step))
+
+    def listen(stage: str, share: float, progress: Progress) -> None:
+        heard.append(progress.step)
+        keep_checkpoint(out, progress)
+
+    resume(out, listen=listen)
     assert heard == [s for s in range(5, 41, 5) if s > at]  # it went on, and did not start anew
 
 
 def test_resumed_run_is_the_same_bit_for_bit(folder: Path, tmp_path: Path) -> None:
     """Stopped after a round of density control, and once more between two; parameters, moments, mean, scores."""
     config = settings(*RESUMED, "deterministic=true")
-    train(folder, tmp_path / "whole", config)
+    train(
+        folder, tmp_path / "whole", settings=config, listen=lambda *said: keep_checkpoint(tmp_path / "whole", said[2])
+    )
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
-    whole, resumed = arrays_of(tmp_path / "whole"), arrays_of(tmp_path / "resumed")
-    assert set(whole) == set(resumed)
-    for name, values in whole.items():
-        np.testing.assert_array_equal(resumed[name], values, err_msg=name)
-    assert whole["param/position"].shape[1] > 8
+    for arrays in (checkpoint_of, arrays_of):
+        whole, resumed = arrays(tmp_path / "whole"), arrays(tmp_path / "resumed")
+        assert set(whole) == set(resumed)
+        for name, values in whole.items():
+            np.testing.assert_array_equal(resumed[name], values, err_msg=name)
+        assert whole["param/position"].shape[1] > 8
+    assert {"first/position", "second/position", "mean/position"} <= set(checkpoint_of(tmp_path / "whole"))
+    assert not (tmp_path / "whole" / "checkpoint.npz").exists()
     scores = [Run(tmp_path / name).metrics for name in ("whole", "resumed")]
     assert scores[0]["ssim"] == scores[1]["ssim"]
     assert [e["step"] for e in log_of(tmp_path / "resumed")] == list(range(5, 41, 5))
@@ -88,7 +110,7 @@ def test_resumed_run_is_the_same_bit_for_bit(folder: Path, tmp_path: Path) -> No
 def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -> None:
     set_threads(max(2, dr.thread_count()))
     config = settings("steps=40", "checkpoint_every=8")
-    train(folder, tmp_path / "whole", config)
+    train(folder, tmp_path / "whole", settings=config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
     greys = [np.load(tmp_path / name / "predictions.npz")["prediction"] for name in ("whole", "resumed")]
     np.testing.assert_allclose(greys[0], greys[1], atol=PARALLEL_TOLERANCE)
@@ -102,17 +124,17 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
     """Lines logged after that checkpoint are not there twice."""
     config = settings("steps=40", "checkpoint_every=8", "deterministic=true")
 
-    def kill(fold: str, steps: int, progress: Progress) -> None:
+    def kill(stage: str, share: float, progress: Progress) -> None:
         if progress.step == 30:
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "killed", config, listen=kill)
+        train(folder, tmp_path / "killed", settings=config, listen=kill)
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 24
     assert log_of(tmp_path / "killed")[-1]["step"] == 30
     resume(tmp_path / "killed")
     assert [e["step"] for e in log_of(tmp_path / "killed")] == list(range(5, 41, 5))
-    train(folder, tmp_path / "whole", config)
+    train(folder, tmp_path / "whole", settings=config)
     for name, values in arrays_of(tmp_path / "whole").items():
         np.testing.assert_array_equal(arrays_of(tmp_path / "killed")[name], values, err_msg=name)
 
@@ -135,30 +157,30 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     broken.observation[0, row, 4, 5] = 2
     monkeypatch.setattr(trainer, "_paper_loss", loss)
     with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
-        train(broken, tmp_path / "broken", config)
+        train(broken, tmp_path / "broken", settings=config)
     monkeypatch.undo()
     assert int(read_checkpoint(tmp_path / "broken")["step"]) == step - 1
     resume(tmp_path / "broken")
-    train(folder, tmp_path / "whole", config)
+    train(folder, tmp_path / "whole", settings=config)
     for name, values in arrays_of(tmp_path / "whole").items():
         np.testing.assert_array_equal(arrays_of(tmp_path / "broken")[name], values, err_msg=name)
 
 
 def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_path: Path) -> None:
-    def kill(fold: str, steps: int, progress: Progress) -> None:
+    def kill(stage: str, share: float, progress: Progress) -> None:
         raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "run", settings("steps=10"), listen=kill)
+        train(folder, tmp_path / "run", settings=settings("steps=10"), listen=kill)
     assert not (tmp_path / "run" / "checkpoint.npz").exists()
-    with pytest.raises(InputError, match=r"no checkpoint\.npz, the run was stopped early"):
-        load_predictor(tmp_path / "run")
+    with pytest.raises(InputError, match=r"model\.npz: missing, the fit was stopped; finish it with train"):
+        open_run(tmp_path / "run").predictor()
     resume(tmp_path / "run")
     assert [e["step"] for e in log_of(tmp_path / "run")] == [5, 10]
 
 
 def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None:
-    before = train(folder, tmp_path / "run", settings("steps=10")).metrics
+    before = train(folder, tmp_path / "run", settings=settings("steps=10")).metrics
     arrays = arrays_of(tmp_path / "run")
     (tmp_path / "run" / "metrics.json").unlink()
     after = resume(tmp_path / "run").metrics
@@ -168,12 +190,12 @@ def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None
 
 
 def test_run_folder_says_all(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = train(folder, tmp_path / "run", settings("steps=10", "seed=3"), split="random", n_train=0.5)
+    run = train(folder, tmp_path / "run", settings=settings("steps=10", "seed=3"), split="random", n_train=0.5)
     assert sorted(p.name for p in run.folder.iterdir()) == [
-        "checkpoint.npz",
         "config.yaml",
         "log.jsonl",
         "metrics.json",
+        "model.npz",
         "predictions.npz",
         "split.npz",
     ]
@@ -206,7 +228,7 @@ def test_run_folder_says_all(folder: Path, tmp_path: Path, one_gateway: Record) 
 
 def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_path: Path) -> None:
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    run = train(data, tmp_path / "run", settings("steps=20"))
+    run = train(data, tmp_path / "run", settings=settings("steps=20"))
     m = run.metrics
     assert list(m["receivers"]) == ["gateway1", "gateway2"]
     with np.load(run.folder / "predictions.npz") as stored:
@@ -227,7 +249,7 @@ def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_pat
 
 @pytest.fixture(scope="module")
 def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(folder, tmp_path_factory.mktemp("runs") / "finished", settings("steps=10"), n_train=10).folder
+    return train(folder, tmp_path_factory.mktemp("runs") / "finished", settings=settings("steps=10"), n_train=10).folder
 
 
 def copy_of(run: Path, to: Path) -> Path:
@@ -237,31 +259,35 @@ def copy_of(run: Path, to: Path) -> Path:
     return to
 
 
-def test_damaged_checkpoints(finished: Path, tmp_path: Path) -> None:
+def predictor(run: Path) -> Any:
+    return open_run(run).predictor()
+
+
+def test_damaged_models(finished: Path, tmp_path: Path) -> None:
     run = copy_of(finished, tmp_path / "run")
-    path = run / "checkpoint.npz"
+    path = run / "model.npz"
     whole = path.read_bytes()
     for content in (whole[: len(whole) // 2], b"", b"no archive"):
         path.write_bytes(content)
-        for use in (load_predictor, resume, evaluate_run):
-            with pytest.raises(InputError, match=r"checkpoint\.npz: not readable") as caught:
+        for use in (predictor, resume, evaluate_run):
+            with pytest.raises(InputError, match=r"model\.npz: not readable") as caught:
                 use(run)
             assert "\n" not in str(caught.value)
     path.write_bytes(whole)
     with np.load(path) as stored:
         arrays = dict(stored)
-    np.savez(path, **(arrays | {"format": np.asarray(99)}))
-    with pytest.raises(InputError, match="format 99, this version reads 3"):
-        load_predictor(run)
+    np.savez(path, **(arrays | {"run/format": np.asarray(99)}))
+    with pytest.raises(InputError, match="format 99, this version reads 2"):
+        predictor(run)
     path.unlink()
-    with pytest.raises(InputError, match=r"no checkpoint\.npz"):
-        load_predictor(run)
+    with pytest.raises(InputError, match=r"model\.npz: missing"):
+        predictor(run)
 
 
 def test_damaged_configurations(finished: Path, tmp_path: Path) -> None:
     run = copy_of(finished, tmp_path / "run")
     path = run / "config.yaml"
-    for content in ("settings: [1", "just text", "", "dataset: x\n"):
+    for content in ("settings: [1", "just text", "", "format: 2\ndataset: x\n"):
         path.write_text(content)
         with pytest.raises(InputError, match=r"config\.yaml: not readable") as caught:
             resume(run)
@@ -299,7 +325,7 @@ def test_no_unseen_row(folder: Path, tmp_path: Path, one_gateway: Record) -> Non
     """Official training rows hold all test rows of this random split."""
     split, other = official(one_gateway), make_splits(one_gateway, "random")[0]
     assert np.isin(other.test, split.all_train).all()
-    train(folder, tmp_path / "run", settings("steps=1"))
+    train(folder, tmp_path / "run", settings=settings("steps=1"))
     with pytest.raises(InputError, match="trained on all test rows of split random; nothing is left to score"):
         evaluate_run(tmp_path / "run", "random")
 
@@ -307,8 +333,8 @@ def test_no_unseen_row(folder: Path, tmp_path: Path, one_gateway: Record) -> Non
 def test_unfinished_runs_have_no_scores(folder: Path, tmp_path: Path) -> None:
     """Metrics mark a run as finished."""
     with pytest.raises(Interrupted):
-        train(folder, tmp_path / "run", settings("steps=40"), stop=stop_after(10))
-    with pytest.raises(InputError, match="run: stopped after step 10 of 40; finish it with train --resume"):
+        train(folder, tmp_path / "run", settings=settings("steps=40"), stop=stop_after(10))
+    with pytest.raises(InputError, match=r"run.model\.npz: missing, the fit was stopped; finish it with train"):
         evaluate_run(tmp_path / "run")
     assert not (tmp_path / "run" / "metrics.json").exists()
 
@@ -330,7 +356,7 @@ def test_rows_that_the_record_has_not(finished: Path, tmp_path: Path, one_gatewa
     split = official(one_gateway)
     for own in (replace(split, train=np.append(split.train, 24)), replace(split, test=np.array([-1]))):
         with pytest.raises(InputError, match=r"split official: row (24|-1), but made-here has rows 0 to 23"):
-            train(one_gateway, tmp_path / "run", settings("steps=5"), split=own)
+            train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=own)
     assert not (tmp_path / "run").exists()
     # A data set that has become shorter since.
     run = copy_of(finished, tmp_path / "copy")
@@ -347,7 +373,7 @@ def test_rows_that_the_record_has_not(finished: Path, tmp_path: Path, one_gatewa
 
 
 def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = train(folder, tmp_path / "run", settings("steps=5"), split="blocked")
+    run = train(folder, tmp_path / "run", settings=settings("steps=5"), split="blocked")
     m = run.metrics
     assert (m["split"], m["n_train"], m["n_test"]) == ("blocked", 16, 24)
     parts = [Run(run.folder / f"fold{k}").metrics for k in range(3)]
@@ -365,17 +391,17 @@ def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: 
     assert again["train_seconds"] == m["train_seconds"]
     with pytest.raises(InputError, match="every row is held out in one of its folds"):
         evaluate_run(run.folder, "random")
-    with pytest.raises(InputError, match="one field for each block; choose one"):
+    with pytest.raises(InputError, match="one model for each block; choose one"):
         run.predictor()
     assert Run(run.folder / "fold1").predictor()(one_gateway.tx_pos_m[:1]).shape == (1, *SIZE)
 
 
 def test_blocked_run_goes_on_in_the_fold_where_it_was_stopped(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(Interrupted, match=rf"stopped after step 4 of 5; .* train --resume {tmp_path / 'run'}"):
-        train(folder, tmp_path / "run", settings("steps=5"), split="blocked", stop=stop_after(8))
+        train(folder, tmp_path / "run", settings=settings("steps=5"), split="blocked", stop=stop_after(8))
     assert (tmp_path / "run" / "fold0" / "metrics.json").exists()
     assert not (tmp_path / "run" / "fold1" / "metrics.json").exists()
-    with pytest.raises(InputError, match="fold1: stopped after step 4 of 5; finish it with train --resume"):
+    with pytest.raises(InputError, match=r"fold1.model\.npz: missing, the fit was stopped; finish it with train"):
         evaluate_run(tmp_path / "run")
     m = resume(tmp_path / "run").metrics
     assert m["n_test"] == 24
@@ -387,16 +413,16 @@ def test_folders_that_hold_something_are_left_alone(folder: Path, tmp_path: Path
     (tmp_path / "run" / "mine.txt").write_text("mine")
     for split in ("official", "blocked"):
         with pytest.raises(InputError, match="exists and is not empty"):
-            train(folder, tmp_path / "run", settings("steps=5"), split=split)
+            train(folder, tmp_path / "run", settings=settings("steps=5"), split=split)
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["mine.txt"]
     with pytest.raises(InputError, match="exists and is not empty"):
-        train(folder, tmp_path / "run" / "mine.txt", settings("steps=5"))
+        train(folder, tmp_path / "run" / "mine.txt", settings=settings("steps=5"))
 
 
 def test_rows_of_ones_own_train(one_gateway: Record, tmp_path: Path) -> None:
     """A record in memory and a split by hand, without validation rows."""
     split = Split("mine", 0, np.arange(10), np.arange(0), np.arange(20, 24))
-    run = train(one_gateway, tmp_path / "run", settings("steps=5"), split=split)
+    run = train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=split)
     assert (run.metrics["split"], run.metrics["n_train"], run.metrics["n_test"]) == ("mine", 10, 4)
     # Standard JSON knows no NaN.
     for name in ("log.jsonl", "metrics.json"):

@@ -18,7 +18,7 @@ from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receive import rssi_dbm
 from wrf_mi.receive.instruments import SpectrumInstrument
-from wrf_mi.report.traced import CONVERGENCE, trace_run
+from wrf_mi.report.runs import train
 from wrf_mi.trace import TraceOptions, trace_paths
 from wrf_mi.trace.target import choose_options, remainder
 
@@ -104,12 +104,12 @@ def test_run_states_its_convergence(tmp_path: Path) -> None:
         official=(rows[:4], rows[4:]),
         frequencies_hz=np.array([FREQUENCY_HZ]),
     )
-    options = TraceOptions(scattering=False)
-    folder = trace_run(scene, record, tmp_path / "run", options, target_error_db=4.0, kinds=())
-    stated = json.loads((folder / CONVERGENCE).read_text())
+    settings = ("target_error_db=4", "target_kinds=")
+    folder = train(record, tmp_path / "run", "ray-tracing", scene=scene, settings=settings).folder
+    stated = json.loads((folder / "convergence.json").read_text())
     assert stated["target_db"] == 4.0
     assert stated["error_db"] <= 4.0
-    assert stated["options"] == yaml.safe_load((folder / "config.yaml").read_text())["options"]
+    assert stated["options"].items() <= yaml.safe_load((folder / "config.yaml").read_text())["settings"].items()
     assert [t["value"] for t in stated["trials"] if t["part"] == "depth"][:2] == [1, 2]
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from wrf_mi.report.watch import Stages
+from wrf_mi.report.watch import Watch
 
 
 def test_stages_are_named_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with Stages() as stages:
+    with Watch() as stages:
         for what, share in (("a", 0.0), ("a", 0.5), ("b", 0.1), ("b", 1.0)):
             stages.listen(what, share)
     assert capsys.readouterr().err.splitlines() == ["a", "b"]
@@ -17,7 +17,7 @@ def test_stages_are_named_once(capsys: pytest.CaptureFixture[str]) -> None:
 def test_stages_show_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("FORCE_COLOR", "1")
-    with Stages() as stages:
+    with Watch() as stages:
         stages.listen("first", 0.5)
         stages.listen("second", 1.0)
     shown = capsys.readouterr().err

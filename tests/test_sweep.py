@@ -18,7 +18,7 @@ from calling import SET, call, refused
 
 from wrf_mi.core import InputError
 from wrf_mi.report import sweep as module
-from wrf_mi.report.run_folder import read_run
+from wrf_mi.report.results import read_run
 from wrf_mi.report.sweep import check_failures, plan_sweep, run_sweep, sweep_table
 
 SECONDS = 60
@@ -71,7 +71,11 @@ def test_bad_input_is_refused_before_anything_starts(
         (folder, ["scene=a,b"], "carrier frequency unknown"),
         (folder, ["model=hybrid", "steps=1"], "steps"),
         (folder, ["model=hybrid", "n-train=0,4"], "nothing to predict from"),
-        (flat_folder, ["model=factorised", "seed=0,1"], "learned fields are fitted to spectra"),
+        (
+            flat_folder,
+            ["model=factorised", "seed=0,1"],
+            "holds rssi; factorised serves spectrum, so choose another model",
+        ),
         (flat_folder, ["model=ray-tracing", "scene=nowhere"], "nowhere"),
         (tmp_path / "none", ["seed=0,1"], "none"),
     ):

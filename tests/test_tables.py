@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from wrf_mi.baselines.models import METHODS
 from wrf_mi.core import InputError
+from wrf_mi.models import MODELS
 from wrf_mi.report import table_pages, tables
 from wrf_mi.report.bench import BenchFailed
 from wrf_mi.report.table_plan import PARTS, QUICK_PARTS, Row, plan
@@ -46,7 +46,7 @@ def test_every_method_of_the_paper_is_planned_for_its_task():
         assert names <= {row.method for row in plan() if row.part.task == task and row.share == 1}
     for row in plan():
         model = row.entry.arguments[row.entry.arguments.index("--model") + 1]
-        assert model in {*METHODS, "hybrid", "ray-tracing", "wrf-gs", "wrf-gs+"}
+        assert model in MODELS
 
 
 def test_names_are_unique_and_whole_tables_come_first():

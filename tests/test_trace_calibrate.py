@@ -1,7 +1,6 @@
 """Calibration finds what made the measurements, and says what cannot be calibrated."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,6 @@ from wrf_mi.trace.calibration import (
     calibrated_rssi,
     harmonics,
     in_body,
-    load_calibration,
-    save_calibration,
     with_materials,
 )
 
@@ -129,22 +126,6 @@ def test_harmonics_are_orthonormal_and_real():
     np.testing.assert_allclose(values[1, :5], sph_harm_y(1, 0, theta, phi).real, atol=1e-6)
     assert harmonics(directions, 0).shape == (0, len(directions))
     np.testing.assert_allclose(in_body(np.array([[0.0, 1, 0]]), np.array([np.pi / 2])), [[1, 0, 0]], atol=1e-12)
-
-
-def test_a_file_gives_back_what_was_written(tmp_path: Path):
-    truth = flat(tx_pattern_db=np.arange(3.0), rx_pattern_db=np.ones((2, 8)), materials={"itu_brick": TRUE_BRICK})
-    read = load_calibration(save_calibration(tmp_path / "calibration.json", truth))
-    for name in ("offset_db", "tx_pattern_db", "rx_pattern_db"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(truth, name))
-    assert read.materials == truth.materials
-    empty = load_calibration(save_calibration(tmp_path / "empty.json", flat()))
-    assert empty.rx_pattern_db.shape == (2, 0)
-    for text, words in (("{", "not a readable"), ('{"format": 9}', "format 9"), ("{}", "not a readable")):
-        (tmp_path / "bad.json").write_text(text)
-        with pytest.raises(InputError, match=words):
-            load_calibration(tmp_path / "bad.json")
-    with pytest.raises(InputError, match="missing; calibrate first"):
-        load_calibration(tmp_path / "none.json")
 
 
 def test_what_cannot_be_calibrated(traced: TraceResult, scene: Any):

@@ -17,7 +17,7 @@ from traced_rooms import SHOEBOX, write_xml
 from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.measure import write_spectrum_folder
-from wrf_mi.report.traced import TracedRun, trace_run
+from wrf_mi.report.runs import open_run, train
 from wrf_mi.tasks import instrument_of
 from wrf_mi.trace import TraceOptions, load_trace, open_scene, trace_paths
 from wrf_mi.trace.polarization import GAIN_DB, cross_polarized
@@ -86,7 +86,7 @@ def test_turning_the_frame_about_its_normal_rolls_the_spectrum(scene: Any) -> No
 def test_a_turned_array_is_traced_as_it_measured(
     xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert median(trace_run(xml, turned_folder, tmp_path / "run", OPTIONS)) > 0.99
+    assert median(train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS).folder) > 0.99
     assert "polarisation" not in caplog.text
 
 
@@ -157,18 +157,18 @@ def test_a_run_predicts_with_the_antennas_that_it_was_traced_with(
 ) -> None:
 
     antennas = AntennaOptions(rx_pattern="tr38901", rx_frame="array", rx_polarization="H", tx_pattern="dipole")
-    out = trace_run(xml, turned_folder, tmp_path / "run", OPTIONS, antennas=antennas)
+    out = train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas).folder
     tx = places()
     with np.load(out / "predictions.npz") as stored:
-        np.testing.assert_allclose(TracedRun(out).predict(tx[stored["row"]])[0], stored["prediction"], atol=1e-4)
+        np.testing.assert_allclose(open_run(out).predict(tx[stored["row"]]).mean, stored["prediction"], atol=1e-4)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--model", "wrf-gs+", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
-        (["--model", "kriging", "--tx-pattern", "dipole"], "a scene belongs to --model ray-tracing or hybrid"),
-        (["--model", "hybrid", "--rx-polarization", "H"], "without --scene nothing is traced"),
+        (["--model", "kriging", "--tx-pattern", "dipole"], "antenna options belong to a scene that is traced"),
+        (["--model", "hybrid", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
     ],
 )
 def test_antenna_options_are_refused_where_nothing_is_traced(
@@ -181,9 +181,9 @@ def test_antenna_options_are_refused_where_nothing_is_traced(
 
 
 def test_a_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
-
+    antennas = AntennaOptions(rx_pattern="tr38901")
     with pytest.raises(InputError, match="state frame array"):
-        trace_run(xml, turned_folder, tmp_path / "run", OPTIONS, antennas=AntennaOptions(rx_pattern="tr38901"))
+        train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas)
     assert not (tmp_path / "run").exists()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import call
+from calling import call, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,11 +18,10 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import InputError, Record
 from wrf_mi.measure import load
-from wrf_mi.report import traced
+from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.report.compare import compare
-from wrf_mi.report.run_folder import read_run
-from wrf_mi.report.runs import evaluate_run, predict_to_file
-from wrf_mi.report.traced import trace_run
+from wrf_mi.report.results import read_run
+from wrf_mi.report.runs import evaluate_run, predict_to_file, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.trace import TraceOptions, load_trace, solve
@@ -31,6 +30,7 @@ from wrf_mi.trace.options import with_kinds
 from wrf_mi.trace.tracer import RayTracer
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
+CALIBRATED = TracingSettings(reflection=False, max_depth=0, calibration="patterns")
 FLOAT32_DB = 1e-4
 """Predictions are stored as float32; gains come from float32 amplitudes."""
 
@@ -43,7 +43,9 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trace_run(room, flat_folder, tmp_path_factory.mktemp("runs") / "traced", DIRECT)
+    return train(
+        flat_folder, tmp_path_factory.mktemp("runs") / "traced", "ray-tracing", scene=room, settings=DIRECT
+    ).folder
 
 
 def friis_dbm(record: Record) -> np.ndarray:
@@ -75,7 +77,7 @@ def test_scoring_again_needs_no_tracing_and_says_the_same(run: Path, monkeypatch
         assert again[key] == before[key], key
     assert (run / "predictions.npz").read_bytes() == predictions
     other = evaluate_run(run, "trajectory")
-    assert other["split"] == "trajectory"
+    assert other["split"] == "trajectory (rows unseen by official)"
     assert json.loads((run / "metrics.json").read_text())["split"] == "official"
 
 
@@ -89,7 +91,9 @@ def test_saved_paths_are_those_of_the_record(flat_folder: Path, run: Path) -> No
 
 @pytest.fixture(scope="module")
 def calibrated(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trace_run(room, flat_folder, tmp_path_factory.mktemp("runs") / "calibrated", DIRECT, calibration="patterns")
+    return train(
+        flat_folder, tmp_path_factory.mktemp("runs") / "calibrated", "ray-tracing", scene=room, settings=CALIBRATED
+    ).folder
 
 
 def asked_rows(run: Path, record: Record, file: Path, heading: np.ndarray | None) -> Path:
@@ -145,8 +149,8 @@ def test_calibrated_run_of_data_without_headings_predicts_without(
 ) -> None:
     """Its pattern is fitted in the frame of the world."""
     record = replace(load(flat_folder), tx_heading_rad=None)
-    monkeypatch.setattr(traced, "load_record", lambda name: record)
-    run = trace_run(room, record, tmp_path / "run", DIRECT, calibration="patterns")
+    monkeypatch.setattr("wrf_mi.trace.load_record", lambda name: record)
+    run = train(record, tmp_path / "run", "ray-tracing", scene=room, settings=CALIBRATED).folder
     read = read_run(run)
     predict_to_file(run, record.tx_pos_m[read.row], tmp_path / "p.npz")
     with np.load(tmp_path / "p.npz") as stored:
@@ -164,10 +168,9 @@ def test_calibration_is_kept_and_scores_again(
     assert read.metrics["train_seconds"] > 0
     assert not np.allclose(read.prediction, read_run(run).prediction, atol=0.1)
     assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
-    with pytest.raises(InputError, match="calibrated on the training rows of official"):
-        evaluate_run(out, "random")
-    with pytest.raises(InputError, match="unknown; choose from patterns, all"):
-        trace_run(room, flat_folder, tmp_path / "other", DIRECT, calibration="everything")
+    assert evaluate_run(out, "random")["split"] == "random (rows unseen by official)"
+    with pytest.raises(InputError, match="setting calibration: 'everything'; choose from patterns, all"):
+        train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 
 
 def test_rays_are_counted_once_for_a_run(
@@ -182,7 +185,9 @@ def test_rays_are_counted_once_for_a_run(
         return converged(*arguments)
 
     monkeypatch.setattr(solve, "converged_rays", counted)
-    out = trace_run(room, flat_folder, tmp_path / "run", TraceOptions(max_depth=1, rays="auto"))
+    out = train(
+        flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(max_depth=1, rays="auto")
+    ).folder
     assert len(calls) == 1
     before = read_run(out).metrics
     assert evaluate_run(out)["abs_error_db"] == before["abs_error_db"]
@@ -191,7 +196,7 @@ def test_rays_are_counted_once_for_a_run(
 
 
 def test_every_block_is_held_out_in_turn(flat_folder: Path, room: Path, tmp_path: Path) -> None:
-    out = trace_run(room, flat_folder, tmp_path / "run", DIRECT, split="blocked")
+    out = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked").folder
     read = read_run(out)
     assert sorted(read.row) == list(range(len(load(flat_folder))))
     assert len(list(out.glob("fold*/split.npz"))) == 5
@@ -229,17 +234,21 @@ def test_train_and_trace_are_one_for_the_ray_tracer(
     status, out, err = call([*named, "--scene", room, "--paths", "line-of-sight", "--depth", "0"], capsys)
     assert status == 0, err
     assert json.loads(out)["abs_error_db"] == read_run(run).metrics["abs_error_db"]
-    for wrong in (named, [*named, "--scene", room, "--set", "steps=1"], ["train", flat_folder, "--depth", "1"]):
-        status, _, err = call(wrong, capsys)
-        assert (status, err.count("\n")) == (2, 1)
-        assert "ray-tracing" in err
+    named[-2] = tmp_path / "other"
+    for wrong, message in (
+        (named, "ray-tracing needs a scene; give --scene SCENE"),
+        ([*named, "--scene", room, "--set", "steps=1"], "unknown setting steps"),
+        (["train", flat_folder, "--depth", "1", "--out", tmp_path / "other"], "belong to --model ray-tracing"),
+    ):
+        refused(wrong, message, capsys)
+        assert not (tmp_path / "other").exists()
 
 
 def test_comparison_shows_the_scene_while_it_is_there(
     flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7)
-    run = trace_run(scene.folder, flat_folder, tmp_path / "run", DIRECT)
+    run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=scene.folder, settings=DIRECT).folder
     assert "Mesh, traced paths" in compare([run], tmp_path / "with").read_text()
     with Image.open(tmp_path / "with" / "flat-scene.png") as picture:
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
@@ -254,7 +263,7 @@ def test_comparison_shows_the_scene_while_it_is_there(
 def test_traced_spectra_are_those_of_the_array(folder: Path, tmp_path: Path) -> None:
     """A spectrum's instrument is known only where the data state carrier and array."""
     with pytest.raises(InputError, match="carrier frequency unknown; state frequency_hz in its gateway_info"):
-        trace_run("laboratory", folder, tmp_path / "run")
+        train(folder, tmp_path / "run", "ray-tracing", scene="laboratory")
     assert not (tmp_path / "run").exists()
 
 

@@ -14,18 +14,15 @@ if TYPE_CHECKING:
     from .fit.config import TrainConfig, with_settings
     from .fit.trainer import Trainer
     from .measure import fetch, make_splits
-    from .report.baseline_run import open_baseline, train_baseline
     from .report.compare import compare
     from .report.figures import spectrum_table
-    from .report.hybrid_run import open_hybrid, train_hybrid
-    from .report.runs import Run, evaluate_run, resume, train
-    from .report.traced import trace_run
+    from .report.runs import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .report.view import scene_view
     from .scene.make import make_scene
     from .trace import TraceOptions
     from .trace import load_record as load
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "BackendError": "core",
@@ -43,15 +40,12 @@ _HOME = {
     "load": "trace:load_record",
     "make_scene": "scene.make",
     "make_splits": "measure",
-    "open_baseline": "report.baseline_run",
-    "open_hybrid": "report.hybrid_run",
+    "open_run": "report.runs",
+    "predict_to_file": "report.runs",
     "resume": "report.runs",
     "scene_view": "report.view",
     "spectrum_table": "report.figures",
-    "trace_run": "report.traced",
     "train": "report.runs",
-    "train_baseline": "report.baseline_run",
-    "train_hybrid": "report.hybrid_run",
     "with_settings": "fit.config",
 }
 
@@ -71,15 +65,12 @@ __all__ = [
     "load",
     "make_scene",
     "make_splits",
-    "open_baseline",
-    "open_hybrid",
+    "open_run",
+    "predict_to_file",
     "resume",
     "scene_view",
     "spectrum_table",
-    "trace_run",
     "train",
-    "train_baseline",
-    "train_hybrid",
     "with_settings",
 ]
 

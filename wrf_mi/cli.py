@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from . import __version__
-from .baselines.models import METHODS
 from .cli_bench import bench_command
 from .cli_train import print_json, progress_bar, show_metrics, sweep_command, trace_command, train_command
 from .core import BackendError, InputError
 from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from .core.files import os_failure
+from .models import MODELS
 
 Arguments = argparse.Namespace
 
@@ -203,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--positions", metavar="CSV", help=text)
     sub.add_argument("--replace", action="store_true", help="take the place of an existing scene folder")
 
-    text = "fit a field to measured spectra, or a hybrid or a baseline to any measurements, and score it"
+    text = "fit a model to measurements and score it"
     sub = command("train", train_command, text)
     _add_training(sub)
     sub.add_argument("--out", metavar="RUN", help="run folder to make")
@@ -285,11 +285,10 @@ def _add_training(sub: Any) -> None:
     sub.add_argument(
         "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
     )
-    models = list(dict.fromkeys(("wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", *METHODS)))
-    sub.add_argument("--model", choices=models, help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
+    sub.add_argument("--model", choices=list(MODELS), help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
     text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for hybrid, or alone for ray-tracing"
     sub.add_argument("--scene", metavar="SCENE", help=text)
-    text = "of a field of spectra: pixel (magnitude at each direction) or array (element signals); default: by --scene"
+    text = "receiver model; of spectra pixel (magnitude at each direction) or array (element signals; default with --scene)"
     sub.add_argument("--receiver", metavar="NAME", help=text)
     _add_tracing(sub)
     sub.add_argument(
@@ -309,8 +308,8 @@ def _add_tracing(sub: Any) -> None:
     sub.add_argument("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
     sub.add_argument("--depth", type=int, metavar="N", help="interactions per path at most (default: 3)")
     sub.add_argument("--reflections", type=int, metavar="N", help="of these reflections at most (default: all)")
-    fit = "fit antenna patterns, or materials too, to the training rows (signal strengths)"
-    sub.add_argument("--calibrate", choices=("patterns", "all"), help=fit)
+    fit = "train on the training rows, separated by commas: gain, materials, planes, patterns, pose"
+    sub.add_argument("--calibrate", metavar="LIST", help=fit)
     sub.add_argument("--rays", metavar="N", help="that search from each source, or auto: until no more paths are found")
     stated = "in place of what the data state, which is by default"
     of_receivers = f"pattern of the receivers' antennas {stated} iso"

@@ -34,7 +34,7 @@ class GaussianEmitter(mi.Emitter):
     parameter        type         unit default  differentiable  meaning
     ================ ============ ==== ======== =============== =====================================================
     ``run``          string            required no              run folder made by ``wrf-mi train`` (or its
-                                                                ``checkpoint.npz``), looked for beside the scene file
+                                                                ``model.npz``), looked for beside the scene file
     ``tx_position``  point        m    required yes             transmitter, world frame
     (weights)        tensor            of run   yes             each of the field's parameters by name, dots as
                                                                 underscores; ``position``, ``log_scale`` and

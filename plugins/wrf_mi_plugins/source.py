@@ -19,8 +19,8 @@ from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.field.gaussians import Gaussians  # noqa: E402
 from wrf_mi.field.models import GEOMETRY  # noqa: E402
-from wrf_mi.fit.folder import CHECKPOINT, read_checkpoint, read_config  # noqa: E402
-from wrf_mi.fit.trainer import final_params, make_field  # noqa: E402
+from wrf_mi.report.run_folder import FITTED  # noqa: E402
+from wrf_mi.report.runs import open_run  # noqa: E402
 
 
 @dataclass
@@ -83,6 +83,5 @@ def source_from_properties(props: Any) -> FieldSource:
         if key not in props:
             raise InputError(f"{name}: no {key}; give {what}")
     path = Path(str(mi.file_resolver().resolve(props["run"])))
-    folder = path.parent if path.name == CHECKPOINT else path
-    field = make_field(read_config(folder).settings)
-    return source_of(field, final_params(read_checkpoint(folder)), list(props["tx_position"]))
+    trained = open_run(path.parent if path.name == FITTED else path).field
+    return source_of(trained.field, trained.params, list(props["tx_position"]))

@@ -1,18 +1,42 @@
-"""What every baseline is spared: data that it does not serve, and inputs that it cannot predict from."""
+"""Data that a model does not serve, and inputs that it cannot predict from."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Protocol
 
 import numpy as np
 
 from ..core import InputError, Record
 from ..measure.observations import count_not_finite, place_of
 from ..tasks import task_of
-from .method import Inputs, Method
+from .method import Inputs
 
 
-def check_record(method: Method, record: Record, others: Iterable[Method] = ()) -> None:
+class Served(Protocol):
+    """What these checks know of a model or `Method`."""
+
+    @property
+    def name(self) -> str:
+        """As in ``wrf-mi train --model``."""
+        ...
+
+    @property
+    def tasks(self) -> tuple[str, ...] | None:
+        """Tasks that it serves; None: all."""
+        ...
+
+    @property
+    def needs_uplink(self) -> bool:
+        """Whether it predicts from the uplink alone."""
+        ...
+
+    def serves(self, task: str) -> bool:
+        """Whether it serves a task."""
+        ...
+
+
+def check_record(method: Served, record: Record, others: Iterable[Served] = ()) -> None:
     """Refuse a record that a method does not serve, or whose parts do not fit together.
 
     Args:
@@ -25,7 +49,8 @@ def check_record(method: Method, record: Record, others: Iterable[Method] = ()) 
             frequencies that differ.
     """
     if not method.serves(record.task):
-        served = " and ".join(method.tasks or ())
+        *most, last = method.tasks or ("nothing",)
+        served = f"{', '.join(most)} and {last}" if most else last
         able = [other.name for other in others if other.serves(record.task)]
         named = f": {', '.join(able)}" if able else ""
         text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
@@ -37,7 +62,7 @@ def check_record(method: Method, record: Record, others: Iterable[Method] = ()) 
     task_of(record).check(record)
 
 
-def check_inputs(inputs: Inputs, record: Record, method: Method) -> None:
+def check_inputs(inputs: Inputs, record: Record, method: Served) -> None:
     """Refuse inputs that a model fitted to a record cannot predict from.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What every baseline is: a name, settings, a fit and a loader; what it predicts from are `Inputs`."""
+"""What a model predicts from (`Inputs`), and the short form of a model: one fitted to a record's rows alone."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ class Inputs:
         tx_pos_m: positions of the moving end [m, 3], metres; NaN where the data do not tell.
         tx_heading_rad: how the transmitter is turned [m], or None.
         uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
+        first_row: number of the first row, for messages.
     """
 
     tx_pos_m: FloatArray
     tx_heading_rad: FloatArray | None = None
     uplink: NDArray[Any] | None = None
+    first_row: int = 0
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -41,6 +43,7 @@ class Inputs:
             self.tx_pos_m[chosen],
             None if heading is None else heading[chosen],
             None if uplink is None else uplink[chosen],
+            self.first_row + (chosen.start or 0),
         )
 
 
@@ -53,7 +56,7 @@ def inputs_of(record: Record, rows: IntArray) -> Inputs:
 
 
 class Fitted(Protocol):
-    """A fitted baseline."""
+    """What a `Method` has fitted."""
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """What the receiver of that index observes, [m, ...] as in `wrf_mi.core.Record`."""
@@ -66,7 +69,7 @@ class Fitted(Protocol):
 
 @dataclass(frozen=True)
 class Method:
-    """One baseline.
+    """A model that is fitted to a record's rows in one go, see `wrf_mi.models.Model` for all others.
 
     Attributes:
         name: as in ``wrf-mi train --model``.

@@ -411,10 +411,12 @@ def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
 
 def _convert(value: Any, kind: Any, name: str, source: str) -> Any:
     choices = typing.get_args(kind)
-    if types.NoneType in choices:  # X | None
-        if value is None:
-            return None
-        (kind,) = (choice for choice in choices if choice is not types.NoneType)
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):  # X | None, int | Literal["auto"]
+        words = [word for choice in choices for word in typing.get_args(choice)]
+        if (value is None and types.NoneType in choices) or value in words:
+            return value
+        kind = next(choice for choice in choices if choice is not types.NoneType)
+        choices = typing.get_args(kind)
     if typing.get_origin(kind) is typing.Literal:
         if value not in choices:
             raise InputError(f"{source}, setting {name}: {value!r}; choose from {', '.join(map(str, choices))}")

@@ -7,9 +7,8 @@ the group `ENTRY_POINTS` that names a `ReceiverKind`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver
 from ..core.angles import FloatArray
+from ..core.registry import Registry
 from ..hybrid.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
@@ -170,32 +170,24 @@ def _csi(form: Form, receiver: Receiver) -> CsiReceiver:
     return CsiReceiver(*form.size, tones, elements, form.basis)
 
 
-class _Receivers(Mapping[str, ReceiverKind]):
-    """Receiver models by name: those of this package and of installed ones."""
-
-    def __init__(self, *own: ReceiverKind) -> None:
-        self._known = {kind.name: kind for kind in own}
-        self._others = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
-
-    def __getitem__(self, name: str) -> ReceiverKind:
-        if name not in self._known:
-            self._known[name] = self._others[name].load()
-        return self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**self._known, **self._others})
-
-    def __len__(self) -> int:
-        return len(self._known | self._others)
-
-
-RECEIVERS: Mapping[str, ReceiverKind] = _Receivers(
+_OWN = (
     ReceiverKind(PIXEL, ("spectrum",), _pixel),
     ReceiverKind("array", ("spectrum",), _array, needs_array=True, needs_carrier=True),
     ReceiverKind("power", ("rssi",), _power, levels=True),
     ReceiverKind("csi", ("csi",), _csi, levels=True, complex_valued=True),
 )
+_RECEIVERS = Registry[ReceiverKind]("receiver model", ENTRY_POINTS, {kind.name: kind for kind in _OWN})
+RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS
 """Every receiver model by its name."""
+
+
+def register(kind: ReceiverKind) -> None:
+    """Add a receiver model for this process; an installed package names it by an entry point of `ENTRY_POINTS`.
+
+    Raises:
+        InputError: a name that is taken.
+    """
+    _RECEIVERS.add(kind.name, kind)
 
 
 def receiver_kind(name: str, task: str) -> ReceiverKind:

@@ -76,29 +76,38 @@ def kind_of(record: Record, with_scene: bool) -> HybridKind:
         with_scene: whether a mesh of the place is given.
 
     Raises:
-        InputError: a task that none serves.
+        InputError: a task that none serves, or channels of receivers with several antennas.
     """
     if record.task not in KINDS:
         raise InputError(f"{record.name}: holds {record.task}; no hybrid predicts that")
-    return KINDS[record.task](record, with_scene)
+    check_antennas(record)
+    return KINDS[record.task](with_scene)
 
 
-def _for_rssi(record: Record, with_scene: bool) -> HybridKind:
+def check_antennas(record: Record) -> None:
+    """Refuse channels of receivers with several antennas.
+
+    Raises:
+        InputError: naming their number.
+    """
+    if record.task == "csi" and record.observation.ndim != 3:
+        antennas = record.observation.shape[2]
+        raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
+
+
+def _for_rssi(with_scene: bool) -> HybridKind:
     from .rssi import RssiHybrid, RssiSettings, fit_rssi
 
     return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
 
 
-def _for_csi(record: Record, with_scene: bool) -> HybridKind:
-    if record.observation.ndim != 3:
-        antennas = record.observation.shape[2]
-        raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
+def _for_csi(with_scene: bool) -> HybridKind:
     from .csi import CsiHybrid, CsiSettings, fit_csi
 
     return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays, uses_antennas=False)
 
 
-def _for_spectra(record: Record, with_scene: bool) -> HybridKind:
+def _for_spectra(with_scene: bool) -> HybridKind:
     if with_scene:
         from .spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
 
@@ -111,24 +120,5 @@ def _for_spectra(record: Record, with_scene: bool) -> HybridKind:
     return HybridKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumHybrid.from_arrays)
 
 
-KINDS: Mapping[str, Callable[[Record, bool], HybridKind]] = {
-    "rssi": _for_rssi,
-    "csi": _for_csi,
-    "spectrum": _for_spectra,
-}
-"""The hybrid of a record, with or without a scene, by its task."""
-
-
-def settings_of_hybrids() -> dict[str, Any]:
-    """Default settings of each hybrid by what it serves."""
-    from .csi import CsiSettings
-    from .measured_spectrum import MeasuredSpectrumSettings
-    from .rssi import RssiSettings
-    from .spectrum import SpectrumSettings
-
-    return {
-        "spectra with --scene": SpectrumSettings(),
-        "spectra without": MeasuredSpectrumSettings(),
-        "signal strengths": RssiSettings(),
-        "channel coefficients": CsiSettings(),
-    }
+KINDS: Mapping[str, Callable[[bool], HybridKind]] = {"spectrum": _for_spectra, "rssi": _for_rssi, "csi": _for_csi}
+"""The hybrid with or without a scene, by task."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from ..core import InputError, Record
+from ..core.registry import resolve
 from .argos import SUFFIXES
 from .ble_folder import ANCHORS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
@@ -50,8 +50,7 @@ class Layout:
         """The function that reads it."""
         if not isinstance(self.reader, str):
             return self.reader
-        module, _, function = self.reader.partition(":")
-        read: Read = getattr(import_module(module), function)
+        read: Read = resolve(self.reader)
         return read
 
 

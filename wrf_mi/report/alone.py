@@ -121,25 +121,24 @@ def _field(job: Job, work: Path) -> Arrays:
     from ..fit.config import TrainConfig, with_settings
     from .runs import Interrupted, train
 
-    settings = [*job.settings, *(["deterministic=true"] if job.deterministic else [])]
-    config = with_settings(TrainConfig(), settings)
+    config: Any = with_settings(TrainConfig(deterministic=job.deterministic), job.settings)
     taken = iter(range(1, config.steps))
-    n_train = job.n_train or None
+    asked: dict[str, Any] = {"settings": config, "n_train": job.n_train or None}
     with suppress(Interrupted):
-        train(job.dataset, work, config, n_train=n_train, stop=lambda: next(taken) == job.stop)
+        train(job.dataset, work, config.model, **asked, stop=lambda: next(taken) == job.stop)
     if job.stop:  # gone on with in a process that has compiled and drawn nothing yet
         run_module("wrf_mi.cli", ["train", "--resume", str(work)], quiet=True)
     score = json.loads((work / "metrics.json").read_text())["ssim"]["median"]
-    files = _of_run(work, ("checkpoint.npz", "predictions.npz"))
+    files = _of_run(work, ("model.npz", "predictions.npz"))
     return files | _predicted(work) | {"score": np.asarray(score)}
 
 
 def _hybrid(job: Job, work: Path) -> Arrays:
-    from .hybrid_run import train_hybrid
+    from .runs import train
 
     asked: dict[str, Any] = {"material": job.material or None, "n_train": job.n_train or None}
-    train_hybrid(job.dataset, work, job.scene or None, **asked, settings=job.settings)
-    return _of_run(work, ("hybrid.npz", "predictions.npz")) | _predicted(work)
+    train(job.dataset, work, "hybrid", scene=job.scene or None, **asked, settings=job.settings)
+    return _of_run(work, ("model.npz", "predictions.npz")) | _predicted(work)
 
 
 def _channels(job: Job, work: Path) -> Arrays:
@@ -159,9 +158,9 @@ def _channels(job: Job, work: Path) -> Arrays:
 
 
 def _traced(job: Job, work: Path) -> Arrays:
-    from .traced import trace_run
+    from .runs import train
 
-    trace_run(job.scene, job.dataset, work, material=job.material or None)
+    train(job.dataset, work, "ray-tracing", scene=job.scene, material=job.material or None)
     return _of_run(work, ("paths.npz", "predictions.npz")) | _predicted(work)
 
 

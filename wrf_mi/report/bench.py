@@ -23,10 +23,9 @@ import yaml
 
 from ..core import InputError
 from ..core.files import write_atomically
-from ..fit.folder import versions
 from ..parallel import Scheduler, SerialScheduler, run_module, worker_threads
 from .fit_key import dataset_files, fit_key
-from .run_folder import CONFIG, METRICS
+from .run_folder import CONFIG, METRICS, versions
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
 """Data sets that are measured elsewhere; all others are made on this machine."""

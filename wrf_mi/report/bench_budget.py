@@ -12,13 +12,13 @@ from typing import Any
 from ..core import Record
 from ..fit.compress import Compression
 from ..fit.config import TrainConfig, with_settings
-from ..fit.folder import load_predictor
 from ..measure import make_splits
 from ..trace import load_record
-from .compressed import compress_run, plain_size, spectrum_times
+from .compressed import compress_run, spectrum_times
 from .fit_key import fit_key, fit_once
-from .run_folder import read_run
-from .runs import train
+from .results import read_run
+from .run_folder import FITTED
+from .runs import open_run, train
 
 BEST = "WRF-GS+"
 """The best field: the paper's network, all defaults. The others are compared with it."""
@@ -84,22 +84,22 @@ def budgets(
         if not budget.of:
             config = with_settings(TrainConfig(seed=seed), [*schedule, *budget.settings])
             fitted = work / f"{_folder_name(name)}-{fit_key(record, rows, config)}"
-            whole_fits[name] = fit_once(fitted, partial(train, record, fitted, config))
+            whole_fits[name] = fit_once(fitted, partial(train, record, fitted, config.model, settings=config))
         folders[name] = source = whole_fits[budget.of or name]
         if budget.how is not None:
             small = work / f"{_folder_name(name)}-compressed-{fit_key(source.name, budget.how)}"
             folders[name] = fit_once(small, partial(compress_run, source, small, budget.how, record))
     first = folders[next(iter(folders))]
-    predictors = {name: load_predictor(folder) for name, folder in folders.items()}
+    predictors = {name: open_run(folder, record).predictor() for name, folder in folders.items()}
     times = spectrum_times(predictors, record.tx_pos_m[rows.all_train], REPEATS)
     found, whole = {}, read_run(first).metrics["ssim"]["median"]
     for name, folder in folders.items():
-        metrics, size = read_run(folder).metrics, plain_size(folder)
+        metrics, size = read_run(folder).metrics, (folder / FITTED).stat().st_size
         found[name] = {
             **{key: metrics[key] for key in ("gaussians", "ssim", "train_seconds")},
             **times[name],
             "bytes": size,
-            "times_smaller": plain_size(first) / size,
+            "times_smaller": (first / FITTED).stat().st_size / size,
             "ssim_loss": whole - metrics["ssim"]["median"],
         }
     return found

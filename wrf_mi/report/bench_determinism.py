@@ -77,7 +77,7 @@ def again(dataset: str) -> list[Row]:
     field = Job("field", dataset, SMALL, deterministic=True)
     whole, repeated, resumed = (alone(job) for job in (field, field, replace(field, stop=STOP)))
     rows = [
-        _bits_row("field, `--deterministic`: checkpoint, predictions, `predict`", whole, repeated),
+        _bits_row("field, `--deterministic`: model, predictions, `predict`", whole, repeated),
         _bits_row("field, `--deterministic`, stopped and resumed in another process", whole, resumed),
     ]
     jobs = {

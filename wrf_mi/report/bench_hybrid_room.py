@@ -17,13 +17,11 @@ from ..baselines.idw import InverseDistance
 from ..baselines.kriging import Kriging
 from ..core import Record
 from ..core.angles import FloatArray
-from ..fit.config import TrainConfig, with_settings
 from ..measure import make_splits
 from ..tasks.scores import ssim, summary
 from ..trace.furnished import traced_room
-from .hybrid_run import train_hybrid
 from .paired import agreed, paired_difference
-from .run_folder import Run, read_run
+from .results import Results, read_run
 from .runs import train
 
 SIZES = (100, 400, 1600)
@@ -53,12 +51,10 @@ def compare(
     """
     with tempfile.TemporaryDirectory() as work:
         place = Path(work)
-        traced = read_run(train_hybrid(record, place / "traced", scene, n_train=0), "traced")
+        traced = read_run(train(record, place / "traced", "hybrid", scene=scene, n_train=0).folder, "traced")
         learned = {
             size: read_run(
-                train(
-                    record, place / f"gs-{size}", with_settings(TrainConfig(seed=seeds[0]), SHORT), n_train=size
-                ).folder,
+                train(record, place / f"gs-{size}", seed=seeds[0], settings=SHORT, n_train=size).folder,
                 "wrf-gs+",
             )
             for size in sizes
@@ -73,14 +69,15 @@ def _of_size(
     place: Path,
     size: int,
     seeds: Sequence[int],
-    traced: Run,
-    learned: dict[int, Run],
+    traced: Results,
+    learned: dict[int, Results],
 ) -> dict[str, Any]:
     quantiles: dict[str, list[dict[str, float]]] = {}
     verdicts: dict[str, list[str]] = {}
     facts = []
     for seed in seeds:
-        run = read_run(train_hybrid(record, place / f"hybrid-{size}-{seed}", scene, n_train=size, seed=seed), "hybrid")
+        own: dict[str, Any] = {"scene": scene, "n_train": size, "seed": seed}
+        run = read_run(train(record, place / f"hybrid-{size}-{seed}", "hybrid", **own).folder, "hybrid")
         methods = _simple(record, size, seed)
         methods |= {"traced": traced.score[0], "wrf-gs+": learned[size].score[0]}
         methods[f"wrf-gs+ of {max(learned)} rows"] = learned[max(learned)].score[0]

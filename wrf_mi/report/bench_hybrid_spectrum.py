@@ -14,9 +14,9 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..measure import load, make_splits
 from ..tasks.scores import ssim, summary
-from .hybrid_run import train_hybrid
 from .paired import agreed, paired_difference
-from .run_folder import Run, read_run
+from .results import Results, read_run
+from .runs import train
 
 SEEDS = (0, 1, 2)
 LENGTH_M, NOISE = 0.1, 0.02
@@ -44,7 +44,8 @@ def spectra(record: Record, split: str, seeds: Sequence[int] = SEEDS) -> dict[st
     runs = []
     for seed in seeds:
         with tempfile.TemporaryDirectory() as work:
-            runs.append(read_run(train_hybrid(record, Path(work) / "run", split=split, seed=seed), "hybrid"))
+            run = train(record, Path(work) / "run", "hybrid", split=split, seed=seed)
+            runs.append(read_run(run.folder, "hybrid"))
     row = runs[0].row
     methods = {name: values[row] for name, values in simple.items()}
     methods["blend of 4 nearest"] = runs[0].reference_score[0]
@@ -64,7 +65,7 @@ def spectra(record: Record, split: str, seeds: Sequence[int] = SEEDS) -> dict[st
     }
 
 
-def _facts(run: Run) -> dict[str, Any]:
+def _facts(run: Results) -> dict[str, Any]:
     kept = ("inside_90", "train_seconds", "ms_per_sample", "peak_memory_mb", "fitted")
     return {"ssim": summary(run.score), **{key: run.metrics[key] for key in kept}}
 
@@ -75,12 +76,12 @@ def _simple(record: Record, split: str) -> Scores:
     names = ("kriging", "mean of the training rows", "best training row in hindsight")
     found = {name: np.full(len(record), np.nan) for name in names}
     for rows in make_splits(record, split, 0):
-        train, test = rows.all_train, rows.test
-        kriging = Kriging(LENGTH_M, NOISE).fit(record.tx_pos_m[train], spectra[train]).predict(record.tx_pos_m[test])
+        known, test = rows.all_train, rows.test
+        kriging = Kriging(LENGTH_M, NOISE).fit(record.tx_pos_m[known], spectra[known]).predict(record.tx_pos_m[test])
         found["kriging"][test] = ssim(kriging, spectra[test])
-        mean = np.broadcast_to(spectra[train].mean(axis=0), spectra[test].shape)
+        mean = np.broadcast_to(spectra[known].mean(axis=0), spectra[test].shape)
         found["mean of the training rows"][test] = ssim(mean, spectra[test])
-        found["best training row in hindsight"][test] = [_best(spectra[train], spectra[row]) for row in test]
+        found["best training row in hindsight"][test] = [_best(spectra[known], spectra[row]) for row in test]
     return found
 
 

@@ -31,7 +31,6 @@ from ..core import InputError, Record  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..core.files import one_line, write_atomically  # noqa: E402
 from ..fit.config import TrainConfig, with_settings  # noqa: E402
-from ..fit.folder import versions  # noqa: E402
 from ..fit.step import CompiledPredictor, device_pose  # noqa: E402
 from ..fit.trainer import Trainer  # noqa: E402
 from ..measure import make_splits  # noqa: E402
@@ -43,6 +42,7 @@ from ..trace.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_pa
 from ..trace.tracer import RayTracer  # noqa: E402
 from .bench import BenchFailed, machine  # noqa: E402
 from .bench_traced import random_field, scene_of  # noqa: E402
+from .run_folder import versions  # noqa: E402
 from .stock import StockRenderer, rgb_variant  # noqa: E402
 from .timing import Call, Interval, Within, interleaved, one_blas_thread, ratio  # noqa: E402
 

@@ -13,7 +13,7 @@ from ..tasks.scores import summary
 from ..trace.furnished import traced_room
 from ..trace.laboratory import SCAN
 from .paired import agreed, paired_difference
-from .run_folder import read_run
+from .results import read_run
 from .runs import train
 
 ROWS = 100
@@ -58,7 +58,7 @@ def starts(
         for seed in seeds:
             for name, own in given.items():
                 config = with_settings(TrainConfig(seed=seed), [*schedule, *own])
-                run = train(record, Path(work) / f"{name}-{seed}", config, n_train=rows)
+                run = train(record, Path(work) / f"{name}-{seed}", settings=config, n_train=rows)
                 scores[name].append(read_run(run.folder, name).score)
     return {
         name: {

@@ -35,6 +35,7 @@ from ..project.footprint import depth_order, project  # noqa: E402
 from ..splat.tiles import TILE_COLUMNS, TILE_ROWS, build_lists, perception_plane  # noqa: E402
 from ..trace import load_record  # noqa: E402
 from .bench import BenchFailed  # noqa: E402
+from .runs import train  # noqa: E402
 from .timing import Interval, bootstrap, interleaved  # noqa: E402
 
 DATA = "rfid-lab"
@@ -82,14 +83,7 @@ def fit(model: str) -> dict[str, Any]:
     processor = time.process_time()
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "run"
-        if model == "hybrid":
-            from .hybrid_run import train_hybrid
-
-            train_hybrid(record, folder)
-        else:
-            from .runs import train
-
-            train(record, folder, TrainConfig(model=model))
+        train(record, folder, model)
         metrics = json.loads((folder / "metrics.json").read_text())
     return {
         "seconds": metrics["train_seconds"],

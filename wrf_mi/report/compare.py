@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 
 from ..core import InputError
 from ..core.files import write_atomically
-from ..fit.folder import CHECKPOINT
+from ..models.ray_tracing import PATHS
 from ..tasks import TASKS
 from . import figures
-from .run_folder import Run, read_runs
-from .traced import is_traced
+from .results import Results, read_runs
+from .run_folder import FITTED
 from .view import scene_view
 
 QUANTILES = (0.1, 0.5, 0.9)
@@ -87,12 +87,12 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     return write_atomically(folder / "index.html", _page(table, shown))
 
 
-def _groups(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
     """Runs by task and data set, under names that can begin a file's name."""
-    by_data: dict[tuple[str, str], list[Run]] = {}
+    by_data: dict[tuple[str, str], list[Results]] = {}
     for run in runs:
         by_data.setdefault((run.task, run.dataset), []).append(run)
-    groups: dict[str, list[Run]] = {}
+    groups: dict[str, list[Results]] = {}
     for (_, dataset), members in by_data.items():
         slug = re.sub(r"[^\w.-]+", "_", Path(dataset).name) or "data"
         while slug in groups:
@@ -101,11 +101,11 @@ def _groups(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return groups
 
 
-def _heading(runs: Sequence[Run]) -> str:
+def _heading(runs: Sequence[Results]) -> str:
     return f"{Path(runs[0].dataset).name}: {TASKS[runs[0].task].heading}"
 
 
-def _rows(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     """The table's rows of one data set: each run, and each reference once."""
     task = TASKS[runs[0].task]
     rows = []
@@ -125,9 +125,9 @@ def _summary(block: dict[str, Any]) -> dict[str, Any]:
     return {key: block.get(key) for key in ("median", "mean", "p10", "p90")}
 
 
-def _references(runs: Sequence[Run]) -> dict[str, tuple[Run, str]]:
+def _references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
     """Each reference by its name: a run that has it and its key, once for runs with the same training and test rows."""
-    found: dict[str, tuple[Run, str]] = {}
+    found: dict[str, tuple[Results, str]] = {}
     for run in runs:
         for key, scores in run.reference_scores.items():
             known = (r.reference_scores[key] for r, k in found.values() if k == key)
@@ -138,7 +138,7 @@ def _references(runs: Sequence[Run]) -> dict[str, tuple[Run, str]]:
     return found
 
 
-def _pictures(slug: str, runs: Sequence[Run]) -> list[Picture]:
+def _pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     task = TASKS[runs[0].task]
     cdf = figures.score_cdf(
         {run.name: run.score for run in runs},
@@ -158,12 +158,13 @@ def _pictures(slug: str, runs: Sequence[Run]) -> list[Picture]:
     return pictures
 
 
-def _scene(runs: Sequence[Run]) -> Figure | None:
+def _scene(runs: Sequence[Results]) -> Figure | None:
     """The first traced run's scene, with the Gaussians of the first field; None where nothing was traced."""
-    traced = next((run for run in runs if is_traced(run.path)), None)
+    traced = next((run for run in runs if (run.path / PATHS).exists()), None)
     if traced is None:
         return None
-    field = next((run.path for run in runs if (run.path / CHECKPOINT).exists()), None)
+    learned = (run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists())
+    field = next(learned, None)
     row = traced.row[np.argsort(np.nanmean(traced.score, axis=0))[len(traced.row) // 2]]
     try:
         return scene_view(traced.path, int(row), field)
@@ -173,7 +174,7 @@ def _scene(runs: Sequence[Run]) -> Figure | None:
         return None
 
 
-def _spectra(runs: Sequence[Run]) -> tuple[str, Figure]:
+def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
     first = runs[0]
     shared = np.array([all(_position(run, first, m) is not None for run in runs) for m in range(len(first.row))])
@@ -194,7 +195,7 @@ def _spectra(runs: Sequence[Run]) -> tuple[str, Figure]:
     return heading, figures.spectrum_table(rows, columns)
 
 
-def _maps(runs: Sequence[Run]) -> tuple[str, Figure]:
+def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
     first = runs[0]
     columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
@@ -218,7 +219,7 @@ def _power_db(values: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.where(power > 0, power, np.nan))
 
 
-def _aligned(run: Run, first: Run, receiver: int) -> np.ndarray | None:
+def _aligned(run: Results, first: Results, receiver: int) -> np.ndarray | None:
     """Predictions of ``run`` in the order of the test rows of ``first``, NaN where it has none; None without any."""
     places = [_position(run, first, m) for m in range(len(first.row))]
     if all(p is None for p in places):
@@ -228,7 +229,7 @@ def _aligned(run: Run, first: Run, receiver: int) -> np.ndarray | None:
     return np.stack([missing if p is None else values[p] for p in places])
 
 
-def _position(run: Run, first: Run, m: int) -> int | None:
+def _position(run: Results, first: Results, m: int) -> int | None:
     """Where ``run`` keeps test row ``m`` of ``first``; None if it has not, or if it is another measurement."""
     found = np.flatnonzero(run.row == first.row[m])
     if len(found) != 1 or len(run.truth) != len(first.truth):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -12,33 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core import InputError, Record
 from ..core.files import write_atomically
+from ..fit.checkpoint import append_log
 from ..fit.compress import Compression, compress
-from ..fit.folder import (
-    CHECKPOINT,
-    SPLIT,
-    append_log,
-    check_new,
-    load_predictor,
-    load_rows,
-    read_checkpoint,
-    read_config,
-    write_config,
-    write_packed,
-)
 from ..fit.predictor import Predictor
-from ..fit.trainer import Progress, final_params
+from ..fit.trainer import Progress
 from ..measure import save_split
-from ..trace import load_record
-from .baseline_run import is_baseline
 from .evaluate import stored_metrics
-from .hybrid_run import is_hybrid
-from .runs import evaluate_run, is_blocked
+from .run_folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
+from .runs import evaluate_run, open_run
 from .timing import interleaved, ratio
-from .traced import is_traced
 
 COMPRESSION = "compression.json"
 """What was done to the run, from which one, and what it cost."""
@@ -76,18 +60,6 @@ def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: 
     return result
 
 
-def plain_size(folder: Path) -> int:
-    """Bytes that a run's parameters take as this project stores them for prediction, networks included.
-
-    A run in training stores three more copies for the optimiser, which are not counted.
-    """
-    arrays = read_checkpoint(folder)
-    if "packed_precision" in arrays:
-        return (folder / CHECKPOINT).stat().st_size
-    with tempfile.TemporaryDirectory() as work:
-        return write_packed(Path(work), arrays, final_params(arrays), "single")
-
-
 def compress_run(
     run: str | Path,
     out: str | Path,
@@ -109,18 +81,15 @@ def compress_run(
         the times of `spectrum_times`; ``times_smaller``, ``ssim_change``, ``seconds`` and the settings.
 
     Raises:
-        InputError: not a run with one learned field, or a folder that is not empty.
+        InputError: not a run of one learned field of spectra alone, or a folder that is not empty.
     """
     source, folder = Path(run), Path(out)
     check_new(folder)
-    if is_traced(source) or is_hybrid(source) or is_baseline(source):
-        raise InputError(f"{source}: not a learned field alone; compress a run of wrf-gs or wrf-gs+")
-    if is_blocked(source):
-        raise InputError(f"{source}: one field for each block; choose one, e.g. {source / 'fold0'}")
-    asked, arrays = read_config(source), read_checkpoint(source)
+    opened = open_run(source, record)
+    asked, field = opened.config, opened.field
     if asked.scene is not None:
         raise InputError(f"{source}: trained together with the paths of {asked.scene}; compress a run without a scene")
-    data = record or load_record(asked.dataset)
+    data = opened.problem.record
     split = load_rows(source, data)
     start = time.perf_counter()
 
@@ -129,26 +98,25 @@ def compress_run(
         append_log(folder, progress)
         listen(stage, steps, progress)
 
-    before: dict[str, NDArray[np.float32]] = final_params(arrays)
-    settings, params = compress(asked.settings, before, data, split, how, heard)
+    settings, params = compress(field.config, field.params, data, split, how, heard)
     seconds = time.perf_counter() - start
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
-    write_config(folder, replace(asked, settings=settings))
-    size = write_packed(folder, arrays, params, how.precision)
+    write_config(folder, replace(asked, model=settings.model, settings=settings))
+    size = write_fitted(folder, field.packed(params, how.precision), read_fitted(source)[1]).stat().st_size
     known = stored_metrics(source)
     ssim_before = (known or evaluate_run(source))["ssim"]["median"]
     ssim_after = evaluate_run(folder)["ssim"]["median"]
-    both = {"before": load_predictor(source), "after": load_predictor(folder)}
+    both = {"before": opened.predictor(), "after": open_run(folder, record).predictor()}
     times = spectrum_times(both, data.tx_pos_m[split.all_train])
+    size_before, count = (source / FITTED).stat().st_size, field.params["position"].shape[1]
     result = {
         "run": str(source),
         "how": asdict(how),
         "seconds": seconds,
-        "before": {"gaussians": before["position"].shape[1], "bytes": plain_size(source), "ssim": ssim_before}
-        | times["before"],
+        "before": {"gaussians": count, "bytes": size_before, "ssim": ssim_before} | times["before"],
         "after": {"gaussians": params["position"].shape[1], "bytes": size, "ssim": ssim_after} | times["after"],
-        "times_smaller": plain_size(source) / size,
+        "times_smaller": size_before / size,
         "ssim_change": ssim_after - ssim_before,
     }
     write_atomically(folder / COMPRESSION, json.dumps(result, indent=1) + "\n")

@@ -6,18 +6,19 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from ..core import InputError
-from ..fit.config import PRESETS, TrainConfig, with_settings
+from ..fit.config import PRESETS
 from ..measure import fetch
 from ..measure.registry import locate
+from ..models.model import Listen
 from ..scene.make import make_scene
-from ..trace import TraceOptions, load_record
+from ..trace import load_record
 from ..trace.laboratory import NAME as LABORATORY
 from ..trace.laboratory import SCAN
 from .compare import compare
-from .runs import Listen, Run, train
-from .traced import trace_run
+from .runs import Run, train
 
 REAL = "rfid-lab"
 FLAT = "flat-ble"
@@ -45,20 +46,19 @@ def demo(out: Path | None, listen: Listen, stop: Callable[[], bool]) -> tuple[Ru
 
     Args:
         out: run folder; None: a new one in ``runs/``. The traced run lies in ``traced/`` in it.
-        listen: hears of progress.
+        listen: progress callback.
         stop: True stops at a checkpoint.
 
     Returns:
         The run of the field and the ``index.html`` with all pictures.
     """
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-    config = with_settings(TrainConfig(), PRESETS["quick"])
     real = here(REAL) is not None
     if not real:
         print(f"using the embedded room {LABORATORY}, traced here by Sionna RT, in its place", file=sys.stderr)
     dataset = REAL if real else LABORATORY
-    print(f"training {config.model} on {dataset}; results go to {folder}", file=sys.stderr)
-    run = train(dataset, folder, config, listen=listen, stop=stop)
+    print(f"training wrf-gs+ on {dataset}; results go to {folder}", file=sys.stderr)
+    run = train(dataset, folder, settings=PRESETS["quick"], listen=listen, stop=stop)
     traced = _trace_flat(folder) if real else _trace_scan(folder)
     runs = [folder] if traced is None else [folder, traced]
     return run, compare(runs, folder / "compare")
@@ -71,8 +71,9 @@ def _trace_flat(folder: Path) -> Path | None:
         return None
     print(f"tracing {FLAT} in the walls of its plan", file=sys.stderr)
     scene = make_scene(data / FLAT_PLAN, folder / "scene", height_m=FLAT_HEIGHT_M)
-    options = TraceOptions(transmission=True, max_depth=6, max_reflections=2)
-    return trace_run(scene.folder, FLAT, folder / "traced", options, progress=sys.stderr.isatty())
+    settings = ("transmission=true", "max_depth=6", "max_reflections=2")
+    asked: dict[str, Any] = {"scene": scene.folder, "settings": settings, "progress": sys.stderr.isatty()}
+    return train(FLAT, folder / "traced", "ray-tracing", **asked).folder
 
 
 def _trace_scan(folder: Path) -> Path:
@@ -80,4 +81,5 @@ def _trace_scan(folder: Path) -> Path:
     print(f"tracing {LABORATORY} in the mesh of its scan", file=sys.stderr)
     points = Path(load_record(LABORATORY).source) / SCAN
     scene = make_scene(points, folder / "scene")
-    return trace_run(scene.folder, LABORATORY, folder / "traced", progress=sys.stderr.isatty())
+    asked: dict[str, Any] = {"scene": scene.folder, "progress": sys.stderr.isatty()}
+    return train(LABORATORY, folder / "traced", "ray-tracing", **asked).folder

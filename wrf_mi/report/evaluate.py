@@ -18,7 +18,8 @@ from ..measure.observations import scorable
 from ..tasks import TASKS, Task
 from ..tasks.scores import summary
 from .references import reference_predictions
-from .run_folder import METRICS, PREDICTIONS, reference_key
+from .results import reference_key
+from .run_folder import METRICS, PREDICTIONS
 
 Predict = Callable[[IntArray, int], NDArray[Any]]
 """What the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or channel
@@ -45,13 +46,16 @@ def milliseconds_per_sample(predict: Predict, rows: IntArray, repeats: int = REP
     return 1e3 * float(np.median(times))
 
 
-def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, Any], dict[str, Any]]:
+def evaluate(
+    record: Record, split: Split, predict: Predict, single: Predict | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Score a method on the test rows of a split, with the references that the data allow beside it.
 
     Args:
         record: of any task in `wrf_mi.tasks.TASKS`.
         split: references (`wrf_mi.report.references`) know all its training rows, validation rows included.
         predict: the method; finite wherever something was received.
+        single: the same where it is timed at one row; None: ``predict``.
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
@@ -79,7 +83,7 @@ def evaluate(record: Record, split: Split, predict: Predict) -> tuple[dict[str, 
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
         "n_train": len(known),
-        "ms_per_sample": milliseconds_per_sample(predict, rows),
+        "ms_per_sample": milliseconds_per_sample(single or predict, rows),
     }
     return metrics, arrays
 

@@ -20,9 +20,8 @@ import numpy as np
 
 from ..core import InputError
 from ..core.files import one_line
-from ..fit.folder import versions
 from ..measure.registry import locate
-from .run_folder import METRICS
+from .run_folder import METRICS, versions
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +30,7 @@ DIGITS = 16
 
 
 def fit_key(*determining: Any) -> str:
-    """Key of a fit: a digest of the versions of what computes (`wrf_mi.fit.folder.versions`) and of what is given.
+    """Key of a fit: a digest of the versions of what computes (`versions`) and of what is given.
 
     Args:
         determining: arrays, data classes (fields that count in comparisons), mappings, tuples and lists of these, and

@@ -21,15 +21,13 @@ from ..baselines.kriging import Kriging
 from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..fit.config import TrainConfig, with_settings
-from ..fit.folder import load_predictor, read_checkpoint
-from ..fit.trainer import final_params
 from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..tasks import instrument_of
 from ..trace import TraceOptions
 from ..trace.tracer import RayTracer
 from .fit_key import fit_key, fit_once, scene_files
-from .hybrid_run import FITTED, open_hybrid, train_hybrid
+from .run_folder import FITTED
 from .runs import Run, train
 from .stock import StockRenderer, rgb_variant
 from .timing import Call, Within
@@ -131,19 +129,19 @@ def field_run(place: Place, model: str, gaussians: int) -> Run:
     settings += ["hold_out=0", "density.every=0", f"validate_every={place.steps}"]
     config = with_settings(TrainConfig(seed=place.seed), settings)
     folder = place.folder / f"{model}-{gaussians}-{fit_key(place.record, place.split, config)}"
-    return Run(fit_once(folder, lambda: train(place.record, folder, config, n_train=place.rows)))
+    fit_once(folder, lambda: train(place.record, folder, model, settings=config, n_train=place.rows))
+    return Run(folder, place.record)
 
 
 def _field(place: Place, model: str, gaussians: int) -> Ready:
     run = field_run(place, model, gaussians)
-    kept = final_params(read_checkpoint(run.folder))
-    return Ready(run.predictor(), _megabytes(list(kept.values())), run.metrics["train_seconds"])
+    return Ready(run.predictor(), _megabytes(list(run.field.params.values())), run.metrics["train_seconds"])
 
 
 def _stock(place: Place, gaussians: int) -> Ready:
     """The same WRF-GS+, its Gaussians computed by us and rendered by Mitsuba's own integrator."""
     run = field_run(place, "wrf-gs+", gaussians)
-    predictor = load_predictor(run.folder)
+    predictor = run.predictor()
     height, width = place.record.observation.shape[-2:]
     renderer = StockRenderer(place.record.receivers[0], height, width)
 
@@ -151,18 +149,18 @@ def _stock(place: Place, gaussians: int) -> Ready:
         with rgb_variant():
             return np.stack([np.abs(renderer.field(predictor.gaussians(one))) for one in np.asarray(tx_pos_m)[:, None]])
 
-    kept = final_params(read_checkpoint(run.folder))
-    return Ready(predict, _megabytes(list(kept.values())), run.metrics["train_seconds"], rgb_variant)
+    return Ready(predict, _megabytes(list(run.field.params.values())), run.metrics["train_seconds"], rgb_variant)
 
 
 def _hybrid(place: Place) -> Ready:
     settings = kind_of(place.record, True).settings()
     key = fit_key(place.record, place.split, scene_files(place.scene), settings, place.seed)
     folder = place.folder / f"hybrid-{key}"
-    fit_once(folder, lambda: train_hybrid(place.record, folder, place.scene, n_train=place.rows, seed=place.seed))
-    model, facts = open_hybrid(folder), Run(folder).metrics
+    asked: dict[str, Any] = {"scene": place.scene, "n_train": place.rows, "seed": place.seed}
+    fit_once(folder, lambda: train(place.record, folder, "hybrid", **asked))
+    run = Run(folder, place.record)
     size = (folder / FITTED).stat().st_size / 1e6
-    return Ready(lambda tx_pos_m: model.predict(tx_pos_m, 0).mean, size, facts["train_seconds"])
+    return Ready(lambda tx_pos_m: run.predict(tx_pos_m).mean, size, run.metrics["train_seconds"])
 
 
 def _tracer(place: Place, rays: int, depth: int) -> Ready:

@@ -11,7 +11,7 @@ from ..baselines.idw import InverseDistance
 from ..core import InputError, Record
 from ..core.types import IntArray
 from ..tasks import TASKS, UPLINK, Task
-from .run_folder import Observations
+from .results import Observations
 
 
 def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> dict[str, Observations]:

@@ -1,234 +1,231 @@
-"""Reading what a run left behind."""
+"""The run folder of every model.
+
+    config.yaml      format, model, data set and its task, split, seed, scene, settings, resolved, and versions
+    split.npz        rows that train, choose and score
+    model.npz        the fitted model: arrays only, with the format and the seconds that its fit took
+    metrics.json     scores
+    predictions.npz  predictions of the test rows, with their truth
+
+With several splits ``fold0``, ... are each such a folder, and the one above pools their scores. A model may leave
+further files: ``checkpoint.npz`` until its training has ended, ``log.jsonl``, ``paths.npz`` of the ray tracer,
+``operator0.npz``. Every file appears whole or not at all.
+"""
 
 from __future__ import annotations
 
-import json
-import zipfile
+import importlib.metadata
+import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from wrf_mi.core import InputError
-from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.types import IntArray
+from .. import __version__
+from ..backend import init
+from ..core import AntennaOptions, InputError, Record, Split
+from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..fit.config import settings_from
+from ..fit.trainer import check_rows
+from ..measure import load_split, save_split
+from ..models import Model, known_model
+from ..models.model import Arrays
 
-from ..tasks import TASKS, Task
-
-METRICS = "metrics.json"
-PREDICTIONS = "predictions.npz"
-LOG = "log.jsonl"
-CONFIG = "config.yaml"
-
-Observations = NDArray[np.float32] | NDArray[np.complex64]
-"""Greys, powers in dBm or channel coefficients, see `wrf_mi.core.Record`."""
-
-
-def reference_key(name: str) -> str:
-    """Key in ``predictions.npz`` of what the reference of that name predicts."""
-    return f"reference_{name}"
+FORMAT = 2
+"""Version of ``config.yaml`` and ``model.npz``."""
+CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
+OLD = ("hybrid.npz", "fitted.npz")
+"""Files that version 0.1 wrote."""
+VERSION, SECONDS = "run/format", "run/train_seconds"
+"""Keys in ``model.npz`` that are not the model's."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """A finished run, with one first axis per receiver.
+class RunConfig:
+    """What ``config.yaml`` says.
 
     Attributes:
-        path: the run folder.
-        name: for tables and legends.
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``; `wrf_mi.tasks.TASKS` says how it is scored.
-        dataset: name or folder of the data set, "" where the run does not tell.
-        metrics: content of ``metrics.json``.
-        seed: of the configuration, or None where it states none.
-        receivers: their names.
-        row: test rows, shape [m].
-        tx_pos_m: transmitter positions [m, 3], metres.
-        prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients, or
-            [n_rx, m, antennas, subcarriers].
-        truth: the same shape; NaN where nothing was received.
-        references: by name (`wrf_mi.tasks.Task.references`) what needs no model, the same shape.
-        validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
+        model: its name.
+        dataset: name or folder that was loaded.
+        task: of the data.
+        split: its name; one fold has its own, e.g. ``blocked:2``.
+        n_train: number or fraction of training rows that was asked for; None: all; 0: none, the scene alone.
+        seed: of split and fit.
+        scene: name, scene folder, Mitsuba XML or mesh; None: none.
+        material: of a bare mesh, or None.
+        antennas: stated in place of the data's.
+        deterministic: fitted on one thread of the CPU, so bit-identical from run to run.
+        settings: of the model, all of them.
     """
 
-    path: Path
-    name: str
-    task: str
+    model: str
     dataset: str
-    metrics: dict[str, Any]
-    seed: int | None
-    receivers: tuple[str, ...]
-    row: IntArray
-    tx_pos_m: FloatArray
-    prediction: Observations
-    truth: Observations
-    references: dict[str, Observations]
-    validation: dict[str, list[tuple[float, float]]]
+    task: str
+    split: str
+    n_train: float | None
+    seed: int
+    scene: str | None
+    material: str | None
+    antennas: AntennaOptions
+    deterministic: bool
+    settings: Any
 
     @cached_property
-    def score(self) -> FloatArray:
-        """The task's metric of each prediction, shape [n_rx, m]; NaN where nothing was received."""
-        return TASKS[self.task].of_rows(self.prediction, self.truth)
+    def entry(self) -> Model:
+        """The model.
 
-    @cached_property
-    def reference_scores(self) -> dict[str, FloatArray]:
-        """The same of each reference."""
-        return {key: TASKS[self.task].of_rows(values, self.truth) for key, values in self.references.items()}
-
-    @property
-    def reference(self) -> Observations:
-        """The reference that stands for all, the first one."""
-        return next(iter(self.references.values()))
-
-    @property
-    def reference_name(self) -> str:
-        """That one in words."""
-        return TASKS[self.task].references[next(iter(self.references))]
-
-    @property
-    def reference_score(self) -> FloatArray:
-        """Score of that one."""
-        return next(iter(self.reference_scores.values()))
+        Raises:
+            InputError: none of that name.
+        """
+        return known_model(self.model).serving(self.task, self.scene is not None)
 
 
-def read_run(path: str | Path, name: str | None = None) -> Run:
-    """Read a run folder.
+def package_versions() -> dict[str, str]:
+    """Versions of this package, of those that compute for it, and of Python."""
+    packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image", "scikit-learn")
+    return {
+        "wrf-mi": __version__,
+        **{name: importlib.metadata.version(name) for name in packages},
+        "python": platform.python_version(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes: packages, backend and device."""
+    backend = init()
+    return {
+        **package_versions(),
+        "backend": f"{backend.name} {backend.llvm_version or ''}".strip(),
+        "device": backend.device,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """What YAML has words for."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+
+
+def write_config(folder: Path, config: RunConfig) -> None:
+    """Write ``config.yaml``."""
+    content = {"format": FORMAT, **_plain(asdict(config)), "versions": versions()}
+    write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
+
+
+def read_config(folder: Path) -> RunConfig:
+    """Read ``config.yaml``.
+
+    Raises:
+        InputError: missing, not YAML, of another format, or settings that this version does not know.
+    """
+    path = folder / CONFIG
+    missing = f"{folder}: no {CONFIG}, so not a run folder; give one made by train or trace"
+    with readable(path, missing, "restore it"):
+        content = yaml.safe_load(path.read_text())
+        if not isinstance(content, dict):
+            raise InputError(f"{path}: not readable (no settings in it); restore it")
+        check_format(folder, content)
+        names = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material")
+        kept = {name: content[name] for name in names}
+        kept |= {"antennas": AntennaOptions(**content["antennas"]), "deterministic": bool(content["deterministic"])}
+        config = RunConfig(**kept, settings=None)
+        kind: Any = config.entry.settings
+        return replace(config, settings=settings_from(kind, content["settings"], str(path)))
+
+
+def check_format(folder: Path, content: dict[str, Any] | None = None) -> None:
+    """Refuse a run folder of version 0.1.
 
     Args:
-        path: the folder; a run over all blocks has subfolders ``fold0``, ... and pooled files at its top.
-        name: for tables and legends; the folder's own name without one.
+        folder: of a run.
+        content: of its ``config.yaml``; None: it is read, where it can be.
 
     Raises:
-        InputError: not a run folder, or a file in it that is missing or damaged.
+        InputError: naming the folder.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give a run folder made by train or trace")
-    metrics = _read_metrics(folder / METRICS)
-    task = TASKS[metrics["task"]]
-    references = [key for key in task.references if key in metrics["reference"]]
-    arrays = _read_predictions(folder / PREDICTIONS, task, references)
-    parts = [folder, *sorted(p for p in folder.glob("fold*") if p.is_dir())]
-    curves = {p.name if p != folder else "": _read_log(p / LOG) for p in parts}
-    return Run(
-        path=folder,
-        name=name or folder.resolve().name,
-        task=metrics["task"],
-        dataset=str(metrics.get("dataset", "")),
-        metrics=metrics,
-        seed=_read_seed(folder, metrics),
-        receivers=tuple(str(name) for name in arrays["receiver_name"]),
-        row=arrays["row"],
-        tx_pos_m=arrays["tx_pos"],
-        prediction=arrays["prediction"],
-        truth=arrays["truth"],
-        references={key: arrays[reference_key(key)] for key in references},
-        validation={fold: points for fold, points in curves.items() if points},
-    )
-
-
-def stated_model(folder: Path) -> Any:
-    """The model that a run folder's ``config.yaml`` names at its top; None where it names none or cannot be read."""
-    try:
-        return yaml.safe_load((folder / CONFIG).read_text()).get("model")
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError):
-        return None
-
-
-def read_runs(paths: Sequence[str | Path]) -> list[Run]:
-    """Read several run folders under names that differ: folders of the same name get as many parents as needed.
-
-    Raises:
-        InputError: no folder, one of them twice, or one that is no run.
-    """
-    resolved = [Path(p).resolve() for p in paths]
-    if not resolved:
-        raise InputError("nothing to compare: give at least one run folder")
-    for folder in resolved:
-        if resolved.count(folder) > 1:
-            raise InputError(f"{folder}: given twice; give each run once")
-    depth = 1
-    while len({p.parts[-depth:] for p in resolved}) < len(resolved):
-        depth += 1
-    return [read_run(path, "/".join(p.parts[-depth:])) for path, p in zip(paths, resolved, strict=True)]
-
-
-def _read_metrics(path: Path) -> dict[str, Any]:
-    try:
-        metrics = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path.parent}: no {METRICS}, so no finished run; finish it with train --resume") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); run evaluate to write it anew") from None
-    needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
-    missing = [key for key in needed if key not in metrics]
-    if missing:
-        raise InputError(f"{path}: no {', '.join(missing)}; run evaluate to write it anew")
-    if metrics["task"] not in TASKS:
-        raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
-    task = TASKS[metrics["task"]]
-    references = metrics.get("reference")
-    held = references if isinstance(references, dict) else {}
-    blocks = [metrics.get(task.block), *(held[key] for key in task.references if key in held)]
-    if len(blocks) == 1 or any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        what = f"no {task.block} or no reference {' or '.join(sorted(task.references))} with a median"
-        raise InputError(f"{path}: {what}; run evaluate to write it anew")
-    return metrics
-
-
-def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict[str, Any]:
-    observed = ("prediction", "truth", *map(reference_key, references))
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in ("row", "tx_pos", *observed)}
-            names = stored.get("receiver_name")
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; run evaluate to write it") from None
-    except KeyError as error:
-        raise InputError(f"{path}: {error.args[0]}; run evaluate to write it anew") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not readable ({error}); run evaluate to write it anew") from None
-    shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
-    single = arrays["truth"].ndim == 1 + task.axes if names is None else len(names) == 1
-    if single:
-        arrays |= {key: arrays[key][None] for key in observed}
-    shape, rows = arrays["truth"].shape, len(arrays["row"])
-    names = np.arange(shape[0] if shape else 0) if names is None else names
-    fits = 0 <= len(shape) - 2 - task.axes <= task.more_axes
-    fits = fits and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
-    if not fits or any(arrays[key].shape != shape for key in observed):
-        raise InputError(f"{path}: shapes do not fit together ({shapes}); run evaluate to write it anew")
-    return arrays | {"receiver_name": names}
-
-
-def _read_seed(folder: Path, metrics: dict[str, Any]) -> int | None:
-    if "seed" in metrics:
-        return metrics["seed"]
-    path = folder / CONFIG
-    try:
-        config = yaml.safe_load(path.read_text()) or {}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: not readable as YAML ({str(error).splitlines()[0]}); restore it") from None
-    return config.get("seed")
-
-
-def _read_log(path: Path) -> list[tuple[float, float]]:
-    """Pairs (seconds, SSIM on held-out validation rows); methods without training leave no log."""
-    if not path.is_file():
-        return []
-    points = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    if content is None:
         try:
-            entry = json.loads(line)
-            # Once the fit trains on the validation rows, their score says nothing about rows it has not seen.
-            if entry["validation_ssim"] is not None and entry["held_out"]:
-                points.append((float(entry["seconds"]), float(entry["validation_ssim"])))
-        except (ValueError, KeyError, AttributeError, TypeError):
-            raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
-    return points
+            content = yaml.safe_load((folder / CONFIG).read_text())
+        except (OSError, ValueError, yaml.YAMLError):
+            content = {"format": FORMAT}  # what is wrong with it is said where it is needed
+    stated = content.get("format") if isinstance(content, dict) else FORMAT
+    if stated is None or any((folder / name).exists() for name in OLD):
+        raise InputError(f"{folder}: a run of version 0.1; train it anew, or use version 0.1")
+    if stated != FORMAT:
+        where = f"{folder / CONFIG}: format {stated}"
+        raise InputError(f"{where}, this version reads {FORMAT}; use the version that wrote it")
+
+
+def check_new(folder: Path) -> None:
+    """See that a folder can be made.
+
+    Raises:
+        InputError: it holds something already.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        remedy = f"choose another --out, or go on with train --resume {folder}"
+        raise InputError(f"{folder}: exists and is not empty; {remedy}")
+
+
+def start_run(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
+    """Make the folder of a run, and those of its folds."""
+    for part, rows in _placed(folder, splits):
+        part.mkdir(parents=True, exist_ok=True)
+        save_split(part / SPLIT, rows)
+    write_configs(folder, config, splits)
+
+
+def write_configs(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
+    """Write ``config.yaml`` of a run and of its folds."""
+    own = [(part, replace(config, split=rows.name)) for part, rows in _placed(folder, splits) if part != folder]
+    # Last at the top: a folder with a configuration has all its splits.
+    for part, stated in [*own, (folder, config)]:
+        write_config(part, stated)
+
+
+def _placed(folder: Path, splits: Sequence[Split]) -> list[tuple[Path, Split]]:
+    """Where each split is kept: one at the top, several in ``fold0``, ..."""
+    if len(splits) == 1:
+        return [(folder, splits[0])]
+    return [(folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
+
+
+def run_parts(folder: Path) -> list[Path]:
+    """The folders of a run that hold a split: its own, or those of its folds."""
+    return [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"), key=lambda p: (len(p.name), p.name))
+
+
+def load_rows(folder: Path, record: Record) -> Split:
+    """The rows of a run.
+
+    Raises:
+        InputError: no split file, a damaged one, or one with rows that the record has not.
+    """
+    split = load_split(folder / SPLIT)
+    check_rows(split, record, str(folder / SPLIT))
+    return split
+
+
+def write_fitted(folder: Path, arrays: Arrays, seconds: float) -> Path:
+    """Write ``model.npz``."""
+    own = {VERSION: FORMAT, SECONDS: seconds}
+    return write_arrays(folder / FITTED, {**own, **arrays}, compressed=True)
+
+
+def read_fitted(folder: Path) -> tuple[Arrays, float]:
+    """Arrays of ``model.npz``, and the seconds that the fit took.
+
+    Raises:
+        InputError: missing, damaged, or of another format.
+    """
+    path = folder / FITTED
+    missing = f"{path}: missing, the fit was stopped; finish it with train --resume"
+    with readable(path, missing, "train the run anew"):
+        arrays = stored_arrays(path)
+        version, seconds = int(arrays.pop(VERSION)), float(arrays.pop(SECONDS))
+    if version != FORMAT:
+        raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    return arrays, seconds

@@ -24,25 +24,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..core import AntennaOptions, InputError, Split
+from ..core import AntennaOptions, InputError
 from ..core.files import one_line, write_atomically
-from ..fit.config import TrainConfig, with_settings
-from ..fit.folder import package_versions
-from ..fit.start import initial_gaussians
-from ..fit.targets import plan_rows, targets_of
-from ..hybrid.models import kind_of
-from ..measure import make_splits
-from ..measure.observations import check_observations
 from ..parallel import Scheduler, SerialScheduler, run_module
-from ..tasks import TASKS, instrument_of, task_of
-from ..trace import TraceOptions, load_record, open_scene
-from .baseline_run import check_baseline
+from ..tasks import TASKS
+from ..trace import load_record
 from .evaluate import stored_metrics
 from .fit_key import content_digest, dataset_files, scene_files
-from .run_folder import CONFIG, METRICS
-from .traced import is_traced
+from .run_folder import CONFIG, METRICS, package_versions
+from .runs import plan_run
 
 OPTIONS = (
     "dataset",
@@ -180,74 +170,21 @@ def _in_name(value: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-"
 
 
-def check_fit(
-    dataset: str,
-    settings: TrainConfig | TraceOptions | tuple[str, ...],
-    scene: str | None,
-    material: str | None,
-    split: tuple[str, int, float | None],
-    calibration: str | None,
-) -> None:
+def check_run(dataset: str, arguments: Mapping[str, Any]) -> None:
     """Refuse a run that ``wrf-mi train`` would refuse, before anything is written.
 
     Args:
         dataset: name or folder.
-        settings: of a field, of a traced run, or changed ones (``key=value``) of the hybrid.
-        scene: name, folder or file, or None.
-        material: of a bare mesh, or None.
-        split: name, seed, and number or fraction of training rows.
-        calibration: of a traced run, or None.
+        arguments: of `wrf_mi.report.runs.plan_run`.
 
     Raises:
         InputError: data, scene, split or settings that cannot be used.
     """
-    record = _record(dataset)
-    rows = _splits(dataset, split[0], split[1], None if split[2] == 0 and isinstance(settings, tuple) else split[2])
-    if isinstance(settings, TrainConfig):
-        for one in rows:
-            check_observations(record, one, complete=task_of(record).image)
-            plan_rows(settings, targets_of(record, one.all_train), one)
-            initial_gaussians(settings.initial, record, one.train, np.random.default_rng([settings.seed, 0]))
-    else:
-        for one in rows:
-            check_observations(record, one)
-    if isinstance(settings, tuple):
-        with_settings(kind_of(record, scene is not None).settings(), settings)
-        if split[2] == 0 and scene is None:
-            raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
-    elif not isinstance(settings, TrainConfig) and calibration is not None and not task_of(record).in_decibel:
-        raise InputError(f"{record.name}: holds {record.task}; only signal strengths (rssi) can be calibrated with")
-    if scene is not None:
-        _open_scene(scene, instrument_of(record).carrier_hz, material)
-    elif material is not None:
-        raise InputError("--material belongs to a bare mesh; give it with --scene")
-
-
-def check_baseline_run(
-    model: str, dataset: str, split: tuple[str, int, float | None], settings: tuple[str, ...]
-) -> None:
-    """The same for a baseline.
-
-    Args:
-        model: its name.
-        dataset: name or folder.
-        split: name, seed, and number or fraction of training rows.
-        settings: changed ones, ``key=value``.
-
-    Raises:
-        InputError: data, split or settings that cannot be used.
-    """
-    check_baseline(model, _record(dataset), split[0], split[2], split[1], settings)
+    plan_run(_record(dataset), **arguments)
 
 
 # Runs of a sweep share most of these.
 _record = lru_cache(maxsize=4)(load_record)
-_open_scene = lru_cache(maxsize=4)(lambda scene, carrier_hz, material: open_scene(scene, carrier_hz, material=material))
-
-
-@lru_cache(maxsize=16)
-def _splits(dataset: str, name: str, seed: int, n_train: float | None) -> list[Split]:
-    return make_splits(_record(dataset), name, seed, n_train)
 
 
 def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
@@ -323,9 +260,9 @@ def _run(run: SweepRun) -> dict[str, Any]:
     folder = run.folder
     if (folder / METRICS).exists():
         return _row(run, "kept")
-    resumable = (folder / CONFIG).exists() and not is_traced(folder)
+    resumable = (folder / CONFIG).exists()
     if folder.exists() and not resumable:
-        shutil.rmtree(folder)  # a trace, or a run stopped before its configuration was there: nothing to go on from
+        shutil.rmtree(folder)  # stopped before its configuration was there: nothing to go on from
     arguments = ("train", "--resume", str(folder)) if resumable else (*run.arguments, "--out", str(folder))
     status, said = run_module("wrf_mi.cli", arguments)
     if status == 0 and (folder / METRICS).exists():

@@ -26,7 +26,6 @@ from wrf_mi_scenes.furnished import write_scene
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_atomically
-from ..fit.folder import package_versions, versions
 from ..measure.registry import locate
 from ..parallel import Scheduler, SerialScheduler, run_module
 from ..scene.make import make_scene
@@ -37,7 +36,8 @@ from ..trace.walked import MEASURED
 from .bench import BenchFailed, machine, threads
 from .bench_hybrid_csi import SCANNED, scanned_scene
 from .fit_key import content_digest, dataset_files, fit_key, scene_files
-from .run_folder import CONFIG, METRICS, read_run
+from .results import read_run
+from .run_folder import CONFIG, METRICS, package_versions, versions
 from .table_pages import read_rows, write_tables
 from .table_plan import NAMED, Part, Row, available, plan
 

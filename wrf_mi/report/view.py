@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 
 from ..core.angles import FloatArray
 from ..field.gaussians import Gaussians
-from ..fit.folder import load_predictor
+from ..models.ray_tracing import PATHS
 from ..scene.preview import GaussianCloud, draw_scene
 from ..scene.surfaces import KINDS, Kind, Surface
-from ..trace import load_trace, open_scene
+from ..trace import load_trace
 from ..trace.surfaces import scene_surfaces
-from .traced import PATHS, read_trace_config
+from .runs import open_run
 
 SHOWN_GAUSSIANS = 40
 """The strongest ones; all of them would hide the rest."""
@@ -35,20 +35,20 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     Raises:
         InputError: not such run folders, or a scene that is no longer there.
     """
-    config, found = read_trace_config(Path(traced)), load_trace(Path(traced) / PATHS)
-    scene = open_scene(config.scene, found.frequency_hz, material=config.material)
+    run, found = open_run(traced), load_trace(Path(traced) / PATHS)
+    scene = run.problem.open_scene(found.frequency_hz)
     transmitter = found.tx_pos_m[row]
     own = found.paths.select(found.paths.tx == row)
     cloud = None
     if field is not None:
-        cloud = cloud_of(load_predictor(field).gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
+        cloud = cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
     return draw_scene(
         surfaces_of(scene),
         paths=replace(own, tx=np.zeros_like(own.tx), n_tx=1),
         transmitters_m=transmitter,
         receivers_m=[receiver.position_m for receiver in found.receivers],
         gaussians=cloud,
-        title=f"{config.scene}, transmitter of row {row}",
+        title=f"{run.config.scene}, transmitter of row {row}",
     )
 
 

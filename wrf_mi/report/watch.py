@@ -15,7 +15,7 @@ from ..fit.trainer import Progress as FitProgress
 
 
 class Watch:
-    """Shows a progress bar (plain lines where output is not a terminal) and turns Ctrl-C into a stop.
+    """Shows the stages of a fit (plain lines where output is not a terminal) and turns Ctrl-C into a stop.
 
     The first Ctrl-C lets the current step finish and writes a checkpoint; a second one ends at once.
     """
@@ -26,15 +26,13 @@ class Watch:
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console
         )
         self._task: Any = None
-        self._fold: str | None = None
+        self._stage: str | None = None
         self._score = ""
         self._stop = False
 
     def __enter__(self) -> Watch:
-        """Take over Ctrl-C and start the bar."""
+        """Take over Ctrl-C."""
         self._before = signal.signal(signal.SIGINT, self._interrupt)
-        if self._console.is_terminal:
-            self._bar.start()
         return self
 
     def __exit__(
@@ -55,54 +53,27 @@ class Watch:
         """Whether Ctrl-C was pressed."""
         return self._stop
 
-    def listen(self, fold: str, steps: int, p: FitProgress) -> None:
-        """Show one progress report."""
-        if fold != self._fold:
-            self._fold, self._task, self._score = fold, None, ""
+    def listen(self, stage: str, share: float, p: FitProgress | None = None) -> None:
+        """Show that ``share`` (0..1) of a stage is done, and how a training goes."""
+        new = stage != self._stage
+        if new:
+            self._stage, self._task, self._score = stage, None, ""
+        text = "" if p is None else self._text(p)
+        if self._console.is_terminal:
+            if self._task is None:
+                self._bar.start()  # not before: the tracer has a bar of its own
+                self._task = self._bar.add_task(stage, total=1.0, text=text)
+            self._bar.update(self._task, completed=share, text=text)
+        elif p is not None and p.validation_ssim is not None:
+            print(f"{stage} {p.step}/{round(p.step / share)}  {text}", file=sys.stderr, flush=True)
+        elif p is None and new:
+            print(stage, file=sys.stderr, flush=True)
+
+    def _text(self, p: FitProgress) -> str:
         if p.validation_ssim is not None and not math.isnan(p.validation_ssim):  # it is without validation rows
             rows = "validation rows" if p.held_out else "validation rows, now trained on"
             self._score = f"SSIM {p.validation_ssim:.3f} ({rows})"
-        text = f"loss {p.loss:.4f}  {self._score}  {p.gaussians} Gaussians  {_clock(p.left_s)} left"
-        if self._console.is_terminal:
-            if self._task is None:
-                self._task = self._bar.add_task(fold or "training", total=steps, text=text)
-            self._bar.update(self._task, completed=p.step, text=text)
-        elif p.validation_ssim is not None:
-            print(f"{fold or 'training'} {p.step}/{steps}  {text}", file=sys.stderr, flush=True)
-
-
-class Stages:
-    """Shows the stages of a fit that is not made of steps, each with the share of it that is done."""
-
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), console=self._console)
-        self._what: str | None = None
-        self._task: Any = None
-
-    def __enter__(self) -> Stages:
-        """Start the bar."""
-        if self._console.is_terminal:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the bar."""
-        if self._console.is_terminal:
-            self._bar.stop()
-
-    def listen(self, what: str, share: float) -> None:
-        """Show that ``share`` (0..1) of a stage is done."""
-        if what != self._what:
-            self._what = what
-            if self._console.is_terminal:
-                self._task = self._bar.add_task(what, total=1.0)
-            else:
-                print(what, file=sys.stderr, flush=True)
-        if self._console.is_terminal:
-            self._bar.update(self._task, completed=share)
+        return f"loss {p.loss:.4f}  {self._score}  {p.gaussians} Gaussians  {_clock(p.left_s)} left"
 
 
 def _clock(seconds: float) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points
+from collections.abc import Mapping
 
 from ..core import InputError, Record
+from ..core.registry import Registry
 from ..receive.instruments import Instrument
 from . import csi, rssi, spectrum
 from .task import UPLINK, Task
@@ -14,31 +14,7 @@ ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""
 
 
-class _Tasks(Mapping[str, Task]):
-    """Tasks by name: those of this package, of installed ones, and those that `register` added."""
-
-    def __init__(self, *own: Task) -> None:
-        self._known = {task.name: task for task in own}
-        self._others = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
-
-    def add(self, task: Task) -> None:
-        if task.name in self:
-            raise InputError(f"task {task.name!r}: there is one of that name; choose another")
-        self._known[task.name] = task
-
-    def __getitem__(self, name: str) -> Task:
-        if name not in self._known:
-            self._known[name] = self._others[name].load()
-        return self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**self._known, **self._others})
-
-    def __len__(self) -> int:
-        return len(self._known | self._others)
-
-
-_TASKS = _Tasks(spectrum.TASK, rssi.TASK, csi.TASK)
+_TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {t.name: t for t in (spectrum.TASK, rssi.TASK, csi.TASK)})
 TASKS: Mapping[str, Task] = _TASKS
 """Every task by the name that records bear (`wrf_mi.core.Record.task`)."""
 
@@ -49,7 +25,7 @@ def register(task: Task) -> None:
     Raises:
         InputError: a name that is taken.
     """
-    _TASKS.add(task)
+    _TASKS.add(task.name, task)
 
 
 def task_of(record: Record) -> Task:

@@ -9,11 +9,9 @@ was tried and left out: on held-out places it changed the error by less than 0.0
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,11 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line, write_atomically
 from .result import TraceResult, recompute
-
-FORMAT = 1
-"""Version of a file of a calibration."""
 
 
 @dataclass(frozen=True)
@@ -134,32 +128,3 @@ def calibrated_rssi(
     rssi = np.full(power.shape, np.nan)
     np.log10(power, out=rssi, where=power > 0)
     return 10 * rssi + calibration.offset_db[:, None]
-
-
-def save_calibration(file: str | Path, calibration: Calibration) -> Path:
-    """Write as JSON, whole or not at all."""
-    values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(calibration).items()}
-    return write_atomically(Path(file), json.dumps({"format": FORMAT, **values}, indent=1) + "\n")
-
-
-def load_calibration(file: str | Path) -> Calibration:
-    """Read what `save_calibration` wrote.
-
-    Raises:
-        InputError: missing, damaged, or of another format version.
-    """
-    path = Path(file)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        version = content["format"]
-        if version != FORMAT:
-            raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
-        arrays = {key: np.asarray(content[key], float) for key in ("offset_db", "tx_pattern_db", "rx_pattern_db")}
-        materials = {name: (float(a), float(b)) for name, (a, b) in content["materials"].items()}
-        return Calibration(**arrays, materials=materials)
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; calibrate first") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not a readable calibration ({one_line(error)}); calibrate anew") from None

@@ -1,0 +1,63 @@
+"""Registries: objects by name, of this package, of installed packages and of this process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Generic, TypeVar
+
+from .errors import InputError
+
+Entry = TypeVar("Entry")
+
+
+def resolve(address: str) -> Any:
+    """The object at ``module:attribute``; the module is imported."""
+    module, _, attribute = address.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+class Registry(Mapping[str, Entry], Generic[Entry]):
+    """Objects by name; what one needs is imported when it is asked for.
+
+    Args:
+        what: an entry is, for messages.
+        group: of the entry points by which installed packages add entries.
+        own: entries of this package by name, or their addresses ``module:attribute``.
+    """
+
+    def __init__(self, what: str, group: str, own: Mapping[str, Entry | str]) -> None:
+        self._what, self._known = what, dict(own)
+        self._others = {point.name: point for point in entry_points(group=group)}
+        self._twice = self._known.keys() & self._others.keys()
+
+    def add(self, name: str, entry: Entry) -> None:
+        """Add an entry for this process.
+
+        Raises:
+            InputError: a name that is taken.
+        """
+        if name in self:
+            raise InputError(f"{self._what} {name!r}: there is one of that name; choose another")
+        self._known[name] = entry
+
+    def __getitem__(self, name: str) -> Entry:
+        if name in self._twice:
+            place = self._others[name].value
+            raise InputError(f"{self._what} {name!r}: an installed package adds one of that name ({place}); remove it")
+        if name not in self._known:
+            self._known[name] = self._others[name].load()
+        entry = self._known[name]
+        if isinstance(entry, str):
+            entry = self._known[name] = resolve(entry)
+        return entry
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._known or name in self._others  # without importing it
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._known, **self._others})
+
+    def __len__(self) -> int:
+        return len(self._known | self._others)

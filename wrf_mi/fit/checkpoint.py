@@ -1,0 +1,66 @@
+"""What a training run leaves in its folder until it has ended.
+
+    checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
+    log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_ssim, held_out, gaussians
+
+Every file appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError
+from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from .trainer import Progress, Trainer
+
+FORMAT = 4
+"""Version of ``checkpoint.npz``."""
+CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
+
+
+def write_checkpoint(folder: Path, trainer: Trainer) -> None:
+    """Write ``checkpoint.npz``: enough to go on."""
+    own = {"format": np.asarray(FORMAT), "seconds": np.asarray(trainer.seconds)}
+    write_arrays(folder / CHECKPOINT, trainer.state.arrays() | own)
+
+
+def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of ``checkpoint.npz``.
+
+    Raises:
+        InputError: missing, damaged, or of another format version.
+    """
+    path = folder / CHECKPOINT
+    missing = f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume"
+    with readable(path, missing, "restore it or train anew"):
+        arrays = stored_arrays(path)
+        version = int(arrays["format"])
+    if version != FORMAT:
+        raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    return arrays
+
+
+def append_log(folder: Path, progress: Progress) -> None:
+    """Add a line to ``log.jsonl``."""
+    entry = asdict(progress)
+    del entry["left_s"]
+    if progress.validation_ssim is not None and math.isnan(progress.validation_ssim):
+        entry["validation_ssim"] = None  # there are no validation rows, and JSON has no NaN
+    with (folder / LOG).open("a") as stream:
+        stream.write(json.dumps(entry) + "\n")
+
+
+def cut_log(folder: Path, step: int) -> None:
+    """Drop lines after ``step``: what was logged after the checkpoint that a run goes on from happens again."""
+    path = folder / LOG
+    if path.is_file():
+        lines = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]
+        write_atomically(path, "".join(f"{line}\n" for line in lines))

@@ -1,0 +1,83 @@
+"""Models: what can be fitted to measurements, or predicts without, under one name and in one form each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..baselines.method import Inputs, Method
+from ..core import InputError
+from ..core.registry import Registry
+from .model import Fitted, Interrupted, Model, Problem, Session, model_of
+
+ENTRY_POINTS = "wrf_mi.models"
+"""Group of the entry points by which other packages add models."""
+
+_OWN: Mapping[str, Model | Method | str] = {
+    "wrf-gs": "wrf_mi.models.gaussians:WRF_GS",
+    "wrf-gs+": "wrf_mi.models.gaussians:WRF_GS_PLUS",
+    "factorised": "wrf_mi.models.gaussians:FACTORISED",
+    "hybrid": "wrf_mi.models.hybrid:MODEL",
+    "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
+    "idw": "wrf_mi.baselines.idw:METHOD",
+    "kriging": "wrf_mi.baselines.kriged:METHOD",
+    "trees": "wrf_mi.baselines.trees:METHOD",
+    "mri": "wrf_mi.baselines.mri:METHOD",
+    "vae": "wrf_mi.baselines.vae:METHOD",
+    "dcgan": "wrf_mi.baselines.dcgan:METHOD",
+    "nerf2": "wrf_mi.baselines.nerf2:METHOD",
+    "linear": "wrf_mi.baselines.linear:METHOD",
+    "fire": "wrf_mi.baselines.fire:METHOD",
+    "r2f2": "wrf_mi.baselines.r2f2:METHOD",
+    "optml": "wrf_mi.baselines.optml:METHOD",
+}
+
+
+class _Models(Registry["Model | Method"]):
+    """Entries of the short form become `Model` when they are asked for."""
+
+    def __getitem__(self, name: str) -> Model:
+        entry = super().__getitem__(name)
+        if isinstance(entry, Method):
+            entry = self._known[name] = model_of(entry)
+        return entry
+
+
+_MODELS = _Models("model", ENTRY_POINTS, _OWN)
+MODELS: Mapping[str, Model] = _MODELS  # type: ignore[assignment]
+"""Every model by its name, as in ``wrf-mi train --model``."""
+
+
+def register(model: Model | Method) -> None:
+    """Add a model for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
+
+    Raises:
+        InputError: a name that is taken.
+    """
+    _MODELS.add(model.name, model)
+
+
+def known_model(name: str) -> Model:
+    """The model of a name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in MODELS:
+        raise InputError(f"model {name!r}: no such model; choose from {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+__all__ = [
+    "ENTRY_POINTS",
+    "MODELS",
+    "Fitted",
+    "Inputs",
+    "Interrupted",
+    "Method",
+    "Model",
+    "Problem",
+    "Session",
+    "known_model",
+    "model_of",
+    "register",
+]

@@ -1,0 +1,270 @@
+"""What a model is: an entry of the registry, the problem that it is fitted to, and what has been fitted."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..baselines.method import Inputs, Method
+from ..core import AntennaOptions, Prediction, Receiver, Record, Split
+from ..core.antenna import AS_STATED
+from ..core.types import IntArray
+from ..parallel import Scheduler
+
+if TYPE_CHECKING:
+    from ..fit.trainer import Progress
+
+Arrays = dict[str, NDArray[Any]]
+Listen = Callable[[str, float, "Progress | None"], None]
+"""Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time where steps are taken."""
+
+UNUSED_HEADING = "its model does not know how the transmitter is turned; leave heading_rad away"
+UNUSED_UPLINK = "its model does not predict from the uplink; leave uplink away"
+
+
+def quiet(stage: str, share: float, progress: Progress | None = None) -> None:
+    """A progress callback that shows nothing."""
+
+
+class Interrupted(Exception):
+    """A fit was stopped; what was fitted is stored."""
+
+    exit_status = 130
+
+
+@dataclass
+class Problem:
+    """Data, scene and settings that a model is fitted to, and loaded with.
+
+    Attributes:
+        dataset: name, folder, or a record that was loaded.
+        settings: of the model's dataclass.
+        seed: of split and fit.
+        scene: name, scene folder, Mitsuba XML or mesh; None: none.
+        material: of a bare mesh, or None.
+        antennas: patterns and polarisations in place of what the data state.
+        use_rows: whether training rows are used; False: the scene alone predicts.
+        operator: learned fields predict by operator where they can, see `wrf_mi.fit.predictor`.
+    """
+
+    dataset: str | Path | Record
+    settings: Any
+    seed: int = 0
+    scene: str | None = None
+    material: str | None = None
+    antennas: AntennaOptions = AS_STATED
+    use_rows: bool = True
+    operator: bool = True
+
+    @cached_property
+    def record(self) -> Record:
+        """The data with the antennas that were stated, read when first asked for.
+
+        Raises:
+            InputError: they cannot be read.
+        """
+        from ..trace import load_record
+
+        own = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
+        return self.antennas.of(own)
+
+    @cached_property
+    def opened_scene(self) -> Any | None:
+        """The scene (``sionna.rt.Scene``) at the record's carrier, opened when first asked for; None: none.
+
+        Raises:
+            InputError: it cannot be opened, or the data do not tell the carrier.
+        """
+        from ..tasks import instrument_of
+
+        return None if self.scene is None else self.open_scene(instrument_of(self.record).carrier_hz)
+
+    def open_scene(self, frequency_hz: float) -> Any | None:
+        """The scene at another frequency, Hz; None: none.
+
+        Raises:
+            InputError: it cannot be opened.
+        """
+        from ..trace import open_scene  # the tracer is imported where there is a scene
+
+        return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
+
+    def rows(self, split: Split) -> IntArray:
+        """Rows that a fit may use."""
+        return split.all_train if self.use_rows else np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Session:
+    """Where a fit keeps its work and what it reports to.
+
+    Attributes:
+        folder: for files of this fit; that of one fold where there are several. ``checkpoint.npz`` in it is removed
+            when the fitted model is stored.
+        run: the run folder, for files that all folds share.
+        listen: progress callback.
+        stop: asked whether to stop, wherever nothing would be lost.
+        scheduler: computes parts of the work; None: this process.
+        progress: show bars on standard error where the tracer takes time.
+    """
+
+    folder: Path
+    run: Path
+    listen: Listen = quiet
+    stop: Callable[[], bool] = lambda: False
+    scheduler: Scheduler | None = None
+    progress: bool = False
+
+    @property
+    def fold(self) -> str:
+        """Name of the fold; "" where there is one split."""
+        return "" if self.folder == self.run else self.folder.name
+
+    def report(self, stage: str, share: float) -> None:
+        """Progress of a fit that is made in one go.
+
+        Raises:
+            Interrupted: it is to stop.
+        """
+        self.listen(f"{self.fold}: {stage}" if self.fold else stage, share, None)
+        if self.stop():
+            raise self.interrupted(f"in {stage}")
+
+    def interrupted(self, where: str) -> Interrupted:
+        """The error that ends a fit which was stopped."""
+        return Interrupted(f"stopped {where}; go on with: wrf-mi train --resume {self.run}")
+
+
+class Fitted(ABC):
+    """A fitted model.
+
+    Attributes:
+        train_seconds: that the fit took over all sittings; None: as long as `Model.fit` did.
+        receivers: whose observations it predicts; None: those of the record.
+        uses_heading: whether `predict` takes headings; None: as `Model.headings` says.
+    """
+
+    train_seconds: float | None = None
+    receivers: tuple[Receiver, ...] | None = None
+    uses_heading: bool | None = None
+
+    @abstractmethod
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """What the receiver of that index observes, [m, ...] as in `wrf_mi.core.Record`.
+
+        Raises:
+            InputError: inputs that it cannot predict from.
+        """
+
+    @abstractmethod
+    def arrays(self) -> Arrays:
+        """All that `Model.load` needs; no key begins with ``run/``."""
+
+    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
+        """Predictions for rows of the record where they are known already; None: `predict` makes them."""
+        return None
+
+    def facts(self) -> dict[str, Any]:
+        """What ``metrics.json`` says of it beside what it says of any."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Model:
+    """An entry of the registry.
+
+    A model of another package is a `Model`, or a `wrf_mi.baselines.method.Method`, that an entry point of the group
+    ``wrf_mi.models`` names.
+
+    Attributes:
+        name: as in ``wrf-mi train --model``.
+        tasks: that it serves; None: all.
+        settings: frozen dataclass of its settings, all with defaults; or several by what they are for (`by_data`).
+        fit: ``fit(problem, split, session)``. ``split.validation`` may choose what is open; what is returned has seen
+            no row but ``problem.rows(split)``. It may go on from files that it left in ``session.folder``.
+        load: ``load(arrays, problem, folder)``, from `Fitted.arrays`; ``folder`` holds the fitted model.
+        source: where the model is from.
+        scene: whether it takes a scene.
+        uses_antennas: whether patterns and polarisations of antennas count in that scene.
+        scene_alone: whether a scene predicts without training rows.
+        uplink: whether it predicts from the uplink.
+        headings: whether it may predict from how the transmitter is turned.
+        complete: whether it needs every receiver's observation of every training row.
+        given: those of the arguments ``model``, ``seed``, ``deterministic`` and ``receiver`` of `wrf_mi.train` that
+            are settings of its own.
+        defaults: ``key=value`` that differ from the defaults of ``settings``.
+        presets: named settings, ``key=value``.
+        check: ``check(problem, splits)`` raises `InputError` where a fit would, before anything is written.
+        prepare: ``prepare(problem, splits, session)``: the settings with what is still open in them resolved; called
+            before the first fit, and again where that was stopped.
+        by_data: ``by_data(task, with_scene)``: the entry of the same name for data of a task, with or without a scene.
+    """
+
+    name: str
+    tasks: tuple[str, ...] | None
+    settings: type | Mapping[str, type]
+    fit: Callable[[Problem, Split, Session], Fitted]
+    load: Callable[[Arrays, Problem, Path], Fitted]
+    source: str
+    scene: Literal["none", "optional", "required"] = "none"
+    uses_antennas: bool = True
+    scene_alone: bool = False
+    uplink: Literal["none", "optional", "required"] = "none"
+    headings: bool = False
+    complete: bool = False
+    given: tuple[str, ...] = ()
+    defaults: tuple[str, ...] = ()
+    presets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    check: Callable[[Problem, Sequence[Split]], None] | None = None
+    prepare: Callable[[Problem, Sequence[Split], Session], Any] | None = None
+    by_data: Callable[[str, bool], Model] | None = None
+
+    @property
+    def needs_uplink(self) -> bool:
+        """Whether it predicts from the uplink alone."""
+        return self.uplink == "required"
+
+    def serves(self, task: str) -> bool:
+        """Whether it serves a task."""
+        return self.tasks is None or task in self.tasks
+
+    def serving(self, task: str, with_scene: bool) -> Model:
+        """The entry for data of a task, with or without a scene."""
+        return self if self.by_data is None or not self.serves(task) else self.by_data(task, with_scene)
+
+
+class FittedMethod(Fitted):
+    """What a `Method` has fitted."""
+
+    def __init__(self, fitted: Any) -> None:
+        self.own = fitted
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """See `Fitted`; without standard deviations."""
+        return Prediction(self.own.predict(inputs, receiver))
+
+    def arrays(self) -> Arrays:
+        """See `Fitted`."""
+        kept: Arrays = self.own.arrays()
+        return kept
+
+
+def model_of(method: Method) -> Model:
+    """The entry of a model that is fitted to a record's rows alone."""
+
+    def fit(problem: Problem, split: Split, session: Session) -> Fitted:
+        return FittedMethod(method.fit(problem.record, split, problem.settings, problem.seed, session.report))
+
+    def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        return FittedMethod(method.load(arrays, problem.record))
+
+    needed: Any = "required" if method.needs_uplink else "optional"
+    ends = fit, load, method.source
+    return Model(method.name, method.tasks, method.settings, *ends, uplink=needed, headings=True)

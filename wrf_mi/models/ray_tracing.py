@@ -1,0 +1,288 @@
+"""The model ``ray-tracing``: paths of a scene, and what is fitted to make them report as the receivers do.
+
+paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.trace.load_trace`)
+convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all that was tried
+
+Signal strengths are not calibrated: an offset per receiver (`wrf_mi.trace.offsets`) is fitted to the training rows. For
+other tasks nothing is fitted. With ``calibration`` what it names is trained: the graph of `wrf_mi.graph.graph` without
+Gaussians, for every task.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..baselines.method import Inputs
+from ..core import InputError, Prediction, Split
+from ..core.angles import FloatArray
+from ..core.files import readable, write_atomically
+from ..core.types import IntArray
+from ..fit.config import calibration_config, with_settings
+from ..parallel import Scheduler, row_parts
+from ..tasks import instrument_of, task_of
+from ..trace import TraceOptions, TraceResult, load_trace, save_trace
+from ..trace.offsets import Offsets, fit_offsets
+from ..trace.polarization import warn_of_cross_polarization
+from ..trace.result import join_traces
+from ..trace.solve import TARGETS_AT_ONCE
+from ..trace.target import CHOSEN_KINDS, choose_options
+from ..trace.tracer import RayTracer
+from .gaussians import FittedField
+from .gaussians import check as check_field
+from .gaussians import fit as fit_field
+from .model import Arrays, Fitted, Model, Problem, Session
+
+NAME = "ray-tracing"
+PATHS, CONVERGENCE = "paths.npz", "convergence.json"
+TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
+"""Positions of one part at least, for a scheduler: candidates of fewer are made no faster. Where rays go out from the
+receivers alone, a part of any size costs as much as a few hundred positions, and the parts for a worker may be two."""
+
+
+@dataclass(frozen=True)
+class TracingSettings(TraceOptions):
+    """What is traced and fitted.
+
+    Attributes:
+        calibration: what is trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
+            ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null: nothing.
+        steps: of that training; null: those of `wrf_mi.fit.config.calibration_config`.
+        target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
+            further kinds of path are chosen by convergence on a sample of the transmitters (`wrf_mi.trace.target`);
+            null: none are chosen.
+        target_kinds: kinds of path that may then be switched on, separated by commas.
+    """
+
+    calibration: str | None = None
+    steps: int | None = None
+    target_error_db: float | None = None
+    target_kinds: str = ",".join(CHOSEN_KINDS)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be traced or chosen.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        super().__post_init__()
+        if self.calibration is not None:
+            calibration_config("", self.calibration.split(","))
+            if self.target_error_db is not None:
+                raise InputError("target_error_db chooses what is traced without calibration; leave one of them away")
+        if unknown := [kind for kind in self.target_kinds.split(",") if kind and kind not in CHOSEN_KINDS]:
+            raise InputError(f"target_kinds {unknown[0]!r}: choose from {', '.join(CHOSEN_KINDS)}")
+
+    @property
+    def options(self) -> TraceOptions:
+        """What is traced."""
+        return TraceOptions(**{one.name: getattr(self, one.name) for one in fields(TraceOptions)})
+
+
+class FittedTracing(Fitted):
+    """A traced scene with what was fitted to training rows.
+
+    Args:
+        problem: data and scene.
+        arrays: from `arrays`.
+        paths: file of the paths of all rows.
+    """
+
+    def __init__(self, problem: Problem, arrays: Arrays, paths: Path) -> None:
+        self._problem, self._arrays, self._paths = problem, arrays, paths
+        self._last: tuple[Inputs, NDArray[Any], set[int]] | None = None
+        self._offsets: Offsets | None = None
+        if "offset_db" in arrays:
+            self._offsets = Offsets(arrays["offset_db"], arrays["floor_dbm"])
+
+    @cached_property
+    def _tracer(self) -> RayTracer:
+        """With the number of rays that the run settled on, not one that new positions would."""
+        problem = self._problem
+        assert problem.scene is not None
+        options = replace(problem.settings.options, rays=int(self._arrays["rays"]))
+        return RayTracer(problem.scene, instrument_of(problem.record), options, problem.material)
+
+    def _reported(self, traced: TraceResult) -> NDArray[Any]:
+        observed = self._tracer.instrument.observe(traced.paths)
+        return observed if self._offsets is None else self._offsets(observed)
+
+    @cached_property
+    def _of_rows(self) -> NDArray[Any]:
+        return self._reported(load_trace(self._paths))
+
+    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
+        """From the stored paths."""
+        return Prediction(self._of_rows[receiver, rows])
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """See `Fitted`. Positions are traced for all receivers together.
+
+        Raises:
+            InputError: a position inside a solid object.
+        """
+        # One receiver after the other is asked for; the same one again means anew, as where predictions are timed.
+        if self._last is None or receiver in self._last[2] or not _same(self._last[0], inputs):
+            traced = self._tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row)
+            self._last = inputs, self._reported(traced), set()
+        self._last[2].add(receiver)
+        return Prediction(self._last[1][receiver])
+
+    def arrays(self) -> Arrays:
+        """See `Fitted`."""
+        return self._arrays
+
+    def facts(self) -> dict[str, Any]:
+        """Numbers of paths and rays, and what tracing took."""
+        own = {"trace_seconds": float(self._arrays["trace_seconds"])}
+        return own | {"paths": int(self._arrays["paths"]), "rays": int(self._arrays["rays"])}
+
+
+def _same(one: Inputs, other: Inputs) -> bool:
+    pairs = (one.tx_pos_m, other.tx_pos_m), (one.tx_heading_rad, other.tx_heading_rad)
+    return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+
+
+class FittedCalibration(FittedField):
+    """Traced paths whose materials, planes, antennas or poses were trained."""
+
+    def facts(self) -> dict[str, Any]:
+        """What was trained, and how long."""
+        return super().facts() | {"calibration": self._problem.settings.calibration}
+
+
+def _graph_problem(problem: Problem) -> Problem:
+    """The same for the training loop: settings of paths alone."""
+    settings: TracingSettings = problem.settings
+    assert settings.calibration is not None
+    options = settings.options
+    if options.diffraction or options.scattering:
+        raise InputError("calibration: diffraction and scattering have no derivative here; trace without them")
+    own = [f"seed={problem.seed}", f"traced.depth={options.max_depth}", f"traced.reflections={_reflections(options)}"]
+    own += [f"traced.transmission={str(options.transmission).lower()}"]
+    own += [] if options.rays == "auto" else [f"traced.rays={options.rays}"]
+    own += [] if settings.steps is None else [f"steps={settings.steps}"]
+    config = with_settings(calibration_config(problem.record.task, settings.calibration.split(",")), own)
+    return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
+
+
+def _reflections(options: TraceOptions) -> int:
+    if not options.reflection:
+        return 0
+    return options.max_depth if options.max_reflections is None else options.max_reflections
+
+
+def fit(problem: Problem, split: Split, session: Session) -> Fitted:
+    """Train what is to be calibrated, or trace all rows, unless another fold has, and fit offsets of signal strengths.
+
+    Raises:
+        InputError: a receiver without a training row that a path reaches.
+    """
+    if problem.settings.calibration is not None:
+        found = fit_field(_graph_problem(problem), split, session)
+        kept = load(found.arrays(), problem, session.folder)
+        kept.train_seconds = found.train_seconds
+        return kept
+    record, path, start = problem.record, session.run / PATHS, time.perf_counter()
+    assert problem.scene is not None
+    settings: TracingSettings = problem.settings
+    tracer = RayTracer(problem.scene, instrument_of(record), settings.options, problem.material)
+    if path.exists():
+        traced = load_trace(path)
+    else:
+        traced = _trace(tracer, problem, session)
+        warn_of_cross_polarization(traced, tracer.scene)
+        save_trace(path, traced)
+        if session.stop():
+            raise session.interrupted("after tracing")
+    seconds = time.perf_counter() - start
+    facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
+    arrays = {name: np.asarray(value) for name, value in facts.items()}
+    known = split.all_train
+    if task_of(record).in_decibel:
+        offsets = fit_offsets(tracer.instrument.observe(traced.paths)[:, known], record.observation[:, known])
+        arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
+    fitted = FittedTracing(problem, arrays, path)
+    fitted.train_seconds = 0.0
+    return fitted
+
+
+def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+    """What a fit's arrays describe; stored paths lie in the run folder, above the folds."""
+    if problem.settings.calibration is not None:
+        found = FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
+        return found
+    here = folder / PATHS
+    return FittedTracing(problem, arrays, here if here.exists() else folder.parent / PATHS)
+
+
+def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
+    """Paths of all positions; each part with the number of rays that all of them settle on."""
+    tx_pos_m, scheduler = problem.record.tx_pos_m, session.scheduler
+    if scheduler is None:
+        return tracer.trace(tx_pos_m, session.progress)
+    assert problem.scene is not None
+    rays = tracer.rays(tx_pos_m)
+    parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_AT_ONCE)
+    ends = tracer.instrument, replace(tracer.options, rays=rays), problem.material
+    given = [(tx_pos_m[part], part.start) for part in parts]
+    sizes = [len(positions) for positions, _ in given]
+    opener = partial(RayTracer, problem.scene, *ends)
+    found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
+    return replace(join_traces(found), options=tracer.options)
+
+
+def _least(tracer: RayTracer, tx_pos_m: FloatArray, scheduler: Scheduler) -> int:
+    if tracer.options.sampled:
+        return TRACED_AT_LEAST
+    return max(TRACED_AT_LEAST, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
+
+
+def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int]) -> TraceResult:
+    return tracer.trace(part[0], first_row=part[1])
+
+
+def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
+    """Settings with those chosen by convergence, if any are; ``convergence.json`` says what was tried."""
+    settings: TracingSettings = problem.settings
+    path = session.run / CONVERGENCE
+    if settings.target_error_db is None:
+        return settings
+    if not path.exists():
+        record, instrument = problem.record, instrument_of(problem.record)
+        spectra = instrument.observe if task_of(record).image else None
+        kinds = settings.target_kinds.split(",")
+        ends = settings.target_error_db, settings.options, kinds, spectra, record.tx_antenna
+        choice = choose_options(problem.opened_scene, record.tx_pos_m, record.receivers, *ends)
+        write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
+    with readable(path, f"{path}: missing; trace anew", "trace anew"):
+        return replace(settings, **json.loads(path.read_text())["options"])
+
+
+def check(problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse a scene that cannot be opened, and what cannot be calibrated."""
+    if problem.settings.calibration is not None:
+        check_field(_graph_problem(problem), splits)
+    assert problem.opened_scene is not None
+
+
+MODEL = Model(
+    NAME,
+    None,
+    TracingSettings,
+    fit,
+    load,
+    "Hoydis et al., 'Sionna RT' (2023)",
+    scene="required",
+    headings=True,
+    check=check,
+    prepare=prepare,
+)
