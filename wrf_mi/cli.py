@@ -288,7 +288,7 @@ def _add_training(sub: Any) -> None:
     sub.add_argument("--model", choices=list(MODELS), help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
     text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for hybrid, or alone for ray-tracing"
     sub.add_argument("--scene", metavar="SCENE", help=text)
-    text = "receiver model; of spectra pixel (magnitude at each direction) or array (element signals; default with --scene)"
+    text = "of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     sub.add_argument("--receiver", metavar="NAME", help=text)
     _add_tracing(sub)
     sub.add_argument(
