@@ -132,6 +132,7 @@ def test_components_hold_what_channels_are_made_of():
 
 
 @pytest.mark.parametrize("model", MODELS)
+@pytest.mark.all_threads
 @pytest.mark.parametrize("shared", [False, True])
 def test_strengths_are_learned_and_kept(model, shared):
     record = strengths()
@@ -186,6 +187,7 @@ def test_a_second_receiver_with_other_components_is_learned():
         assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
 
 
+@pytest.mark.all_threads
 @pytest.mark.parametrize("name", [*MODELS, "nerf2"])
 def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(name):
     """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""
