@@ -30,8 +30,12 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# A worker for each core; four at most, of one to two gigabytes each. The laboratory is traced first where it is not
+# kept yet, so that no two workers do. Notebooks take longest and begin first, so that no worker is left alone with one
+# in the end; a file stays with one worker, whose tests share what its fixtures fitted.
 test: lint
-	$(BIN)/pytest --nbmake tests notebooks
+	@$(BIN)/python -c 'import wrf_mi; wrf_mi.load("laboratory")'
+	$(BIN)/pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --nbmake notebooks tests
 
 test-slow: $(READY)
 	$(BIN)/pytest -m "slow and not gpu"

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+# Before NumPy is loaded, and for child processes: threads of OpenBLAS wait for each other by spinning, and where
+# another process has one of the cores, small products take twenty times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 from made_flat import write_flat, write_plain_flat
@@ -14,17 +18,20 @@ from made_flat import write_flat, write_plain_flat
 if TYPE_CHECKING:
     from wrf_mi.core import Record
 
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
-@pytest.fixture(autouse=True)
-def same_threads() -> Iterator[None]:
-    """Deterministic fits leave the process on one thread."""
-    drjit = sys.modules.get("drjit")
-    before = drjit and drjit.thread_count()
-    yield
-    if before:
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Dr.Jit computes on this process's share of the cores, and on all of them where a test is marked so.
+
+    Before each test, fixtures of its file included: deterministic fits leave the process on one thread.
+    """
+    if "drjit" in sys.modules:
         from wrf_mi.backend import set_threads
 
-        set_threads(before)
+        workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+        set_threads(max(2, CORES) if item.get_closest_marker("all_threads") else max(1, CORES // workers))
 
 
 @pytest.fixture(scope="session")

@@ -36,6 +36,8 @@ from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError  # noqa: E402
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 EXACT = 1e-12
 """Some hundred float64 products of numbers around one."""
 

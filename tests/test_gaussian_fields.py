@@ -157,6 +157,7 @@ def test_components_hold_what_channels_are_made_of() -> None:
     np.testing.assert_allclose((h[0] @ basis.conj().T) @ basis, h[0], atol=1e-5)
 
 
+@pytest.mark.all_threads
 @pytest.mark.parametrize("model", MODELS)
 def test_strengths_are_learned_and_kept(model: str, tmp_path) -> None:
     record = strengths()
@@ -230,6 +231,7 @@ def test_a_second_receiver_with_other_components_is_learned(antennas: int) -> No
         assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
 
 
+@pytest.mark.all_threads
 @pytest.mark.parametrize("model", [*MODELS, "nerf2"])
 def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
     """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""

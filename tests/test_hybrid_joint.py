@@ -145,6 +145,7 @@ def test_the_pose_too(truth: Truth) -> None:
     assert fit.losses[-1] < 0.05 * fit.losses[0]
 
 
+@pytest.mark.all_threads
 def test_two_receivers_batches_and_another_loss(truth: Truth) -> None:
     """Views share the field, have poses of their own, and take steps in turn; batches go through all rows."""
     count = 5

@@ -27,6 +27,8 @@ from wrf_mi.splat import tiles  # noqa: E402
 from wrf_mi.splat.operator import weight_strips  # noqa: E402
 from wrf_mi.splat.tiles import TileLists, build_lists, perception_plane  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 ROUNDING = 1e-5
 """Float32: matrix products add in another order for another number of columns; the same formula else."""
 

@@ -22,6 +22,8 @@ from wrf_mi_plugins import integrator  # noqa: E402
 
 from wrf_mi.core import InputError  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 wrf_mi_plugins.register_all()
 
 ROUNDING = 1e-5

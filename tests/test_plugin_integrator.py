@@ -27,6 +27,8 @@ from wrf_mi.core.angles import equirectangular_sphere  # noqa: E402
 from wrf_mi.field import Gaussians  # noqa: E402
 from wrf_mi.report import bench_traced  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 wrf_mi_plugins.register_all()
 
 LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02

@@ -23,6 +23,8 @@ from wrf_mi.receive.footprints import gaussian_signals  # noqa: E402
 from wrf_mi.receive.graph import LagMatrix, with_gains  # noqa: E402
 from wrf_mi.receive.graph import gaussian_signals as device_signals  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
 FREQUENCY_HZ = 920e6

@@ -22,6 +22,8 @@ from wrf_mi.splat.render import splat  # noqa: E402
 from wrf_mi.splat.shared import GROUP, group_of  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
 SIZE = 23, 61

@@ -26,6 +26,8 @@ from wrf_mi.splat.render import splat  # noqa: E402
 from wrf_mi.splat.skip import Skip, behind, negligible  # noqa: E402
 from wrf_mi.splat.tiles import build_lists, perception_plane  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 Float64 = dr.float64_array_t(mi.Float)
 RECEIVER = Receiver("r", np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.3, 0.2, 0.9]))
 POSE = Pose(

@@ -22,6 +22,8 @@ from wrf_mi.splat import oracle  # noqa: E402
 from wrf_mi.splat.render import splat  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 FLOAT32_TOLERANCE = 1e-4
 """Relative L2 error of an image: float32 rounding of some ten operations, and pixels on the cut-off."""
 FLOAT64_TOLERANCE = 1e-12

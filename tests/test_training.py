@@ -27,6 +27,8 @@ from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
 from wrf_mi.loss.spectrum import spectrum_loss  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402
 
+pytestmark = pytest.mark.all_threads
+
 FLOAT32_TOLERANCE = 1e-4
 """Greys of one field computed on two ways: float32 rounding, and footprints' cut-off, which is worth 0.01."""
 
