@@ -327,14 +327,16 @@ ONE_ANTENNA = (
     "patience=8",
 )
 """What a field of signal strengths or channels departs from one of spectra in: it ends in few numbers."""
-PATHS = ("steps=400", "batch=8", "validate_every=50", "patience=8", "density.every=0")
+PATHS = ("steps=500", "batch=128", "hold_out=0.9", "validate_every=50", "patience=8", "density.every=0")
 """What paths alone depart in: few parameters are fitted, soon."""
+PATHS_OF_IMAGES = ("batch=8",)
+"""And where observations are images, each of thousands of numbers."""
 HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
-    "gain": ("traced.gain=0.02",),
+    "gain": ("traced.gain=0.05",),
     "materials": ("traced.material=0.05",),
     "planes": ("traced.shift=1e-3", "traced.tilt=5e-4"),
-    "patterns": ("traced.pattern=0.01", "traced.pattern_degree=4"),
+    "patterns": ("traced.pattern=0.03", "traced.pattern_degree=3"),
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
 }
 """What of the traced side can be fitted, by name; rates as ``--set`` takes them."""
@@ -347,12 +349,12 @@ def default_config(task: str) -> TrainConfig:
     return with_settings(TrainConfig(), OF_TASK.get(task, ()))
 
 
-def calibration_config(task: str, parts: Iterable[str]) -> TrainConfig:
+def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:
     """The settings of a fit of paths alone.
 
     Args:
-        task: whose observations they are fitted to.
         parts: what is fitted, of `CALIBRATED`; all else is held.
+        images: whether observations are images.
 
     Raises:
         InputError: none of these, or nothing.
@@ -362,7 +364,8 @@ def calibration_config(task: str, parts: Iterable[str]) -> TrainConfig:
     if unknown or not chosen:
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
     moved = [setting for part in chosen for setting in CALIBRATED[part]]
-    return with_settings(default_config(task), [f"model={PATHS_ALONE}", *PATHS, *HELD, *moved])
+    own = PATHS_OF_IMAGES if images else ()
+    return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *own, *HELD, *moved])
 
 
 PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick": QUICK}

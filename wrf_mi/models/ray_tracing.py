@@ -75,7 +75,7 @@ class TracingSettings(TraceOptions):
         """
         super().__post_init__()
         if self.calibration is not None:
-            calibration_config("", self.calibration.split(","))
+            calibration_config(self.calibration.split(","))
             if self.target_error_db is not None:
                 raise InputError("target_error_db chooses what is traced without calibration; leave one of them away")
         if unknown := [kind for kind in self.target_kinds.split(",") if kind and kind not in CHOSEN_KINDS]:
@@ -170,7 +170,7 @@ def _graph_problem(problem: Problem) -> Problem:
     own += [f"traced.transmission={str(options.transmission).lower()}"]
     own += [] if options.rays == "auto" else [f"traced.rays={options.rays}"]
     own += [] if settings.steps is None else [f"steps={settings.steps}"]
-    config = with_settings(calibration_config(problem.record.task, settings.calibration.split(",")), own)
+    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), own)
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 

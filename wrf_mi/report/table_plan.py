@@ -46,7 +46,7 @@ NAMED = "{scene}"
 """In arguments: in whose place a scene's come."""
 IN_A_FLAT = (
     *("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2"),
-    *("--calibrate", "patterns"),
+    *("--calibrate", "gain,patterns"),
 )
 """Walls are two surfaces each and let waves through; strengths are not calibrated."""
 ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
