@@ -18,7 +18,7 @@ from wrf_mi.core import InputError
 from wrf_mi.measure import load, make_splits, write_nerf2_csi
 from wrf_mi.report.compare import compare
 from wrf_mi.report.results import read_run
-from wrf_mi.report.runs import evaluate_run, open_run, train
+from wrf_mi.report.runs import Interrupted, evaluate_run, open_run, resume, train
 
 FILES = {"config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"}
 ROUNDING = 1e-4
@@ -132,6 +132,21 @@ def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
     refused(["predict", out, *asked], "one model for each block; choose one", capsys)
     status, _, err = call(["predict", out / "fold0", *asked], capsys)
     assert status == 0, err
+
+
+def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: Path) -> None:
+    out, stages = tmp_path / "run", list[str]()
+    with pytest.raises(Interrupted, match=rf"stopped in kriging: receivers; go on with: wrf-mi train --resume {out}"):
+        train(
+            folder,
+            out,
+            "kriging",
+            split="blocked",
+            listen=lambda stage, share, _: stages.append(stage),
+            stop=lambda: stages[-1].startswith("fold1"),
+        )
+    assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
+    assert sorted(read_run(resume(out).folder).row) == list(range(24))
 
 
 def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -104,6 +104,15 @@ def test_no_deterministic_fit_on_a_gpu(one_gateway: Record) -> None:
         Trainer(one_gateway, official(one_gateway), settings("steps=1", "deterministic=true"))
 
 
+@pytest.mark.usefixtures("gpu_process")
+def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> None:
+    """Nothing is written, wherever determinism is stated."""
+    for stated in ({"settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
+        with pytest.raises(BackendError, match="already computes with cuda: start another for llvm"):
+            train(one_gateway, tmp_path / "run", **stated)
+        assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("model", ["wrf-gs+", "hybrid", "ray-tracing"])
 def test_the_command_asks_for_the_cpu_first(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before anything is read: whatever reads a data set may choose the GPU."""

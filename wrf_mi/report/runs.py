@@ -157,12 +157,14 @@ def train(
     """
     folder = Path(out)
     check_new(folder)
-    if deterministic:
+    if deterministic:  # before anything is read: whatever reads a data set may choose the GPU
         init("llvm", threads=1)
     place: dict[str, Any] = {"scene": scene, "material": material, "antennas": antennas, "receiver": receiver}
     rows: dict[str, Any] = {"split": split, "n_train": n_train, "seed": seed}
     own: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
     problem, config, splits = plan_run(dataset, model, **place, **rows, **own)
+    if config.deterministic:
+        init("llvm", threads=1)
     start_run(folder, config, splits)
     try:
         _complete(folder, config, problem, Session(folder, folder, listen, stop, scheduler, progress))
@@ -189,6 +191,8 @@ def resume(
         BackendError: as `train`.
     """
     run = open_run(folder, record)
+    if run.config.deterministic:
+        init("llvm", threads=1)
     session = Session(run.folder, run.folder, listen, stop, scheduler, progress)
     _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
@@ -196,8 +200,6 @@ def resume(
 
 def _complete(folder: Path, config: RunConfig, problem: Problem, session: Session) -> None:
     """Fit every part that is not fitted yet, and score the run."""
-    if config.deterministic:
-        init("llvm", threads=1)
     parts = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in parts]
     if config.entry.prepare is not None and not all((part / FITTED).exists() for part in parts):
