@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from wrf_mi.core import InputError
+from wrf_mi.core.registry import resolve
 from wrf_mi.report import bench_plan
 from wrf_mi.report.bench import CASES, CHECKS, bench, check_table, read_results, table
 from wrf_mi.report.check import main
@@ -79,8 +79,7 @@ def test_checks_say_what_data_they_lack(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The function is there; without data it is one line, exit status 2 and no file."""
-    module, _, function = CHECKS[name].function.partition(":")
-    assert callable(getattr(importlib.import_module(f"wrf_mi.report.{module}"), function))
+    assert callable(resolve(CHECKS[name].function))
     if name in NEEDS_NO_DATA:
         return
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path))
@@ -93,7 +92,7 @@ def test_checks_say_what_data_they_lack(
 def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
     monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
-    assert main("bench_plan:flat_plan", str(tmp_path / "out.json")) == 0
+    assert main("wrf_mi.report.bench_plan:flat_plan", str(tmp_path / "out.json")) == 0
     assert json.loads((tmp_path / "out.json").read_text()) == figures
     line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
     assert line == "| mesh: walls | **0.9** | 0.8 |"

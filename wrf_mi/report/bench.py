@@ -6,7 +6,6 @@ against what it is held to, on data or scenes that others made.
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import platform
@@ -23,6 +22,7 @@ import yaml
 
 from ..core import InputError
 from ..core.files import write_atomically
+from ..core.registry import Registry, resolve
 from ..parallel import Scheduler, SerialScheduler, run_module, worker_threads
 from .fit_key import dataset_files, fit_key
 from .run_folder import CONFIG, METRICS, versions
@@ -35,6 +35,14 @@ class BenchFailed(RuntimeError):
     """A case did not finish; its command said why."""
 
     exit_status = 1
+
+
+ENTRY_POINTS = "wrf_mi.benchmarks"
+"""Group of the entry points by which other packages add checks."""
+
+
+def _here(function: str) -> str:
+    return f"{__package__}.{function}"
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,7 @@ class Check:
 
     Attributes:
         title: for the table.
-        function: ``module:function`` below ``wrf_mi.report``; it takes nothing and returns ``rows``, a list of
+        function: ``module:function``; it takes nothing and returns ``rows``, a list of
             dictionaries ``what``, ``value`` (text with its unit) and ``asked``, beside whatever else it measured.
         quick: likewise, the same with few cases, for `quick_checks`; it raises `BenchFailed` where a bound is not held.
             Empty: there is none.
@@ -102,28 +110,40 @@ CASES: Mapping[str, Case] = {
 }
 
 
-CHECKS: Mapping[str, Check] = {
-    "traced-and-splatted": Check("Mitsuba integrator", "bench_traced:main"),
-    "image-method": Check("Sionna RT against MATLAB", "bench_trace:newrf", data=(CONFERENCE, OFFICE)),
-    "scan-to-paths": Check("mesh from a scan", "bench_scene:scans", data=(CONFERENCE, OFFICE)),
-    "large-scan": Check("mesh from a scan", "bench_scene:large_scan", data=(OFFICE,)),
-    "flat-plan": Check("mesh of a flat", "bench_plan:flat_plan", data=(FLAT,)),
-    "flat-ble": Check("ray tracing in a flat", "bench_calibration:flat", data=(FLAT,)),
-    "stress": Check("numbers under stress", "bench_stress:main", "bench_stress:quick"),
-    "determinism": Check("the same again", "bench_determinism:main", data=(RFID, FLAT, CONFERENCE)),
-    "hybrid-rfid-lab": Check("hybrid, rfid-lab", "bench_hybrid_spectrum:rfid_lab", data=(RFID,)),
-    "hybrid-flat": Check("hybrid, flat-ble", "bench_hybrid_rssi:all_rows", data=(FLAT,)),
-    "hybrid-flat-64": Check("hybrid, flat-ble", "bench_hybrid_rssi:few_rows", data=(FLAT,)),
-    "hybrid-conference": Check("hybrid, newrf", "bench_hybrid_csi:conference", data=(CONFERENCE,)),
-    "hybrid-office": Check("hybrid, newrf", "bench_hybrid_csi:office", data=(OFFICE,)),
-    "hybrid-room": Check("hybrid, traced room", "bench_hybrid_room:main"),
-    "hybrid-starts": Check("WRF-GS+, traced room", "bench_starts:main"),
-    "pareto": Check("traced room", "bench_pareto:main", data=("traced-room",)),
-    "scaling": Check("cost against work", "bench_scaling:main"),
-    "operator": Check("prediction by operator", "bench_operator:main"),
-    "budgets": Check("fields at budgets", "bench_budget:main", data=(RFID,)),
-    "training": Check("training", "bench_training:main", data=(RFID,)),
+_OWN: Mapping[str, Check] = {
+    "traced-and-splatted": Check("Mitsuba integrator", _here("bench_traced:main")),
+    "image-method": Check("Sionna RT against MATLAB", _here("bench_trace:newrf"), data=(CONFERENCE, OFFICE)),
+    "scan-to-paths": Check("mesh from a scan", _here("bench_scene:scans"), data=(CONFERENCE, OFFICE)),
+    "large-scan": Check("mesh from a scan", _here("bench_scene:large_scan"), data=(OFFICE,)),
+    "flat-plan": Check("mesh of a flat", _here("bench_plan:flat_plan"), data=(FLAT,)),
+    "flat-ble": Check("ray tracing in a flat", _here("bench_calibration:flat"), data=(FLAT,)),
+    "stress": Check("numbers under stress", _here("bench_stress:main"), _here("bench_stress:quick")),
+    "determinism": Check("the same again", _here("bench_determinism:main"), data=(RFID, FLAT, CONFERENCE)),
+    "hybrid-rfid-lab": Check("hybrid, rfid-lab", _here("bench_hybrid_spectrum:rfid_lab"), data=(RFID,)),
+    "hybrid-flat": Check("hybrid, flat-ble", _here("bench_hybrid_rssi:all_rows"), data=(FLAT,)),
+    "hybrid-flat-64": Check("hybrid, flat-ble", _here("bench_hybrid_rssi:few_rows"), data=(FLAT,)),
+    "hybrid-conference": Check("hybrid, newrf", _here("bench_hybrid_csi:conference"), data=(CONFERENCE,)),
+    "hybrid-office": Check("hybrid, newrf", _here("bench_hybrid_csi:office"), data=(OFFICE,)),
+    "hybrid-room": Check("hybrid, traced room", _here("bench_hybrid_room:main")),
+    "hybrid-starts": Check("WRF-GS+, traced room", _here("bench_starts:main")),
+    "pareto": Check("traced room", _here("bench_pareto:main"), data=("traced-room",)),
+    "scaling": Check("cost against work", _here("bench_scaling:main")),
+    "operator": Check("prediction by operator", _here("bench_operator:main")),
+    "budgets": Check("fields at budgets", _here("bench_budget:main"), data=(RFID,)),
+    "training": Check("training", _here("bench_training:main"), data=(RFID,)),
 }
+_CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
+CHECKS: Mapping[str, Check] = _CHECKS
+"""Every check by its name."""
+
+
+def register(name: str, check: Check) -> None:
+    """Add a check for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
+
+    Raises:
+        InputError: a name that is taken.
+    """
+    _CHECKS.add(name, check)
 
 
 SHARED_NOTE = (
@@ -191,8 +211,7 @@ def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:
             raise InputError(f"bench {name} --quick: {what}; only {', '.join(able)} has one, or leave --quick away")
     results = []
     for name in names:
-        module, _, function = CHECKS[name].quick.partition(":")
-        figures = getattr(importlib.import_module(f"{__package__}.{module}"), function)()
+        figures = resolve(CHECKS[name].quick)()
         results.append({"case": name, "title": CHECKS[name].title, "figures": figures})
     return results
 

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from pathlib import Path
 
 from ..core import InputError
 from ..core.files import write_atomically
+from ..core.registry import resolve
 
 
 def main(function: str, out: str) -> int:
-    """Call ``function`` (``module:name`` below ``wrf_mi.report``) and write what it returns as JSON.
+    """Call ``function`` (``module:name``) and write what it returns as JSON.
 
     Returns:
         The exit status: 2 with one line where data are missing.
     """
-    module, _, name = function.partition(":")
     try:
-        figures = getattr(importlib.import_module(f"wrf_mi.report.{module}"), name)()
+        figures = resolve(function)()
     except InputError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)
         return 2
