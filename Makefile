@@ -3,11 +3,12 @@
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo lint test test-slow bench bench-quick clean
+.PHONY: help setup demo lint test test-gpu test-slow bench bench-quick clean
 
 help:
 	@echo "make demo       train on real spectra, or on a traced room where there are none"
 	@echo "make test       lint, types, import order, tests, notebooks"
+	@echo "make test-gpu   the tests that need a CUDA device"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make bench      every stored figure, run time against error among them; hours"
 	@echo "make bench-quick  ratios of run times against the stored ones, numbers under stress; two minutes"
@@ -39,6 +40,9 @@ test: lint
 
 test-slow: $(READY)
 	$(BIN)/pytest -m "slow and not gpu"
+
+test-gpu: $(READY)
+	$(BIN)/pytest -m gpu
 
 bench: $(READY)
 	$(BIN)/wrf-mi bench

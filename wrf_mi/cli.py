@@ -267,6 +267,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("names", nargs="*", metavar="NAME", help="cases to measure (default: all), or tables")
     sub.add_argument("--out", default="benchmarks/results", metavar="DIR", help="where results are written")
     sub.add_argument("--runs", default="runs/bench", metavar="DIR", help="where run folders are kept")
+    text = "with --quick: compute with this one (default: CUDA where it works, else LLVM)"
+    sub.add_argument("--backend", choices=("llvm", "cuda"), help=text)
     _add_scheduler(sub)
     text = "a minute: ratios of interleaved pairs, fails if one is clearly above twice the stored one; with the NAME"
     text += " stress few cases of it, fails if a bound is not held; with tables a small version in ten minutes"

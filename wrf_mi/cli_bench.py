@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from .backend import init
 from .cli_train import print_json
 from .core import InputError
 
@@ -14,10 +15,12 @@ TABLES = "tables"
 
 def bench_command(a: argparse.Namespace) -> int:
     """Cases and checks, ratios, or tables."""
+    _check_options(a)
+    if a.backend is not None:  # before anything that computes is imported
+        init(a.backend)
     from .parallel import open_scheduler
     from .report.bench import CASES, CHECKS, bench
 
-    _check_options(a)
     if a.quick and TABLES not in a.names:
         return _quick(a)
     with open_scheduler(a.scheduler) as scheduler:
@@ -41,6 +44,8 @@ def _check_options(a: argparse.Namespace) -> None:
         raise InputError("bench tables: measured by itself; leave the other names away")
     if a.hours is not None and not (alone and a.hours > 0):
         raise InputError("--hours: a positive number with tables; leave it away")
+    if a.backend is not None and (alone or not a.quick):
+        raise InputError("--backend: belongs to --quick; other cases use the one that `wrf-mi doctor` shows")
     if a.store and (alone or not a.quick):
         raise InputError("--store: belongs to --quick without names; cases and tables are stored in any case")
     if a.quick and a.scheduler and not alone:

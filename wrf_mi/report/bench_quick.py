@@ -237,7 +237,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     """Measure all pairs, and store them or hold them against what is stored.
 
     Args:
-        out: folder of `FILE`.
+        out: folder of the stored ratios, see `file_of`.
         store: write it.
         pairs: to measure.
 
@@ -248,14 +248,15 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
         InputError: nothing is stored, or what is cannot be read or comes from another kind of device.
         BenchFailed: a ratio is worse.
     """
-    stored = None if store else read_stored(out / FILE)
+    file = file_of(out)
+    stored = None if store else read_stored(file)
     start = time.perf_counter()
     with one_blas_thread():
         found = measure_pairs(pairs)
     result = {
         "case": "quick",
         "title": "interleaved pairs",
-        "command": "wrf-mi bench --quick --store",
+        "command": f"wrf-mi bench --quick --backend {init().name} --store",
         "wall_seconds": time.perf_counter() - start,
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine(),
@@ -264,10 +265,15 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     }
     if stored is None:
         out.mkdir(parents=True, exist_ok=True)
-        write_atomically(out / FILE, json.dumps(result, indent=1) + "\n")
+        write_atomically(file, json.dumps(result, indent=1) + "\n")
     elif lines := worse(found, stored):
         raise BenchFailed(f"bench --quick: {'; '.join(lines)}")
     return result
+
+
+def file_of(out: Path) -> Path:
+    """Stored ratios of the backend that this process computes with: ``quick.json``, or ``quick-cuda.json``."""
+    return out / (FILE if (own := init().name) == "llvm" else FILE.replace(".", f"-{own}."))
 
 
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
