@@ -196,14 +196,3 @@ def test_predictions_of_another_shape_are_named(tmp_path: Path):
         np.savez(tmp_path / "run" / "predictions.npz", **kept | wrong)
         with pytest.raises(InputError, match=r"shapes do not fit together .*; run evaluate to write it anew"):
             read_run(tmp_path / "run")
-
-
-@pytest.mark.parametrize("task", ["rssi", "csi"])
-@pytest.mark.parametrize("split", ["official", "blocked"])
-def test_factorised_fields_are_fitted_to_spectra_alone(tmp_path: Path, task: str, split: str):
-    from wrf_mi.report.runs import train
-
-    with pytest.raises(InputError, match=f"made-up: holds {task}; factorised serves spectrum, so choose") as error:
-        train(record(task, 1), tmp_path / "run", "factorised", split=split)
-    assert "\n" not in str(error.value)
-    assert not (tmp_path / "run").exists()

@@ -21,13 +21,13 @@ init()
 import drjit as dr  # noqa: E402
 
 from wrf_mi.core import InputError, Record, Split  # noqa: E402
-from wrf_mi.fit import trainer  # noqa: E402
 from wrf_mi.fit.checkpoint import read_checkpoint  # noqa: E402
 from wrf_mi.fit.config import TrainConfig  # noqa: E402
 from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
 from wrf_mi.measure import load, load_split, make_splits, write_spectrum_folder  # noqa: E402
 from wrf_mi.report.runs import Interrupted, Run, evaluate_run, open_run, resume, train  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402
+from wrf_mi.tasks.spectrum import Spectrum  # noqa: E402
 
 PARALLEL_TOLERANCE = 1e-3
 """Greys of two runs on several threads after 40 steps: sums of gradients differ in their last digit, 1e-7, and Adam
@@ -143,10 +143,11 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The loss of one row is not a number; with that mended, the run goes on as if nothing had been."""
-    paper = trainer._paper_loss
+    paper = Spectrum.loss
 
-    def loss(prediction: Any, truth: Any, *shape: int, eta: float) -> Any:
-        return dr.select(dr.max(truth) > 1.5, np.nan, paper(prediction, truth, *shape, eta=eta))
+    def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, structural_weight: float) -> Any:
+        found = paper(task, prediction, truth, *shape, structural_weight=structural_weight)
+        return dr.select(dr.max(truth) > 1.5, np.nan, found)
 
     config = settings("steps=20", "checkpoint_every=2", "log_every=20", "validate_every=20", "deterministic=true")
     broken = load(folder)  # keeps its source, which is what a resumed run reads
@@ -155,7 +156,7 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     row = next(r for r in reached if reached.index(r) % 2 == 0 and reached.index(r) > 8)
     step = reached.index(row) + 1
     broken.observation[0, row, 4, 5] = 2
-    monkeypatch.setattr(trainer, "_paper_loss", loss)
+    monkeypatch.setattr(Spectrum, "loss", loss)
     with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
         train(broken, tmp_path / "broken", settings=config)
     monkeypatch.undo()

@@ -73,8 +73,8 @@ def test_bad_input_is_refused_before_anything_starts(
         (folder, ["model=hybrid", "n-train=0,4"], "nothing to predict from"),
         (
             flat_folder,
-            ["model=factorised", "seed=0,1"],
-            "holds rssi; factorised serves spectrum, so choose another model",
+            ["model=vae", "seed=0,1"],
+            "holds rssi; vae serves spectrum, so choose another model",
         ),
         (flat_folder, ["model=ray-tracing", "scene=nowhere"], "nowhere"),
         (tmp_path / "none", ["seed=0,1"], "none"),

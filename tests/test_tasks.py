@@ -112,7 +112,10 @@ def test_models_that_do_not_serve_a_task_say_so_in_one_line(
     for model, message in (
         ("trees", "holds delay-spread; trees serves rssi, so choose another model: idw, kriging"),
         ("hybrid", "holds delay-spread; hybrid serves spectrum, rssi and csi, so choose another model: idw, kriging"),
-        ("factorised", "holds delay-spread; factorised serves spectrum, so choose another model: idw, kriging"),
+        (
+            "factorised",
+            "holds delay-spread; factorised serves spectrum, rssi and csi, so choose another model: idw, kriging",
+        ),
     ):
         done = command(environment, "train", data, "--model", model, "--out", tmp_path / model)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
