@@ -13,17 +13,19 @@ from hybrid_room import CEILING, FREQUENCY_HZ, WALLS, receiver, room, transmitte
 from scipy.spatial.transform import Rotation
 from small_fits import stop_after
 
-from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.fit.config import TrainConfig, calibration_config, default_config, with_settings
 from wrf_mi.fit.trainer import NumericsError, Trainer
+from wrf_mi.hybrid import PowerReceiver, TracedField, TracedOptions
 from wrf_mi.hybrid.materials import physical
 from wrf_mi.tasks import instrument_of
 from wrf_mi.trace import TraceOptions, trace_paths
-from wrf_mi.trace.materials import BELOW_1_GHZ
+from wrf_mi.trace.materials import BELOW_1_GHZ, with_materials
 
 # isort: split
 import drjit as dr
+import mitsuba as mi
 
 ARRAY_M = planar_array(4, 4, 0.16)
 BAND_HZ = FREQUENCY_HZ + np.linspace(-10e6, 10e6, 4)
@@ -104,6 +106,33 @@ def test_a_gain_starts_at_that_of_the_observations(task: str, tmp_path: Path) ->
         assert peaks.mean() == pytest.approx(1, abs=1e-3)
 
 
+def test_patterns_are_recovered(tmp_path: Path) -> None:
+    """Strengths of a transmitter whose pattern turns with its heading, at receivers with patterns of their own."""
+    scene, rng = room(tmp_path, WALLS), np.random.default_rng(7)
+    tx, heading = rng.uniform([1, 1, 0.8], [5, 4, 2.4], (80, 3)), rng.uniform(-np.pi, np.pi, 80)
+    receivers = receiver(), Receiver("tag", np.array([1.0, 4.0, 2.0]), receiver().orientation_xyzw)
+    model, options = PowerReceiver(4, 8, (FREQUENCY_HZ,), interference=False), TracedOptions(OPTIONS, pattern_degree=1)
+    truth = {"pattern.transmitter": rng.normal(0, 0.5, (2, 3))}
+    truth |= {f"receiver.{one.name}.pattern": rng.normal(0, 0.5, (2, 3)) for one in receivers}
+    given = {name: mi.TensorXf(value.astype(np.float32)) for name, value in truth.items()}
+    sides = [TracedField(scene, tx, one, options, heading) for one in receivers]
+    seen = np.stack([model(side(given), None).numpy() for side in sides]).astype(np.float32)
+    hz = np.array([FREQUENCY_HZ])
+    record = Record("room", "rssi", tx, receivers, seen, frequencies_hz=hz, tx_heading_rad=heading)
+    error = []
+    for parts in ("gain", "gain,patterns"):
+        config = paths_alone(parts, "steps=400", "batch=30")
+        config = with_settings(config, ["traced.pattern_degree=1"] if "patterns" in parts else [])
+        trainer = Trainer(record, all_of(record, 60), config, scene=scene)
+        trainer.run()
+        predict = trainer.predictor()
+        found = np.stack([predict.of_rows(record, np.arange(60, 80), r) for r in range(2)])
+        error.append(np.median(np.abs(found - seen[:, 60:])))
+    assert error[1] < 0.1 * error[0]
+    with pytest.raises(InputError, match="needs headings; give heading_rad"):
+        predict(tx[:2])
+
+
 def test_permittivity_is_recovered_beside_gaussians(tmp_path: Path) -> None:
     """The Gaussians take the echo of the ceiling, which the mesh lacks."""
     whole, known = rooms(tmp_path)
@@ -164,3 +193,15 @@ def test_the_documented_training_runs(capsys: pytest.CaptureFixture[str]) -> Non
     permittivity, error = (float(line) for line in capsys.readouterr().out.split())
     assert 1 < permittivity < 10
     assert 0 < error < 1
+
+
+def test_materials_are_replaced_for_a_block_only(tmp_path: Path) -> None:
+    scene = room(tmp_path, WALLS)
+    concrete = scene.radio_materials["itu_concrete"]
+    before, callback = float(np.ravel(concrete.relative_permittivity)[0]), concrete.frequency_update_callback
+    with with_materials(scene, {"itu_concrete": (7.0, 0.2)}):
+        assert float(np.ravel(concrete.relative_permittivity)[0]) == 7
+    assert float(np.ravel(concrete.relative_permittivity)[0]) == before
+    assert concrete.frequency_update_callback is callback
+    with pytest.raises(InputError, match="no radio material 'itu_ice'"), with_materials(scene, {"itu_ice": (3, 0)}):
+        pass
