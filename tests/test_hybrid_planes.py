@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from hybrid_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, WALLS, WIDTH, receiver, room, transmitters
+from small_fits import stop_after
 from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.core import InputError, Receiver
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.fit.config import calibration_config, with_settings
+from wrf_mi.fit.trainer import Trainer
 from wrf_mi.graph.settings import TRACED_NAMES, TracedConfig
-from wrf_mi.hybrid import ArrayReceiver, CsiReceiver, JointFit, TracedField, TracedOptions, View
+from wrf_mi.hybrid import CsiReceiver, TracedField, TracedOptions
 
 # isort: split
 import drjit as dr
@@ -169,19 +172,32 @@ def test_a_material_that_is_no_slab_is_named(scene: Any) -> None:
             traced._search(receiver().position_m)
 
 
+def record_of(receivers: tuple[Receiver, ...], tx: np.ndarray, observation: np.ndarray, task: str) -> Record:
+    hz = FREQUENCY_HZ * np.array([1, 1.02]) if task == "csi" else np.array([FREQUENCY_HZ])
+    return Record("room", task, tx, receivers, observation, frequencies_hz=hz)
+
+
+def trainer_of(record: Record, scene: Any, parts: str, *settings: str) -> Trainer:
+    """Paths alone, trained on all rows."""
+    rows = np.arange(len(record))
+    own = ("traced.rays=4096", "optimiser.warm_up=10", "hold_out=0", "patience=0", f"batch={len(record)}")
+    config = with_settings(calibration_config(parts.split(","), record.task == "spectrum"), [*own, *settings])
+    return Trainer(record, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=scene)
+
+
 def test_planes_are_found_again(scene: Any, tmp_path: Path) -> None:
     """Channels of a room whose ceiling hangs lower and slants tell where it is."""
-    options = TracedOptions(replace(OPTIONS, max_depth=1), gain=300.0, planes=True)
-    tx = transmitters(12, seed=3)
+    tx, model = transmitters(12, seed=3), CsiReceiver(2, 4, (FREQUENCY_HZ, 1.02 * FREQUENCY_HZ))
+    options = TracedOptions(replace(OPTIONS, max_depth=1), planes=True)
     true = TracedField(room(tmp_path, {**WALLS, **ceiling(-0.02, True), **PARTITION}), tx, receiver(), options)
-    model = CsiReceiver(2, 4, (FREQUENCY_HZ, 1.02 * FREQUENCY_HZ))
     observed = model(true({}), None).numpy().reshape(len(tx), -1, 2).astype(float) @ [1, 1j]
-    traced = TracedField(scene, tx, receiver(), options)
-    rates = {SHIFT: 0.002, TILT: 0.002, "*": 0.0}
-    fit = JointFit(tx, [View(receiver(), model, observed, traced)], rates=rates)
-    fit.run(250, final_factor=0.02)
-    assert fit.losses[-1] < 0.05 * fit.losses[0]
-    plane, values = plane_of(scene, "ceiling"), fit.values()
+    record = record_of((receiver(),), tx, observed[None].astype(np.complex64), "csi")
+    rates = "traced.shift=0.002", "traced.tilt=0.002", "traced.depth=1", "traced.reflections=1", "steps=500"
+    trainer = trainer_of(record, scene, "planes", *rates)
+    assert set(trainer.state.adam) == {SHIFT, TILT}
+    trainer.run()
+    miss = np.abs(trainer.predictor()(tx) - observed).mean() / np.abs(observed).mean()
+    plane, values = plane_of(scene, "ceiling"), trainer.state.params()
     expected = {name: value.numpy() for name, value in moved_values(scene, -0.02, True).items()}
     # Where the ceiling is met, not at its centre: shift and tilt are told apart over 0.3 m of it alone.
     spot = np.array([3.0, 2.3, HEIGHT])
@@ -192,40 +208,38 @@ def test_planes_are_found_again(scene: Any, tmp_path: Path) -> None:
         normal = walls.normal[plane]
         return float((walls.offset_m[plane] - normal[:2] @ spot[:2]) / normal[2])
 
+    assert miss < 0.02
     assert height(values) == pytest.approx(height(expected), abs=3e-3)
     assert abs(height(expected) - HEIGHT) > 0.015
 
 
-def test_views_share_planes_and_keep_their_recordings(scene: Any) -> None:
-    """A search for paths in one view, and steps on it, leave the recorded steps of the others as they are."""
-    own, other = receiver((10, 5, 0)), Receiver("tag", np.array([1.0, 4.0, 2.0]), receiver().orientation_xyzw)
-    tx = transmitters(4)
-    options = TracedOptions(OPTIONS, gain=300.0, materials="surface", planes=True)
-    model = ArrayReceiver(6, 12, planar_array(3, 3, 0.16), FREQUENCY_HZ)
-    truth = np.random.default_rng(0).uniform(0, 1, (len(tx), 6, 12))
-    sides = [TracedField(scene, tx, one, options) for one in (own, other)]
-    views = [View(one, model, truth, side) for one, side in zip((own, other), sides, strict=True)]
-    fit = JointFit(tx, views, rates={"receiver.array.position": 1e-4, "plane.*": 1e-4})
-    fit.run(6)
-    assert {SHIFT, TILT, "material.surface.permittivity"} <= set(fit.adam)
-    (_, first), (_, second) = fit._steps[0], fit._steps[1]
+def test_receivers_share_planes_and_keep_their_recordings(scene: Any) -> None:
+    """A search for paths at one receiver, and steps on it, leave the recorded steps of the others as they are."""
+    array = planar_array(3, 3, 0.16)
+    own = replace(receiver((10, 5, 0)), array_m=array)
+    other = Receiver("tag", np.array([1.0, 4.0, 2.0]), own.orientation_xyzw, array_m=array)
+    tx, spectra = transmitters(4), np.random.default_rng(0).uniform(0, 1, (2, 4, 8, 16)).astype(np.float32)
+    record = record_of((own, other), tx, spectra, "spectrum")
+    settings = "traced.materials=surface", "traced.material=0.05", "traced.position=1e-4", "steps=40"
+    trainer = trainer_of(record, scene, "planes", "traced.depth=2", *settings)
+    names = {SHIFT, TILT, "material.surface.permittivity", "receiver.array.position", "receiver.tag.position"}
+    assert names <= set(trainer.state.adam)
+    trainer.run(stop=stop_after(10))
+    first, second = trainer._steps[0, 1], trainer._steps[1, 1]
     recordings = second.n_recordings
-    before = fit.predict(view=1)
-    # Further than a quarter of a wavelength: the next step on the first view searches.
-    fit.set_values({"receiver.array.position": np.array([0.3, 0.0, 0.0])})
-    np.testing.assert_array_equal(fit.predict(view=1), before)
-    moved = fit.values()[SHIFT]
-    fit.run(4)
-    assert (sides[0].searches, sides[1].searches) == (2, 1)
-    assert fit._steps[0][1] is not first
-    assert fit._steps[1][1] is second
+    before = trainer.state.params()
+    # As a step does once the receiver is further than a quarter of a wavelength from where it was.
+    side = trainer._sides[0]
+    assert side is not None
+    side._search(own.position_m + np.array([0.05, 0, 0]))
+    trainer.run(stop=stop_after(6))
+    assert [side.searches for side in trainer._sides if side is not None] == [2, 1]
+    assert trainer._steps[0, 2] is not first
+    assert trainer._steps[1, 1] is second
+    assert (0, 1) not in trainer._steps
     assert second.n_recordings == recordings
-    # Steps on either view move the planes, and the replayed step sees where they are.
-    assert np.abs(fit.values()[SHIFT] - moved).max() > 0
-    prediction, loss = fit.predict(view=0), fit.step()
-    assert loss == pytest.approx(np.abs(prediction - truth).mean(), rel=1e-3)
-    prediction, loss = fit.predict(view=1), fit.step()
-    assert loss == pytest.approx(np.abs(prediction - truth).mean(), rel=1e-3)
+    # Steps at either receiver move the planes, and the replayed step sees where they are.
+    assert np.abs(trainer.state.params()[SHIFT] - before[SHIFT]).max() > 0
 
 
 def test_rates_of_the_configuration(scene: Any) -> None:

@@ -129,6 +129,8 @@ def test_a_receiver_without_paths_still_has_its_gaussians(rooms: dict[str, Path]
     below = replace(record, tx_pos_m=record.tx_pos_m - np.array([0, 0, 9.0]))
     trainer = trained(below, rooms["known"], "traced.transmission=false", "steps=30")
     assert np.isfinite(trainer.predictor()(below.tx_pos_m[:4], 0)).all()
+    with pytest.raises(InputError, match="rx0: no training row is reached by a path"):
+        trained(below, rooms["known"], "model=ray-tracing", "traced.transmission=false", "steps=30")
 
 
 def test_an_uplink_and_a_scene_do_not_go_together(rooms: dict[str, Path]) -> None:

@@ -5,7 +5,6 @@ Whatever is refused is refused in one line that names the data, before anything 
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +101,11 @@ def test_a_stopped_trace_goes_on_with_its_paths(
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    out, settings = tmp_path / "run", ray_tracing.TracingSettings(**asdict(DIRECT))
+    out = tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(module, stage, stopped)
         with pytest.raises(KeyboardInterrupt):
-            train(flat_folder, out, "ray-tracing", scene=room, settings=settings, split=split)
+            train(flat_folder, out, "ray-tracing", scene=room, settings=DIRECT, split=split)
     written = (out / "paths.npz").stat().st_mtime_ns  # an hour's work may lie there
     again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
     refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)

@@ -51,7 +51,6 @@ def public_functions() -> dict[str, Callable[..., Any]]:
     """Functions of the library that take a receiver from a user."""
     from wrf_mi.fit.predictor import Predictor
     from wrf_mi.hybrid.csi import CsiHybrid
-    from wrf_mi.hybrid.joint import JointFit
     from wrf_mi.hybrid.measured_spectrum import MeasuredSpectrumHybrid
     from wrf_mi.hybrid.models import HybridModel
     from wrf_mi.hybrid.rssi import RssiHybrid
@@ -59,15 +58,14 @@ def public_functions() -> dict[str, Callable[..., Any]]:
     from wrf_mi.receive.calibrate import fit_array
     from wrf_mi.report.runs import Run
 
-    models = (CsiHybrid, MeasuredSpectrumHybrid, RssiHybrid, SpectrumHybrid, HybridModel, Run, JointFit)
+    models = (CsiHybrid, MeasuredSpectrumHybrid, RssiHybrid, SpectrumHybrid, HybridModel, Run)
     found = {model.__name__: model.predict for model in models}
-    return {**found, "Predictor": Predictor.__call__, "learned": JointFit.learned, "fit_array": fit_array}
+    return {**found, "Predictor": Predictor.__call__, "fit_array": fit_array}
 
 
 def test_functions_say_that_they_take_names() -> None:
     for name, function in public_functions().items():
-        given = inspect.signature(function).parameters
-        assert given["view" if "view" in given else "receiver"].annotation == "int | str", name
+        assert inspect.signature(function).parameters["receiver"].annotation == "int | str", name
 
 
 def test_runs_predict_for_a_receiver_by_name(plain_flat_folder: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from wrf_mi.trace.options import with_kinds
 from wrf_mi.trace.tracer import RayTracer
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
-CALIBRATED = TracingSettings(reflection=False, max_depth=0, calibration="patterns")
+CALIBRATED = TracingSettings(reflection=False, max_depth=0, calibration="gain,patterns", steps=60)
 FLOAT32_DB = 1e-4
 """Predictions are stored as float32; gains come from float32 amplitudes."""
 
@@ -132,7 +132,7 @@ def test_headings_are_refused_where_unused_and_demanded_where_used(
     record, out = load(flat_folder), tmp_path / "p.npz"
     heading = np.zeros(len(read_run(run).row))
     for folder, headings, message in [
-        (calibrated, None, "calibrated with the transmitter's headings; give heading_rad"),
+        (calibrated, None, "the model needs headings; give heading_rad"),
         (run, heading, "does not know how the transmitter is turned; leave heading_rad away"),
     ]:
         asked = asked_rows(folder, record, tmp_path / "tx.csv", headings)
@@ -164,12 +164,12 @@ def test_calibration_is_kept_and_scores_again(
 ) -> None:
     out = calibrated
     read = read_run(out)
-    assert read.metrics["calibration"] == "patterns"
+    assert read.metrics["calibration"] == "gain,patterns"
     assert read.metrics["train_seconds"] > 0
     assert not np.allclose(read.prediction, read_run(run).prediction, atol=0.1)
     assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
     assert evaluate_run(out, "random")["split"] == "random (rows unseen by official)"
-    with pytest.raises(InputError, match="setting calibration: 'everything'; choose from patterns, all"):
+    with pytest.raises(InputError, match="calibration everything: choose of gain, materials, planes, patterns, pose"):
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 
 
@@ -237,7 +237,7 @@ def test_train_and_trace_are_one_for_the_ray_tracer(
     named[-2] = tmp_path / "other"
     for wrong, message in (
         (named, "ray-tracing needs a scene; give --scene SCENE"),
-        ([*named, "--scene", room, "--set", "steps=1"], "unknown setting steps"),
+        ([*named, "--scene", room, "--set", "batch=1"], "unknown setting batch"),
         (["train", flat_folder, "--depth", "1", "--out", tmp_path / "other"], "belong to --model ray-tracing"),
     ):
         refused(wrong, message, capsys)

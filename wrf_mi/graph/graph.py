@@ -154,10 +154,17 @@ class Graph:
         return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the parameters beside the field's that a rate moves, by name; sides of all receivers."""
+        """Starting values of the parameters beside the field's that a rate moves, by name; sides of all receivers.
+
+        Raises:
+            InputError: without Gaussians, a receiver that no path reaches.
+        """
         values: dict[str, NDArray[np.float32]] = {}
         for side in sides:
             if side is not None:
+                if self.field is None and not side.exists.any():
+                    name = side.receiver.name
+                    raise InputError(f"{name}: no training row is reached by a path; trace more kinds of path")
                 values |= {name: v for name, v in side.parameters().items() if self.traced.rate(name) > 0}
         if self.field is not None and self.kind.levels:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)

@@ -6,19 +6,16 @@ from .. import backend
 backend.init()
 
 from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver  # noqa: E402
-from .joint import JointFit, View  # noqa: E402
 from .learned import learned_field  # noqa: E402
 from .traced import TracedField, TracedOptions, TracedPaths  # noqa: E402
 
 __all__ = [
     "ArrayReceiver",
     "CsiReceiver",
-    "JointFit",
     "PixelReceiver",
     "PowerReceiver",
     "TracedField",
     "TracedOptions",
     "TracedPaths",
-    "View",
     "learned_field",
 ]

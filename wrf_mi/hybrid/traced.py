@@ -210,10 +210,6 @@ class TracedField:
             values |= self._planes.parameters()
         return values
 
-    def at(self, tx_pos_m: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> TracedField:
-        """The same field for other transmitters."""
-        return TracedField(self.scene, tx_pos_m, self.receiver, self.options, tx_heading_rad)
-
     def refresh(self, parameters: Mapping[str, Any]) -> bool:
         """Search for paths again if the receiver has moved too far from where they were searched.
 

@@ -282,7 +282,6 @@ MODEL = Model(
     load,
     "Hoydis et al., 'Sionna RT' (2023)",
     scene="required",
-    headings=True,
     check=check,
     prepare=prepare,
 )

@@ -16,12 +16,12 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from ..baselines.idw import InverseDistance
 from ..baselines.kriging import Kriging
-from ..core import Receiver, Record
+from ..core import Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.files import write_arrays
 from ..core.types import IntArray
-from ..field import Encoding, WrfGsPlus, random_gaussians
-from ..hybrid import CsiReceiver, JointFit, View
+from ..fit.config import default_config, with_settings
+from ..fit.trainer import Trainer
 from ..hybrid.csi import CsiSettings, fit_csi
 from ..measure.newrf import read_newrf
 from ..scene.make import make_scene
@@ -39,9 +39,19 @@ POSES = 6
 RAYS = 1 << 20
 SCANNED = "scene"
 """Folder of the scene that `scanned_scene` makes."""
-ENCODING = Encoding(position_octaves=6, position_scale_m=4.0, tx_octaves=6, tx_scale_m=4.0)
-GAUSSIANS, LAYERS, WIDTH, STEPS, BATCH = 150, 4, 64, 1000, 16
-"""Of the learned field alone."""
+STEPS = 1000
+LEARNED = (
+    "hold_out=0",
+    "patience=0",
+    "batch=16",
+    "initial.gaussians=150",
+    "initial.size_deg=10",
+    "encoding.position_octaves=6",
+    "encoding.tx_octaves=6",
+    "encoding.tx_scale_m=4",
+    "optimiser.averaging=0.99",
+)
+"""Settings of the learned field alone."""
 
 Complex = NDArray[np.complex128]
 
@@ -131,24 +141,10 @@ def scanned_scene(room: str | Path, work: Path, seed: int, range_noise_m: float 
 
 def learned_field_alone(record: Record, train: IntArray, test: IntArray, seed: int, steps: int = STEPS) -> Complex:
     """What a WRF-GS+ field learns without a mesh."""
-    assert record.frequencies_hz is not None
-    observed = record.observation[0, train]
-    unit = float(np.sqrt(np.square(np.abs(observed)).mean()))
-    receiver = record.receivers[0]
-    model = CsiReceiver(10, 40, tuple(map(float, record.frequencies_hz)))
-    start = random_gaussians([receiver], GAUSSIANS, np.random.default_rng(seed), size_deg=10.0, signal=0.05)
-    fit = JointFit(
-        record.tx_pos_m[train],
-        [View(receiver, model, observed / unit)],
-        WrfGsPlus(encoding=ENCODING, layers=LAYERS, width=WIDTH, skip=2),
-        start,
-        rates={"receiver.*": 0.0},
-        batch=BATCH,
-        seed=seed,
-    )
-    fit.run(steps, final_factor=0.05)
-    parts = fit.predict(record.tx_pos_m[test])
-    return np.asarray((parts[..., 0] + 1j * parts[..., 1]) * unit, complex)
+    config = with_settings(default_config(record.task), [*LEARNED, f"seed={seed}", f"steps={steps}"])
+    trainer = Trainer(record, Split("official", seed, train, train[:0], test), config)
+    trainer.run()
+    return np.asarray(trainer.predictor()(record.tx_pos_m[test]), complex)
 
 
 def _without_scan(record: Record, train: IntArray, test: IntArray) -> dict[str, Complex]:

@@ -13,7 +13,7 @@ import numpy as np
 from ..baselines.idw import InverseDistance
 from ..baselines.kriging import Kriging, log_distance
 from ..baselines.trees import Trees
-from ..core import InputError, Record
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..hybrid.rssi import RssiSettings, fit_rssi
@@ -22,23 +22,16 @@ from ..measure.registry import locate
 from ..scene.make import make_scene
 from ..tasks import TASKS
 from ..tasks.scores import abs_error_db
-from ..trace import TraceResult, open_scene, recompute, trace_paths
-from ..trace.calibrate import (
-    OFFSETS_ALONE,
-    CalibrationOptions,
-    absolute_error_db,
-    calibrate,
-    choose_calibration,
-)
-from .bench_calibration import HEIGHT_M, OPTIONS, WALLS_M
+from ..trace import open_scene
+from .bench_calibration import CALIBRATED, HEIGHT_M
 from .paired import agreed, paired_difference
+from .results import read_run
+from .runs import train
 
 SEEDS = (0, 1, 2)
 FEW = 64
 NORMAL_90 = 1.6449
 """Half the width of the normal distribution's 90 % interval, in standard deviations."""
-PATTERNS = CalibrationOptions(materials=False)
-"""What `wrf_mi.report.bench_calibration` finds best on held-out training rows."""
 HYBRID = "hybrid"
 Scored = dict[str, tuple[FloatArray, FloatArray | None]]
 """By method: absolute errors in dB and whether the 90 % interval holds the truth, [n_rx, test rows] each."""
@@ -66,16 +59,13 @@ def flat_strengths(
     with tempfile.TemporaryDirectory() as work:
         made = make_scene(Path(folder) / "layout.csv", Path(work) / "flat", height_m=HEIGHT_M).folder
         assert record.frequencies_hz is not None
-        frequency_hz = float(record.frequencies_hz[0])
-        scene = open_scene(made, frequency_hz)
-        tracer = open_scene(made, frequency_hz) if ray_tracing else None
-        traced = trace_paths(tracer, record.tx_pos_m, record.receivers, OPTIONS) if ray_tracing else None
+        scene = open_scene(made, float(record.frequencies_hz[0]))
         for seed in seeds:
             (split,) = make_splits(record, "official", seed=seed, n_train=n_train)
             train, test = split.all_train, split.test
             scored = _simple(record, train, test, seed)
-            if traced is not None:
-                scored["ray tracing, calibrated"] = (_calibrated(traced, tracer, record, train, test, seed), None)
+            if ray_tracing:
+                scored["ray tracing, calibrated"] = (_calibrated(record, split, made, Path(work) / str(seed)), None)
             ours, fact = _hybrid(record, train, test, scene, seed)
             facts.append(fact)
             scored["hybrid without mesh"], _ = _hybrid(record, train, test, None, seed)
@@ -148,20 +138,11 @@ def _hybrid(
     return _scored(estimates, np.asarray(record.observation[:, test], float)), {**seconds, **model.summary()}
 
 
-def _calibrated(
-    traced: TraceResult, scene: Any, record: Record, train: IntArray, test: IntArray, seed: int
-) -> FloatArray:
-    """Errors of ray tracing with offsets and patterns fitted; thickness of walls as in `bench_calibration`."""
-    for material, choices in WALLS_M.items():
-        errors = []
-        for thickness in choices:
-            scene.radio_materials[material].thickness = thickness
-            _, (error,) = choose_calibration(recompute(traced, scene), scene, record, train, [OFFSETS_ALONE])
-            errors.append(error)
-        scene.radio_materials[material].thickness = choices[int(np.argmin(errors))]
-    own = recompute(traced, scene)
-    options = CalibrationOptions(**{**vars(PATTERNS), "seed": seed})
-    return absolute_error_db(calibrate(own, scene, record, train, options), own, scene, record, test)
+def _calibrated(record: Record, split: Split, scene: Path, out: Path) -> FloatArray:
+    """Errors of ray tracing with gains and patterns fitted, as in `bench_calibration`."""
+    own: dict[str, Any] = {"scene": scene, "split": split, "seed": split.seed, "settings": CALIBRATED}
+    train(record, out, "ray-tracing", **own)
+    return abs_error_db(read_run(out).prediction, np.asarray(record.observation[:, split.test], float))
 
 
 def _figures(error: FloatArray, inside: FloatArray | None) -> dict[str, float]:

@@ -13,8 +13,8 @@ from skimage.metrics import structural_similarity
 from ..backend.device import on_device, to_float
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..hybrid.joint import absolute_error
 from ..hybrid.spectrum_loss import Grid
+from ..loss.known import absolute_error
 from ..loss.spectrum import SSIM_WEIGHT, spectrum_loss
 from .stress_rows import EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst
 
@@ -90,11 +90,11 @@ def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[fl
 
 
 def _absolute(one: FloatArray, other: FloatArray, rng: Rng) -> float:
-    """Error of the loss of the hybrid's joint fit and of its derivatives, with a third of the rows not received."""
+    """Error of the absolute error and of its derivatives, with a third of the rows not received."""
     known = rng.random(one.size) > 1 / 3
     prediction = to_float(one)
     dr.enable_grad(prediction)
-    value = absolute_error(prediction, to_float(np.where(known, other.ravel(), np.nan)), 1)
+    value = absolute_error(prediction, to_float(np.where(known, other.ravel(), np.nan)))
     dr.backward(value)
     truth = np.abs(one - other).ravel()[known].mean()
     slope = np.where(known, np.sign(one - other).ravel(), 0) / known.sum()

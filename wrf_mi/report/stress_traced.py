@@ -26,8 +26,8 @@ from ..hybrid import ArrayReceiver, CsiReceiver, PowerReceiver, TracedField, Tra
 from ..receive.graph import path_power
 from ..trace import TraceOptions, TraceResult, open_scene, trace_paths
 from ..trace.buffer import to_buffer
-from ..trace.calibration import with_materials
 from ..trace.fields import field_of
+from ..trace.materials import with_materials
 from ..trace.surfaces import scene_surfaces
 from .stress_fields import RECEIVER
 from .stress_rows import PHASE, Row, Worst, row
@@ -151,7 +151,7 @@ Reported = Callable[[Mapping[str, Any]], Any]
 
 
 def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
-    """Sionna RT's fields, float32, by the materials of the room: gains, and the signal strengths of calibration."""
+    """Sionna RT's fields, float32, by the materials of the room: gains and powers."""
     surfaces, known = scene_surfaces(scene), scene.radio_materials
     buffer = to_buffer(traced.legs(surfaces), surfaces, valid=True)
     names = sorted({known[scene.objects[name].radio_material.name].name for name in traced.paths.object_names})

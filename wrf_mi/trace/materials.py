@@ -8,7 +8,8 @@ material, and Sionna RT raises an error outside it. Most building materials begi
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M
@@ -98,3 +99,31 @@ def _constants(permittivity: float, conductivity: float) -> Any:
         return mi.Float(permittivity), mi.Float(conductivity)
 
     return constants
+
+
+@contextmanager
+def with_materials(scene: Any, materials: Mapping[str, tuple[Any, Any]]) -> Iterator[None]:
+    """Give materials of a ``sionna.rt.Scene`` other constants while the block lasts.
+
+    Args:
+        scene: ``sionna.rt.Scene``.
+        materials: relative permittivity and conductivity (S/m) by name, numbers or Dr.Jit arrays with derivatives.
+
+    Raises:
+        InputError: the scene has no such material.
+    """
+    if unknown := [name for name in materials if name not in scene.radio_materials]:
+        raise InputError(f"scene: no radio material {unknown[0]!r}; it has {', '.join(scene.radio_materials)}")
+    before = []
+    for name, (permittivity, conductivity) in materials.items():
+        material = scene.radio_materials[name]
+        constants = material.relative_permittivity, material.conductivity
+        before.append((material, material.frequency_update_callback, constants))
+        material.frequency_update_callback = None
+        material.relative_permittivity, material.conductivity = permittivity, conductivity
+    try:
+        yield
+    finally:
+        for material, callback, constants in before:
+            material.relative_permittivity, material.conductivity = constants
+            material.frequency_update_callback = callback
