@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from wrf_mi.core import Record, Split
-from wrf_mi.fit.config import TrainConfig, with_settings
+from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.config import TrainConfig
 from wrf_mi.measure import make_splits
 
 QUICK = (

@@ -16,7 +16,7 @@ from made_channels import channels
 
 import wrf_mi
 from wrf_mi.core import InputError, Record
-from wrf_mi.fit.config import describe, settings_from
+from wrf_mi.core.settings import describe, settings_from
 from wrf_mi.measure import load, make_splits, write_nerf2_csi, write_spectrum_folder
 from wrf_mi.models import MODELS, known_model
 from wrf_mi.report.run_folder import _plain

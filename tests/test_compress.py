@@ -21,9 +21,10 @@ from wrf_mi.cli import main
 from wrf_mi.core import InputError, Record
 from wrf_mi.fit.compress import Compression, compress, importance, prune
 from wrf_mi.fit.config import TrainConfig
+from wrf_mi.fit.fields import make_field
 from wrf_mi.fit.packed import LEVELS, pack_params, unpack_params
 from wrf_mi.fit.predictor import Predictor
-from wrf_mi.fit.trainer import Trainer, make_field
+from wrf_mi.fit.trainer import Trainer
 from wrf_mi.measure import make_splits
 from wrf_mi.report.bench_budget import Budget, budgets, rows_of
 from wrf_mi.report.compressed import COMPRESSION

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import asdict
 from operator import attrgetter
 from typing import Any, get_type_hints
 
@@ -13,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
-from wrf_mi.fit.config import PRESETS, TrainConfig, describe, dump, from_dict, to_dict, with_settings
-from wrf_mi.fit.trainer import make_field
+from wrf_mi.core.settings import describe, settings_from, with_settings
+from wrf_mi.fit.config import PRESETS, TrainConfig
+from wrf_mi.fit.fields import make_field
 
 
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -24,7 +26,11 @@ def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-DEFAULTS = leaves(to_dict(TrainConfig()))
+def read(values: Any, source: str = "config") -> TrainConfig:
+    return settings_from(TrainConfig, values, source)
+
+
+DEFAULTS = leaves(asdict(TrainConfig()))
 INSIDE = {"initial.opacity", "density.least_opacity", "density.reset_opacity"}
 """Shares that must be neither 0 nor 1: their logits are stored."""
 LARGEST = {
@@ -87,8 +93,8 @@ def configurations(draw: st.DrawFn) -> TrainConfig:
 
 @given(configurations())
 def test_a_configuration_survives_a_dictionary_and_a_file(config: TrainConfig) -> None:
-    assert from_dict(to_dict(config)) == config
-    assert from_dict(yaml.safe_load(dump(config))) == config
+    assert read(asdict(config)) == config
+    assert read(yaml.safe_load(yaml.safe_dump(asdict(config)))) == config
 
 
 def as_text(value: Any) -> str:
@@ -98,13 +104,13 @@ def as_text(value: Any) -> str:
 
 @given(configurations())
 def test_settings_as_text_make_any_configuration(config: TrainConfig) -> None:
-    changed = [(name, value) for name, value in leaves(to_dict(config)).items() if value != DEFAULTS[name]]
+    changed = [(name, value) for name, value in leaves(asdict(config)).items() if value != DEFAULTS[name]]
     assert with_settings(TrainConfig(), [f"{name}={as_text(value)}" for name, value in changed]) == config
 
 
 def test_what_is_not_named_keeps_its_default() -> None:
-    assert from_dict({}) == TrainConfig()
-    config = from_dict({"steps": 5, "density": {"grow": 0.5}})
+    assert read({}) == TrainConfig()
+    config = read({"steps": 5, "density": {"grow": 0.5}})
     assert (config.steps, config.density.grow, config.density.every) == (5, 0.5, TrainConfig().density.every)
 
 
@@ -126,7 +132,7 @@ def test_what_is_not_named_keeps_its_default() -> None:
     ],
 )
 def test_a_setting(setting: str, name: str, value: Any) -> None:
-    flat = leaves(to_dict(with_settings(TrainConfig(), [setting])))
+    flat = leaves(asdict(with_settings(TrainConfig(), [setting])))
     assert flat[name] == value
     assert type(flat[name]) is type(value)
     assert flat == DEFAULTS | {name: value}
@@ -232,7 +238,7 @@ def test_ends_of_ranges_are_accepted(setting: str, value: float) -> None:
 )
 def test_files_that_are_refused(values: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
-        from_dict(values, "config.yaml")
+        read(values, "config.yaml")
     assert message in str(caught.value)
 
 
@@ -277,6 +283,6 @@ def test_quick_preset_is_shorter() -> None:
 
 
 def test_description_names_every_setting_and_can_be_set() -> None:
-    lines = describe().splitlines()
+    lines = describe(TrainConfig()).splitlines()
     assert [line.partition("=")[0] for line in lines] == list(DEFAULTS)
     assert with_settings(TrainConfig(steps=7, seed=9), lines) == TrainConfig()

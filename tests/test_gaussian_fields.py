@@ -19,10 +19,11 @@ from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
+from wrf_mi.core.settings import with_settings  # noqa: E402
 from wrf_mi.field import FIELDS  # noqa: E402
 from wrf_mi.field.gaussians import by_component  # noqa: E402
 from wrf_mi.fit.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
-from wrf_mi.fit.config import TrainConfig, default_config, with_settings  # noqa: E402
+from wrf_mi.fit.config import TrainConfig, default_config  # noqa: E402
 from wrf_mi.fit.predictor import TOGETHER, Predictor  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
 from wrf_mi.fit.step import device_pose  # noqa: E402

@@ -13,7 +13,8 @@ from small_fits import stop_after
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import InputError, Receiver, Record, Split
-from wrf_mi.fit.config import calibration_config, with_settings
+from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.config import calibration_config
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.graph.settings import TRACED_NAMES, TracedConfig
 from wrf_mi.hybrid import CsiReceiver, TracedField, TracedOptions

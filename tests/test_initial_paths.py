@@ -20,9 +20,10 @@ import mitsuba as mi  # noqa: E402
 
 from wrf_mi.backend.device import to_tensor  # noqa: E402
 from wrf_mi.core import InputError, Paths, Record  # noqa: E402
+from wrf_mi.core.settings import with_settings  # noqa: E402
 from wrf_mi.field import WrfGsPlus  # noqa: E402
 from wrf_mi.field.initial_paths import gaussians_from_mesh, gaussians_from_paths  # noqa: E402
-from wrf_mi.fit.config import InitialConfig, TrainConfig, with_settings  # noqa: E402
+from wrf_mi.fit.config import InitialConfig, TrainConfig  # noqa: E402
 from wrf_mi.fit.start import initial_gaussians  # noqa: E402
 from wrf_mi.trace import TraceOptions, trace_paths  # noqa: E402
 

@@ -20,7 +20,8 @@ import wrf_mi
 from wrf_mi.cli import main
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.fit.config import TrainConfig, with_settings
+from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.config import TrainConfig
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.measure import make_splits, write_spectrum_folder
 from wrf_mi.report.runs import Interrupted, evaluate_run, open_run, resume, train

@@ -12,7 +12,8 @@ from traced_rooms import SHOEBOX, write_xml
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.fit.config import default_config, with_settings
+from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.config import default_config
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths

@@ -16,7 +16,8 @@ from PIL import Image
 from wrf_mi.cli import _parser
 from wrf_mi.cli_bench import TABLES
 from wrf_mi.core import Receiver, Record
-from wrf_mi.fit.config import TrainConfig, describe, with_settings
+from wrf_mi.core.settings import describe, with_settings
+from wrf_mi.fit.config import TrainConfig
 from wrf_mi.measure import write_spectrum_folder
 from wrf_mi.report.bench import CASES, CHECKS
 
@@ -131,7 +132,7 @@ def test_model_page_states_the_defaults_and_constants() -> None:
     for name, value, where, *_ in constants:
         module = importlib.import_module(where.removesuffix(".py").replace("/", "."))
         assert float(value) == getattr(module, name), name
-    defaults = dict(line.split("=", 1) for line in describe().splitlines())
+    defaults = dict(line.split("=", 1) for line in describe(TrainConfig()).splitlines())
     for name, value, *_ in settings:
         assert value == defaults.get(name), name
 

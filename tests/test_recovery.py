@@ -10,8 +10,9 @@ from made_spectra import spectra
 
 from wrf_mi.baselines.idw import InverseDistance
 from wrf_mi.core import Split
+from wrf_mi.core.settings import with_settings
 from wrf_mi.field import FIELDS
-from wrf_mi.fit.config import TrainConfig, with_settings
+from wrf_mi.fit.config import TrainConfig
 from wrf_mi.fit.state import FitState
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.tasks.scores import ssim

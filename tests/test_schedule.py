@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError, Split
-from wrf_mi.fit.config import TrainConfig, with_settings
+from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.config import TrainConfig
 from wrf_mi.fit.schedule import Schedule, plan
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .core import BackendError, InputError, Receiver, Record, Split
-    from .fit.config import TrainConfig, with_settings
+    from .core.settings import with_settings
+    from .fit.config import TrainConfig
     from .fit.trainer import Trainer
     from .measure import fetch, make_splits
     from .report.compare import compare
@@ -46,7 +47,7 @@ _HOME = {
     "scene_view": "report.view",
     "spectrum_table": "report.figures",
     "train": "report.runs",
-    "with_settings": "fit.config",
+    "with_settings": "core.settings",
 }
 
 __all__ = [

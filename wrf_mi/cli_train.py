@@ -137,7 +137,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
 
 
 def _settings_text() -> str:
-    from .fit.config import describe
+    from .core.settings import describe
     from .models import MODELS
 
     found: dict[type, list[str]] = {}

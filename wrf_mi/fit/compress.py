@@ -16,11 +16,12 @@ from ..field import InitialGaussians
 from ..splat.removal import removal
 from ..splat.tiles import perception_plane
 from .config import NetworkConfig, TrainConfig
+from .fields import make_field
 from .packed import PRECISIONS
 from .predictor import Predictor
 from .state import FitState
 from .step import device_pose
-from .trainer import Progress, Trainer, make_field
+from .trainer import Progress, Trainer
 
 Params = dict[str, NDArray[np.float32]]
 

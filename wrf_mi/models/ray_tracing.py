@@ -25,8 +25,9 @@ from ..baselines.method import Inputs
 from ..core import InputError, Prediction, Split
 from ..core.angles import FloatArray
 from ..core.files import readable, write_atomically
+from ..core.settings import with_settings
 from ..core.types import IntArray
-from ..fit.config import calibration_config, with_settings
+from ..fit.config import calibration_config
 from ..parallel import Scheduler, row_parts
 from ..tasks import instrument_of, task_of
 from ..trace import TraceOptions, TraceResult, load_trace, save_trace

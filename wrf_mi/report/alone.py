@@ -118,7 +118,8 @@ def _predicted(folder: Path) -> Arrays:
 
 
 def _field(job: Job, work: Path) -> Arrays:
-    from ..fit.config import TrainConfig, with_settings
+    from ..core.settings import with_settings
+    from ..fit.config import TrainConfig
     from .runs import Interrupted, train
 
     config: Any = with_settings(TrainConfig(deterministic=job.deterministic), job.settings)
@@ -170,7 +171,8 @@ def _step(job: Job, work: Path) -> Arrays:
     import mitsuba as mi
 
     from ..backend.device import to_float, to_tensor
-    from ..fit.config import TrainConfig, with_settings
+    from ..core.settings import with_settings
+    from ..fit.config import TrainConfig
     from ..fit.step import TrainingData, device_pose, grey
     from ..fit.trainer import Trainer
     from ..loss.spectrum import spectrum_loss

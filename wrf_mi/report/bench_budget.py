@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..core import Record
+from ..core.settings import with_settings
 from ..fit.compress import Compression
-from ..fit.config import TrainConfig, with_settings
+from ..fit.config import TrainConfig
 from ..measure import make_splits
 from ..trace import load_record
 from .compressed import compress_run, spectrum_times

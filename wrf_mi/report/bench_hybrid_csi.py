@@ -19,8 +19,9 @@ from ..baselines.kriging import Kriging
 from ..core import Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.files import write_arrays
+from ..core.settings import with_settings
 from ..core.types import IntArray
-from ..fit.config import default_config, with_settings
+from ..fit.config import default_config
 from ..fit.trainer import Trainer
 from ..hybrid.csi import CsiSettings, fit_csi
 from ..measure.newrf import read_newrf

@@ -30,7 +30,8 @@ from ..backend.device import to_float, to_tensor  # noqa: E402
 from ..core import InputError, Record  # noqa: E402
 from ..core.arrays import planar_array  # noqa: E402
 from ..core.files import one_line, write_atomically  # noqa: E402
-from ..fit.config import TrainConfig, with_settings  # noqa: E402
+from ..core.settings import with_settings  # noqa: E402
+from ..fit.config import TrainConfig  # noqa: E402
 from ..fit.step import CompiledPredictor, device_pose  # noqa: E402
 from ..fit.trainer import Trainer  # noqa: E402
 from ..measure import make_splits  # noqa: E402

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..core import Record
-from ..fit.config import TrainConfig, with_settings
+from ..core.settings import with_settings
+from ..fit.config import TrainConfig
 from ..tasks.scores import summary
 from ..trace.furnished import traced_room
 from ..trace.laboratory import SCAN

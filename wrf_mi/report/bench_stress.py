@@ -16,9 +16,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core import Record
+from ..core.settings import with_settings
 from ..field import FIELDS, Encoding, random_gaussians
 from ..field.network import Weights
-from ..fit.config import TrainConfig, with_settings
+from ..fit.config import TrainConfig
 from ..fit.trainer import NumericsError, Trainer
 from ..measure import make_splits
 from .bench import BenchFailed

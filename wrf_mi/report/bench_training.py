@@ -26,7 +26,8 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 from ..backend.device import to_tensor  # noqa: E402
-from ..fit.config import TrainConfig, with_settings  # noqa: E402
+from ..core.settings import with_settings  # noqa: E402
+from ..fit.config import TrainConfig  # noqa: E402
 from ..fit.step import device_pose  # noqa: E402
 from ..fit.trainer import Trainer, peak_memory_mb  # noqa: E402
 from ..measure import make_splits  # noqa: E402

@@ -20,7 +20,8 @@ from ..baselines.idw import InverseDistance
 from ..baselines.kriging import Kriging
 from ..core import Record, Split
 from ..core.angles import FloatArray
-from ..fit.config import TrainConfig, with_settings
+from ..core.settings import with_settings
+from ..fit.config import TrainConfig
 from ..hybrid.models import kind_of
 from ..measure import make_splits
 from ..tasks import instrument_of

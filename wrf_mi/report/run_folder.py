@@ -27,7 +27,7 @@ from .. import __version__
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
-from ..fit.config import settings_from
+from ..core.settings import settings_from
 from ..fit.trainer import check_rows
 from ..measure import load_split, save_split
 from ..models import Model, known_model

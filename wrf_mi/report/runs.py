@@ -15,8 +15,8 @@ from ..backend import init
 from ..baselines.checks import check_record
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
+from ..core.settings import with_settings
 from ..fit.checkpoint import CHECKPOINT
-from ..fit.config import with_settings
 from ..fit.trainer import check_rows
 from ..measure import make_splits
 from ..measure.observations import check_observations, place_of

@@ -23,9 +23,9 @@ from ..core.arrays import planar_array  # noqa: E402
 from ..field import FIELDS, InitialGaussians, random_gaussians  # noqa: E402
 from ..field.parts import gaussians_in_parts  # noqa: E402
 from ..fit.config import TrainConfig  # noqa: E402
+from ..fit.fields import make_field  # noqa: E402
 from ..fit.predictor import Predictor  # noqa: E402
 from ..fit.step import device_pose  # noqa: E402
-from ..fit.trainer import make_field  # noqa: E402
 from ..hybrid.models import kind_of  # noqa: E402
 from ..receive import bartlett_spectrum, element_signals  # noqa: E402
 from ..receive.footprints import gaussian_signals  # noqa: E402
