@@ -124,7 +124,7 @@ def test_train_on_one_row(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert "4/4" in err
     assert "nan" not in err
     for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines():
-        assert json.loads(line, parse_constant=pytest.fail)["validation_ssim"] is None
+        assert json.loads(line, parse_constant=pytest.fail)["validation_score"] is None
 
 
 def test_preset_model_and_settings_in_that_order(folder: Path, tmp_path: Path) -> None:
@@ -267,16 +267,16 @@ def test_watch_stops_at_the_first_and_ends_at_the_second_signal(capsys: pytest.C
 
 
 def progress(**values: Any) -> Progress:
-    return Progress(**({"step": 10, "seconds": 1.0, "loss": 0.25, "validation_ssim": None, "held_out": True,
+    return Progress(**({"step": 10, "seconds": 1.0, "loss": 0.25, "validation_score": None, "held_out": True,
                         "gaussians": 8, "left_s": 61.0} | values))  # fmt: skip
 
 
 def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with Watch() as watch:
         watch.listen("training", 0.25, progress())
-        watch.listen("training", 0.5, progress(step=20, validation_ssim=0.5))
-        watch.listen("fold1", 0.5, progress(step=20, validation_ssim=0.75, held_out=False))
-        watch.listen("fold2", 0.5, progress(step=20, validation_ssim=float("nan")))
+        watch.listen("training", 0.5, progress(step=20, validation_score=0.5))
+        watch.listen("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
+        watch.listen("fold2", 0.5, progress(step=20, validation_score=float("nan")))
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
@@ -292,7 +292,7 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     with Watch() as watch:
         for fold in ("fold0", "fold1"):
             for step in (20, 40):
-                watch.listen(fold, step / 40, progress(step=step, validation_ssim=0.5))
+                watch.listen(fold, step / 40, progress(step=step, validation_score=0.5))
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
     assert "fold0" in shown
     assert "fold1" in shown

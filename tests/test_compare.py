@@ -66,7 +66,7 @@ def write_log(path):
         # The last score is of rows that are trained on by then: it belongs in no picture.
         for step in range(5):
             score = 0.2 * step if step else None
-            entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "validation_ssim": score, "gaussians": 5}
+            entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "validation_score": score, "gaussians": 5}
             entry["held_out"] = step < 4
             file.write(json.dumps(entry) + "\n")
 
@@ -231,7 +231,7 @@ def cut_truth(run):
         (replace("metrics.json", "{"), "not readable as JSON"),
         (replace("predictions.npz", "not a zip"), "predictions.npz: not readable"),
         (
-            replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_ssim": 1, "held_out": true}\n{"st'),
+            replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
             "line 2 is no log entry",
         ),
         (replace("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),

@@ -272,7 +272,7 @@ def test_a_fit_goes_on_from_its_best_moment(hold_out: float) -> None:
     trainer.validate = lambda: next(given)  # type: ignore[method-assign]
 
     def listen(progress) -> None:
-        if progress.validation_ssim is not None:
+        if progress.validation_score is not None:
             seen.append((progress.step, progress.held_out))
         if progress.step == 30:
             kept.update(trainer.state.params())

@@ -41,7 +41,7 @@ def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> Non
     assert trainer.run(heard.append)
     assert [p.step for p in heard] == list(range(5, 121, 5))
     assert heard[-1].loss < 0.8 * heard[0].loss
-    scores = [p.validation_ssim for p in heard if p.validation_ssim is not None]
+    scores = [p.validation_score for p in heard if p.validation_score is not None]
     assert len(scores) == 3
     assert scores[-1] > scores[0] + 0.05
     assert [p.held_out for p in heard] == [p.step <= 60 for p in heard]

@@ -1,7 +1,7 @@
 """What a training run leaves in its folder until it has ended.
 
     checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
-    log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_ssim, held_out, gaussians
+    log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_score, held_out, gaussians
 
 Every file appears whole or not at all.
 """
@@ -51,9 +51,9 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
 def append_log(folder: Path, progress: Progress) -> None:
     """Add a line to ``log.jsonl``."""
     entry = asdict(progress)
-    del entry["left_s"]
-    if progress.validation_ssim is not None and math.isnan(progress.validation_ssim):
-        entry["validation_ssim"] = None  # there are no validation rows, and JSON has no NaN
+    del entry["left_s"], entry["label"]
+    if progress.validation_score is not None and math.isnan(progress.validation_score):
+        entry["validation_score"] = None  # there are no validation rows, and JSON has no NaN
     with (folder / LOG).open("a") as stream:
         stream.write(json.dumps(entry) + "\n")
 

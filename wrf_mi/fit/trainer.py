@@ -61,19 +61,21 @@ class Progress:
         step: steps taken.
         seconds: training time so far, over all sittings.
         loss: mean over the steps since the last line.
-        validation_ssim: median on the validation rows, where it was just computed.
+        validation_score: median on the validation rows, where it was just computed.
         held_out: whether the validation rows are still kept out of training.
         gaussians: their number.
         left_s: estimated seconds to the end.
+        label: of the score.
     """
 
     step: int
     seconds: float
     loss: float
-    validation_ssim: float | None
+    validation_score: float | None
     held_out: bool
     gaussians: int
     left_s: float
+    label: str = "SSIM"
 
 
 def peak_memory_mb() -> float:
@@ -327,7 +329,17 @@ class Trainer:
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / taken * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
-                listen(Progress(state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left))
+                told = (
+                    state.step,
+                    self.seconds,
+                    losses[0] / since,
+                    score,
+                    held_out,
+                    state.gaussians,
+                    left,
+                    self.task.label,
+                )
+                listen(Progress(*told))
                 losses, since = dr.zeros(mi.Float), 0
                 if score is not None and choosing and self._chosen(score):
                     state, schedule = self.state, self.schedule

@@ -75,6 +75,8 @@ class TracingSettings(TraceOptions):
             InputError: naming the setting.
         """
         super().__post_init__()
+        if self.steps is not None and (self.calibration is None or self.steps < 1):
+            raise InputError(f"setting steps: {self.steps}; a positive number, with calibration")
         if self.calibration is not None:
             calibration_config(self.calibration.split(","))
             if self.target_error_db is not None:

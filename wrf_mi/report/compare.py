@@ -154,7 +154,7 @@ def _pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         pictures.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
     curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
     if curves:
-        pictures.append((f"{slug}-training.png", "Training", figures.training_curves(curves)))
+        pictures.append((f"{slug}-training.png", "Training", figures.training_curves(curves, task.label)))
     return pictures
 
 

@@ -221,11 +221,12 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
     return figure
 
 
-def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
+def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "SSIM") -> Figure:
     """Score on validation rows, while they are held out, over training time.
 
     Args:
-        curves: pairs (seconds, SSIM) of each run by its name.
+        curves: pairs (seconds, score) of each run by its name.
+        label: of the score.
     """
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
@@ -233,7 +234,7 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figu
         seconds, score = zip(*points, strict=True)
         axes.plot(seconds, score, marker=".", label=name)
     axes.set_xlabel("training time (s)")
-    axes.set_ylabel("SSIM on held-out validation rows")
+    axes.set_ylabel(f"{label} on held-out validation rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

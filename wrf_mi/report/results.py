@@ -194,7 +194,7 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
 
 
 def _read_log(path: Path) -> list[tuple[float, float]]:
-    """Pairs (seconds, SSIM on held-out validation rows); methods without training leave no log."""
+    """Pairs (seconds, score on held-out validation rows); methods without training leave no log."""
     if not path.is_file():
         return []
     points = []
@@ -202,8 +202,8 @@ def _read_log(path: Path) -> list[tuple[float, float]]:
         try:
             entry = json.loads(line)
             # Once the fit trains on the validation rows, their score says nothing about rows it has not seen.
-            if entry["validation_ssim"] is not None and entry["held_out"]:
-                points.append((float(entry["seconds"]), float(entry["validation_ssim"])))
+            if entry["validation_score"] is not None and entry["held_out"]:
+                points.append((float(entry["seconds"]), float(entry["validation_score"])))
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
     return points

@@ -64,15 +64,15 @@ class Watch:
                 self._bar.start()  # not before: the tracer has a bar of its own
                 self._task = self._bar.add_task(stage, total=1.0, text=text)
             self._bar.update(self._task, completed=share, text=text)
-        elif p is not None and p.validation_ssim is not None:
+        elif p is not None and p.validation_score is not None:
             print(f"{stage} {p.step}/{round(p.step / share)}  {text}", file=sys.stderr, flush=True)
         elif p is None and new:
             print(stage, file=sys.stderr, flush=True)
 
     def _text(self, p: FitProgress) -> str:
-        if p.validation_ssim is not None and not math.isnan(p.validation_ssim):  # it is without validation rows
+        if p.validation_score is not None and not math.isnan(p.validation_score):  # it is without validation rows
             rows = "validation rows" if p.held_out else "validation rows, now trained on"
-            self._score = f"SSIM {p.validation_ssim:.3f} ({rows})"
+            self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
         return f"loss {p.loss:.4f}  {self._score}  {p.gaussians} Gaussians  {_clock(p.left_s)} left"
 
 
