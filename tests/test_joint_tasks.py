@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -134,9 +133,15 @@ def test_a_receiver_without_paths_still_has_its_gaussians(rooms: dict[str, Path]
         trained(below, rooms["known"], "model=ray-tracing", "traced.transmission=false", "steps=30")
 
 
-def test_an_uplink_and_a_scene_do_not_go_together(rooms: dict[str, Path]) -> None:
+def test_beside_a_scene_positions_tell_and_not_the_uplink(rooms: dict[str, Path]) -> None:
     record = measured("csi", rooms["known"])
-    first: Any = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
-    first = replace(first, uplink=first.observation[0][:, None])
-    with pytest.raises(InputError, match="paths are traced from positions, not from an uplink"):
-        trained(first, rooms["known"])
+    first = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
+    first = replace(first, uplink=np.asarray(first.observation[0][:, None]))
+    trainer = trained(first, rooms["known"], "steps=20")
+    assert trainer.graph.form.features == 0
+    rows = thirds(record).test
+    found = trainer.predictor()(first.tx_pos_m[rows], 0)
+    assert found.shape == first.observation[0, rows].shape
+    nowhere = replace(first, tx_pos_m=np.full_like(first.tx_pos_m, np.nan))
+    with pytest.raises(InputError, match="room has no position in row 0"):
+        trained(nowhere, rooms["known"])

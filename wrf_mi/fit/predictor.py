@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -29,7 +30,9 @@ from .step import CompiledPredictor, Params, device_pose, evaluated
 from .still import StillField, stands_still
 
 TOGETHER = 16
-"""Transmitters whose paths and Gaussians are evaluated together."""
+"""Transmitters whose Gaussians, or paths and Gaussians, are evaluated together."""
+TRACED_NUMBERS = 512
+"""With paths, of small observations as many as have so many numbers: each search for paths has its price."""
 
 
 class Predictor:
@@ -159,13 +162,13 @@ class Predictor:
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
-        out = np.empty((len(given), *shape), np.float32)
-        for start in range(0, len(given), TOGETHER):
-            part = given[start : start + TOGETHER]
-            turned = None if heading_rad is None else heading_rad[start : start + TOGETHER]
-            traced = self.graph.scene is not None
+        out, traced = np.empty((len(given), *shape), np.float32), self.graph.scene is not None
+        together = max(TOGETHER, TRACED_NUMBERS // math.prod(shape)) if traced else TOGETHER
+        for start in range(0, len(given), together):
+            part = given[start : start + together]
+            turned = None if heading_rad is None else heading_rad[start : start + together]
             found = self._traced(part, receiver, turned) if traced else self._learned(part.T, receiver)
-            out[start : start + TOGETHER] = found.numpy().reshape(len(part), *shape)
+            out[start : start + together] = found.numpy().reshape(len(part), *shape)
         return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 
     def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:

@@ -48,14 +48,16 @@ class Targets:
         return chosen[seen]
 
 
-def targets_of(record: Record, rows: IntArray) -> Targets:
+def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
     """Conditions and observations of a record; units are measured on training rows.
+
+    An uplink is the condition where there is one, but beside paths of a scene, which are traced from positions.
 
     Raises:
         InputError: a position that is not known, or an uplink without a signal or of other antennas.
     """
     task, seen = task_of(record), np.asarray(record.observation)
-    if record.uplink is None:
+    if record.uplink is None or with_scene:
         if not np.isfinite(record.tx_pos_m[rows]).all():
             row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
             raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
@@ -104,7 +106,7 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
     size = tuple(map(int, record.observation.shape[-2:])) if task.image else view
     basis = _basis(targets, rows, config.view.components) if task.is_complex else None
     outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
-    features = 0 if record.uplink is None else len(targets.condition)
+    features = 0 if record.uplink is None or with_scene else len(targets.condition)
     headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
     if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")

@@ -134,7 +134,7 @@ class Trainer:
         known = split.all_train
         config = config.resolved(record.tx_pos_m[known], scene is not None and self.task.image)
         self.record, self.split, self.config = record, split, config
-        self.targets = targets_of(record, known)
+        self.targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, self.targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(

@@ -100,7 +100,7 @@ class Graph:
             needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
             raise InputError(f"{what} needs {needed}; state array and frequency_hz in the data")
         if scene is not None and form.features:
-            raise InputError("paths are traced from positions, not from an uplink; leave the scene or the uplink away")
+            raise InputError("paths are traced from positions, not from an uplink; leave the scene away")
         if field is None and scene is None:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced

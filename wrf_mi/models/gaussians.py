@@ -147,7 +147,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     scene = None if problem.scene is None else problem.opened_scene
     for rows in splits:
         known = rows.all_train
-        config, targets = _resolved(problem, known), targets_of(record, known)
+        config, targets = _resolved(problem, known), targets_of(record, known, scene is not None)
         form = form_of(record, config, targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         field = None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)
