@@ -24,9 +24,10 @@ from wrf_mi.report.results import read_run
 from wrf_mi.report.runs import evaluate_run, predict_to_file, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import instrument_of
-from wrf_mi.trace import TraceOptions, load_trace, solve
+from wrf_mi.trace import TraceOptions, load_trace, open_scene, solve
 from wrf_mi.trace.offsets import fit_offsets
 from wrf_mi.trace.options import with_kinds
+from wrf_mi.trace.surfaces import scene_surfaces
 from wrf_mi.trace.tracer import RayTracer
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
@@ -171,6 +172,16 @@ def test_calibration_is_kept_and_scores_again(
     assert evaluate_run(out, "random")["split"] == "random (rows unseen by official)"
     with pytest.raises(InputError, match="calibration everything: choose of gain, materials, planes, patterns, pose"):
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
+
+
+def test_calibrated_planes_are_left_as_a_scene(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=["calibration=planes", "steps=3"])
+    before, after = (scene_surfaces(open_scene(place, 2.4e9)) for place in (room, run.folder / "corrected"))
+    moved = np.abs(run.field.params["plane.shift"]).max()
+    assert moved > 0
+    assert before.triangles.shape == after.triangles.shape
+    assert 0 < np.abs(before.triangles - after.triangles).max() < 20 * moved
+    train(flat_folder, tmp_path / "traced", "ray-tracing", scene=run.folder / "corrected")
 
 
 def test_rays_are_counted_once_for_a_run(

@@ -63,6 +63,17 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     return (corners + way[own]).reshape(-1, 3, 3)
 
 
+def check_materials(scene: Any) -> None:
+    """Refuse a scene that `write_corrected_scene` cannot write.
+
+    Raises:
+        InputError: a material that is not of ITU-R P.2040.
+    """
+    for name, thing in scene.objects.items():
+        if (material := thing.radio_material.name) not in THICKNESS_M:
+            raise InputError(f"object {name}: material {material} is not one of ITU-R P.2040; a folder needs one")
+
+
 def write_corrected_scene(
     folder: str | Path, scene: Any, parameters: Mapping[str, NDArray[Any]], description: str = "", replace: bool = False
 ) -> Path:
@@ -85,13 +96,12 @@ def write_corrected_scene(
         InputError: a material that is not of ITU-R P.2040, or a folder that exists or cannot be written.
         ValueError: see `moved_triangles`.
     """
+    check_materials(scene)
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
     parts, kinds, thickness = [], {}, {}
     for index, name in enumerate(surfaces.names):
         material = scene.objects[name].radio_material
-        if material.name not in THICKNESS_M:
-            raise InputError(f"object {name}: material {material.name} is not one of ITU-R P.2040; a folder needs one")
         corners = triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]].reshape(-1, 3)
         vertices, faces = np.unique(corners, axis=0, return_inverse=True)
         parts.append(Surface(name, "other", vertices, faces.reshape(-1, 3)))

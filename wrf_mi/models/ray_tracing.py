@@ -1,6 +1,7 @@
 """The model ``ray-tracing``: paths of a scene, and what is fitted to make them report as the receivers do.
 
 paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.trace.load_trace`)
+corrected/        where planes were calibrated: the scene with these, a folder that plain Sionna RT opens
 convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all that was tried
 
 Signal strengths are not calibrated: an offset per receiver (`wrf_mi.trace.offsets`) is fitted to the training rows. For
@@ -28,6 +29,7 @@ from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
 from ..fit.config import calibration_config
+from ..hybrid.corrected import check_materials, write_corrected_scene
 from ..parallel import Scheduler, row_parts
 from ..tasks import instrument_of, task_of
 from ..trace import TraceOptions, TraceResult, load_trace, save_trace
@@ -43,7 +45,7 @@ from .gaussians import fit as fit_field
 from .model import Arrays, Fitted, Model, Problem, Session
 
 NAME = "ray-tracing"
-PATHS, CONVERGENCE = "paths.npz", "convergence.json"
+PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Positions of one part at least, for a scheduler: candidates of fewer are made no faster. Where rays go out from the
 receivers alone, a part of any size costs as much as a few hundred positions, and the parts for a worker may be two."""
@@ -177,6 +179,10 @@ def _graph_problem(problem: Problem) -> Problem:
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 
+def _moves_planes(problem: Problem) -> bool:
+    return "planes" in (problem.settings.calibration or "").split(",")
+
+
 def _reflections(options: TraceOptions) -> int:
     if not options.reflection:
         return 0
@@ -191,6 +197,8 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     """
     if problem.settings.calibration is not None:
         found = fit_field(_graph_problem(problem), split, session)
+        if _moves_planes(problem):
+            write_corrected_scene(session.folder / CORRECTED, problem.opened_scene, found.params, replace=True)
         kept = load(found.arrays(), problem, session.folder)
         kept.train_seconds = found.train_seconds
         return kept
@@ -274,6 +282,8 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse a scene that cannot be opened, and what cannot be calibrated."""
     if problem.settings.calibration is not None:
         check_field(_graph_problem(problem), splits)
+        if _moves_planes(problem):
+            check_materials(problem.opened_scene)
     assert problem.opened_scene is not None
 
 
