@@ -21,7 +21,7 @@ from ..core import InputError
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 from .trainer import Progress, Trainer
 
-FORMAT = 4
+FORMAT = 5
 """Version of ``checkpoint.npz``."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 

@@ -32,7 +32,7 @@ class InitialConfig:
         nearest_m: smallest distance of a random Gaussian from its receiver, metres.
         farthest_m: largest distance, metres.
         opacity: alpha at a footprint's centre.
-        signal: deviation of the starting signals; 0: `SIGNAL_ALONE`, or `SIGNAL_WITH_SCENE` together with a scene.
+        signal: deviation of the starting signals.
     """
 
     gaussians: int = 270
@@ -43,7 +43,7 @@ class InitialConfig:
     nearest_m: float = 1.0
     farthest_m: float = 8.0
     opacity: float = 0.4
-    signal: float = 0.0
+    signal: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,6 @@ PATHS_ALONE = "ray-tracing"
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
 OTHERWISE = 15000
-SIGNAL_ALONE, SIGNAL_WITH_SCENE = 0.3, 0.02
-"""Deviation of the starting signals: together with a scene the Gaussians add next to nothing to its paths at first."""
 LEAST_TX_SCALE_M = 1.0
 """Metres per unit of transmitters within two metres; doubled for wider ones as often as needed."""
 
@@ -217,19 +215,15 @@ class TrainConfig:
     skip: Skip = field(default_factory=Skip)
     traced: TracedConfig = field(default_factory=TracedConfig)
 
-    def resolved(self, tx_pos_m: ArrayLike, with_scene: bool = False) -> TrainConfig:
-        """The same with the number of steps, the scale of transmitters and the starting signals that are meant.
+    def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
+        """The same with the number of steps and the scale of transmitters that are meant.
 
         Args:
             tx_pos_m: training transmitters [n, 3], metres.
-            with_scene: whether paths of a scene are trained together with the Gaussians.
         """
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
         scale = self.encoding.tx_scale_m or telling_scale(tx_pos_m, LEAST_TX_SCALE_M)
-        signal = self.initial.signal or (SIGNAL_WITH_SCENE if with_scene else SIGNAL_ALONE)
-        initial = dataclasses.replace(self.initial, signal=signal)
-        encoding = dataclasses.replace(self.encoding, tx_scale_m=scale)
-        return dataclasses.replace(self, steps=steps, initial=initial, encoding=encoding)
+        return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
@@ -327,13 +321,34 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
 }
 """What of the traced side can be fitted, by name; rates as ``--set`` takes them."""
-OF_TASK: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENNA}
-"""Settings of tasks other than spectra, as ``--set`` takes them."""
+JOINT_IMAGES = (
+    "batch=8",
+    "steps=1500",
+    "initial.signal=0.02",
+    "density.every=0",
+    "validate_every=50",
+    "patience=6",
+)
+"""What Gaussians beside the paths of a scene depart in, where observations are images: paths explain most of an image,
+to which the Gaussians add next to nothing at first."""
 
 
-def default_config(task: str) -> TrainConfig:
-    """The settings that a fit to a task's observations begins with."""
-    return with_settings(TrainConfig(), OF_TASK.get(task, ()))
+def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
+    """What a fit to a task's observations departs in from `TrainConfig`, as ``--set`` takes it.
+
+    Args:
+        task: its name.
+        image: whether an observation is an image.
+        with_scene: whether paths of a scene are trained together with the Gaussians.
+    """
+    if image:
+        return JOINT_IMAGES if with_scene else ()
+    return ONE_ANTENNA if task in ("rssi", "csi") else ()
+
+
+def default_config(task: str, with_scene: bool = False) -> TrainConfig:
+    """The settings that a fit to a task's observations begins with, alone or beside the paths of a scene."""
+    return with_settings(TrainConfig(), task_settings(task, task == "spectrum", with_scene))
 
 
 def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:

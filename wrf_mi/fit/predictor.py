@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import to_tensor
+from ..backend.device import to_float, to_tensor
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
@@ -25,9 +25,13 @@ from ..graph.receivers import PIXEL, Form
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import perception_plane
 from ..tasks.conditions import known_uplink, normalised_uplink
+from .reach import Reach
 from .recorded import Recorded
 from .step import CompiledPredictor, Params, device_pose, evaluated
 from .still import StillField, stands_still
+
+if TYPE_CHECKING:
+    from ..hybrid.traced import TracedField
 
 TOGETHER = 16
 """Transmitters whose Gaussians, or paths and Gaussians, are evaluated together."""
@@ -50,6 +54,7 @@ class Predictor:
             whatever ``skip`` says.
         store: folder in which operators are kept from process to process; None: in memory alone.
         graph: of the field, these receivers and a scene; None: the field alone, seen by pixel receivers.
+        reach: where the Gaussians are trusted; None: everywhere.
     """
 
     def __init__(
@@ -63,8 +68,9 @@ class Predictor:
         operator: bool = False,
         store: Path | None = None,
         graph: Graph | None = None,
+        reach: Reach | None = None,
     ) -> None:
-        self.receivers = tuple(receivers)
+        self.receivers, self.reach = tuple(receivers), reach
         self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
         # The operator and the recorded prediction are the magnitude at each direction.
         self._pixels = field is not None and self.graph.scene is None and self.graph.form.receiver == PIXEL
@@ -128,15 +134,49 @@ class Predictor:
             raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
         return heading
 
-    def _traced(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> Any:
+    def _traced(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
+    ) -> Any:
         """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
         side = self.graph.trace(tx_pos_m, receiver, heading_rad)
         if side is not None:
             side.refresh(self._params)
-        report, pose = self.graph.report(receiver, side), self._poses[receiver]
-        return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane)
+        return self._evaluated(tx_pos_m, receiver, side, None, weight)
 
-    def _learned(self, condition: FloatArray, receiver: int) -> Any:
+    def _evaluated(
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        side: TracedField | None,
+        slots: IntArray | None,
+        weight: NDArray[Any] | None,
+    ) -> Any:
+        learned = weight is None or bool(np.any(weight))
+        report, pose = self.graph.report(receiver, side, learned), self._poses[receiver]
+        return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
+
+    def of_side(
+        self, tx_pos_m: FloatArray, receiver: int, side: TracedField | None, slots: IntArray, weight: NDArray[Any]
+    ) -> NDArray[Any]:
+        """What a receiver reports of transmitters whose paths are known.
+
+        Args:
+            tx_pos_m: positions [m, 3], metres.
+            receiver: its number.
+            side: its traced side, or None.
+            slots: rows of that [m].
+            weight: of the Gaussians' signal [m], 0 to 1.
+
+        Returns:
+            As `__call__`.
+        """
+
+        def found(part: slice) -> Any:
+            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weight[part])
+
+        return self._in_parts(len(tx_pos_m), receiver, side is not None, found)
+
+    def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
         """What a receiver reports of conditions [3 or features, at most `TOGETHER`] without a scene, flat."""
         if receiver not in self._reports:
             report = self.graph.report(receiver, None)
@@ -153,22 +193,34 @@ class Predictor:
         filled = np.minimum(np.arange(TOGETHER), count - 1)
         tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
         dr.make_opaque(slots)
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane)
+        own = None if weight is None else to_float(weight[filled])
+        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, own)
         found = self._reports[receiver](self._params, batch)
         return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
 
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
+        weight = None if self.reach is None else self.reach.weight(given, receiver)
+        traced = self.graph.scene is not None
+
+        def found(part: slice) -> Any:
+            own = None if weight is None else weight[part]
+            if traced:
+                return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
+            return self._learned(given[part].T, receiver, own)
+
+        return self._in_parts(len(given), receiver, traced, found)
+
+    def _in_parts(self, count: int, receiver: int, traced: bool, found: Callable[[slice], Any]) -> NDArray[Any]:
+        """Reports of so many transmitters from the flat ones of parts of them."""
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
-        out, traced = np.empty((len(given), *shape), np.float32), self.graph.scene is not None
+        out = np.empty((count, *shape), np.float32)
         together = max(TOGETHER, TRACED_NUMBERS // math.prod(shape)) if traced else TOGETHER
-        for start in range(0, len(given), together):
-            part = given[start : start + together]
-            turned = None if heading_rad is None else heading_rad[start : start + together]
-            found = self._traced(part, receiver, turned) if traced else self._learned(part.T, receiver)
-            out[start : start + together] = found.numpy().reshape(len(part), *shape)
+        for start in range(0, count, together):
+            part = slice(start, min(start + together, count))
+            out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
         return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 
     def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:

@@ -26,6 +26,8 @@ class FitState:
         step: steps taken.
         urge: sum since the last round of density control of each Gaussian's directional gradient, [n].
         urge_steps: steps in that sum.
+        reach_m: how far from training transmitters the Gaussians are trusted, metres (`wrf_mi.fit.reach`); infinite:
+            everywhere.
         chosen: step from which the fit went on, see `wrf_mi.fit.config.TrainConfig.patience`; 0: from the last one.
         best: the state that scored best on validation rows (see `arrays`); None: none is kept.
         best_score: its score, the higher the better.
@@ -37,6 +39,7 @@ class FitState:
         self.adam.update({name: to_tensor(values) for name, values in params.items()})
         self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = self.chosen = 0
+        self.reach_m = float(np.inf)
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0
         self._clear_urge()
@@ -87,6 +90,12 @@ class FitState:
         self._set_moments(first, second, count)
         self._clear_urge()
 
+    def forget_moments(self) -> None:
+        """Let Adam start anew from the parameters as they are."""
+        first, second, _ = self.moments()
+        nothing = {name: np.zeros_like(values) for name, values in first.items()}
+        self._set_moments(nothing, {name: np.zeros_like(values) for name, values in second.items()}, 0)
+
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and forget its momentum (opacity reset)."""
         _, _, count = self.moments()
@@ -116,7 +125,8 @@ class FitState:
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
         scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
-        return flat | {"urge": self.urge.numpy()} | {name: np.asarray(value) for name, value in scalars.items()}
+        flat |= {"urge": self.urge.numpy(), "reach_m": np.asarray(self.reach_m)}
+        return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FitState:
@@ -129,7 +139,7 @@ class FitState:
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
-        state.urge_steps = int(arrays["urge_steps"])
+        state.urge_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
         state.urge = to_float(arrays["urge"])
         state.best = group("best/") or None
         if state.best is not None:

@@ -19,7 +19,7 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import NDArray
 
-from ..backend.device import on_device, to_tensor
+from ..backend.device import on_device, to_float, to_tensor
 from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
@@ -217,13 +217,32 @@ def make_step(
 
 
 def evaluated(
-    report: Report, params: Mapping[str, Any], condition: NDArray[Any], receiver: int, pose: Pose, plane: Plane
+    report: Report,
+    params: Mapping[str, Any],
+    condition: NDArray[Any],
+    receiver: int,
+    pose: Pose,
+    plane: Plane,
+    slots: NDArray[Any] | None = None,
+    weight: NDArray[Any] | None = None,
 ) -> Any:
-    """A report of conditions [3 or features, m], the first m rows of its traced side, evaluated without gradients."""
+    """A report of conditions [3 or features, m], evaluated without gradients.
+
+    Args:
+        report: see `wrf_mi.graph.Graph.report`.
+        params: its parameters.
+        condition: positions, metres, or features.
+        receiver: its number.
+        pose: of the receiver.
+        plane: its directions.
+        slots: rows of the traced side [m]; None: the first m.
+        weight: of the Gaussians' signal [m]; None: 1.
+    """
     with dr.suspend_grad():
-        slots = on_device(np.arange(condition.shape[1]), mi.UInt32)
-        batch = Batch(to_tensor(np.ascontiguousarray(condition)), slots, dr.opaque(mi.UInt32, receiver), pose, plane)
-        found = report(params, batch)
+        rows = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
+        own = None if weight is None else to_float(weight)
+        tx = to_tensor(np.ascontiguousarray(condition))
+        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, own))
         dr.eval(found)
     return found
 

@@ -128,8 +128,14 @@ def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128
     return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
 
 
-def plan_rows(config: TrainConfig, targets: Targets, split: Split) -> Schedule:
+def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool = False) -> Schedule:
     """The plan of a fit: each receiver learns from what it observed.
+
+    Args:
+        config: settings.
+        targets: of the record.
+        split: rows that train and rows that choose.
+        joint: whether Gaussians are trained beside paths of a scene.
 
     Raises:
         InputError: see `wrf_mi.fit.schedule.plan`.
@@ -138,4 +144,4 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split) -> Schedule:
     train = [targets.received(r, split.train) for r in range(len(targets.truth))]
     # A receiver whose few rows all are to choose by learns from these.
     train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
-    return plan(config, train, everything)
+    return plan(config, train, everything, config.traced.steps if joint else 0)

@@ -29,6 +29,7 @@ from ..tasks.conditions import placed_receivers
 from .config import PATHS_ALONE, TrainConfig
 from .fields import make_field
 from .predictor import Predictor
+from .reach import Reach, choose_reach, hold_out_groups
 from .start import initial_gaussians
 from .state import FitState
 from .step import (
@@ -132,7 +133,7 @@ class Trainer:
         self.task = task_of(record)
         check_observations(record, split, complete=self.task.image)
         known = split.all_train
-        config = config.resolved(record.tx_pos_m[known], scene is not None and self.task.image)
+        config = config.resolved(record.tx_pos_m[known])
         self.record, self.split, self.config = record, split, config
         self.targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, self.targets, known, scene is not None)
@@ -147,7 +148,11 @@ class Trainer:
         )
         self._shape = self.targets.truth.shape[2:]
         self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
-        self.schedule = plan_rows(config, self.targets, split)
+        # Gaussians that correct something are chosen on rows away from those that train, too.
+        self._chooses_reach = self.graph.corrects and config.patience > 0 and config.hold_out > 0
+        self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
+        joint = self.graph.field is not None and scene is not None
+        self.schedule = plan_rows(config, self.targets, self._choosing, joint)
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
@@ -218,17 +223,20 @@ class Trainer:
         side = self._sides[receiver]
         if side is not None:
             side.refresh({name: self.state.adam[name] for name in self.state.adam})
-        key = None if side is None and not self.graph.arrays(receiver, None) else (receiver, side and side.searches)
+        state = self.state
+        learned = side is None or (state.step >= self.schedule.alone and not (state.chosen and state.reach_m == 0))
+        arrays = self.graph.arrays(receiver, side)
+        key = None if side is None and not arrays else (receiver, side and side.searches, learned)
         if key not in self._steps:
             self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
-            report = self.graph.report(receiver, side)
-            state = None if key is None else partial(self.graph.arrays, receiver, side)
-            if state is not None:
+            report = self.graph.report(receiver, side, learned)
+            own = None if key is None else partial(self.graph.arrays, receiver, side)
+            if own is not None:
                 # What is made from NumPy's memory at first use must be there before a recording.
                 params = {name: self.state.adam[name] for name in self.state.adam}
                 first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
                 evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
-            self._steps[key] = make_step(report, self._rates(), self._loss, self._shape, state)
+            self._steps[key] = make_step(report, self._rates(), self._loss, self._shape, own)
         return self._steps[key]
 
     def _rates(self) -> dict[str, float]:
@@ -255,10 +263,38 @@ class Trainer:
             self._predictor = Predictor(own.field, params, own.receivers, *own.form.size, self.config.skip, graph=own)
         else:
             self._predictor.update(self.state.mean)
+        self._predictor.reach = self.reach()
         return self._predictor
+
+    def reach(self) -> Reach | None:
+        """Where the Gaussians are trusted, by the rows that train now; None: they correct nothing."""
+        if not self.graph.corrects:
+            return None
+        rows = self._known if self.state.chosen else self._choosing.train
+        known = [self.record.tx_pos_m[self.targets.received(r, rows)] for r in range(len(self.record.receivers))]
+        return Reach(tuple(known), self.state.reach_m)
+
+    def _corrected_score(self) -> float:
+        """Median score of what Gaussians correct; until the fit has chosen, with the reach that is best at this moment."""
+        predict, record, reach = self.predictor(), self.record, self.reach()
+        chosen = self._choosing if self._chooses_reach and not self.state.chosen else self.split
+        rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
+        assert reach is not None
+
+        def score(r: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+            ends = self._sides[r], np.searchsorted(self._known, rows[r]), weight
+            found = predict.of_side(record.tx_pos_m[rows[r]], r, *ends)
+            return self.task.training_score(found, record.observation[r, rows[r]])
+
+        held = [record.tx_pos_m[own] for own in rows]
+        lengths = reach.lengths(held) if chosen is not self.split else [reach.length_m]
+        self.state.reach_m, median = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
+        return median
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
+        if self.graph.corrects:
+            return self._corrected_score()
         rows, record = self.split.validation, self.record
         if len(rows) == 0:
             return float("nan")
@@ -295,6 +331,8 @@ class Trainer:
         since = taken = 0
         while state.step < config.steps and not (taken and stop()):
             t = state.step
+            if 0 < t == schedule.alone:
+                state.forget_moments()
             receiver = int(schedule.receiver[t])
             rows = schedule.rows[t]
             state.mean, trouble, report = self._step_of(receiver)(
@@ -321,8 +359,10 @@ class Trainer:
             last = state.step == config.steps
             if state.step in schedule.density:
                 self._adapt()
-            choosing = config.patience > 0 and state.step <= schedule.joined and not state.chosen
-            scored = state.step % config.validate_every == 0 or last or (choosing and state.step == schedule.joined)
+            after_paths = state.step >= schedule.alone
+            choosing = config.patience > 0 and after_paths and state.step <= schedule.joined and not state.chosen
+            scored = (state.step % config.validate_every == 0 and after_paths) or last
+            scored = scored or (choosing and state.step in (schedule.alone, schedule.joined))
             if state.step % config.log_every == 0 or scored:
                 self._require_finite(trouble)
                 score = self.validate() if scored else None
@@ -361,6 +401,8 @@ class Trainer:
         self.state = state.go_back()
         self.state.chosen = self.state.step
         self.schedule, self.state.step = self.schedule.after(self.state.chosen)
+        if self.state.reach_m == 0 and self.graph.scene is None:
+            self.state.step = self.config.steps  # nothing is predicted better than zero: there is nothing to train
         self.record_functions()
         return True
 

@@ -55,6 +55,7 @@ class Batch:
         receiver: its number from 0.
         pose: of the receiver.
         plane: directions of its learned signal.
+        weight: of the learned signal [batch], 0 to 1; None: 1.
     """
 
     condition: Any
@@ -62,6 +63,7 @@ class Batch:
     receiver: Any
     pose: Pose
     plane: Plane
+    weight: Any | None = None
 
 
 Report = Callable[[Mapping[str, Any], Batch], Any]
@@ -111,6 +113,13 @@ class Graph:
     def sphere(self) -> bool:
         """Whether receivers see the full sphere, or else the upper hemisphere."""
         return self.models[0].sphere
+
+    @property
+    def corrects(self) -> bool:
+        """Whether observations are something without the Gaussians, which correct it: paths, or a channel of zero."""
+        return self.field is not None and (
+            self.scene is not None or (self.kind.complex_valued and not self.form.features)
+        )
 
     @cached_property
     def _prepared(self) -> Any:
@@ -182,17 +191,21 @@ class Graph:
         """
         assert self.field is not None
         gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
-        if LEVEL not in params:
+        if LEVEL not in params and batch.weight is None:
             return gaussians
         kind: Any = type(gaussians.signal[0])
-        unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
-        if paths is not None:
-            re, im = paths.gain
-            power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
-            each = dr.width(gaussians.signal[0]) // paths.batch
-            unit = dr.gather(
-                kind, dr.sqrt(SHARE**2 * power + unit * unit), dr.arange(mi.UInt32, paths.batch * each) // each
-            )
+        unit = kind(1)
+        if LEVEL in params:
+            unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
+            if paths is not None:
+                re, im = paths.gain
+                power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
+                unit = dr.sqrt(SHARE**2 * power + unit * unit)
+        if batch.weight is not None:
+            unit = unit * batch.weight
+        if (count := dr.width(unit)) > 1:
+            each = dr.width(gaussians.signal[0]) // count
+            unit = dr.gather(kind, unit, dr.arange(mi.UInt32, count * each) // each)
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
     def report(self, number: int, side: TracedField | None, learned: bool = True) -> Report:

@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 from ..baselines.method import Inputs
 from ..core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
 from ..fit.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
-from ..fit.config import OF_TASK, PATHS_ALONE, PRESETS, TrainConfig
+from ..fit.config import PATHS_ALONE, PRESETS, TrainConfig, task_settings
 from ..fit.fields import make_field
 from ..fit.packed import pack_params, unpack_params
 from ..fit.predictor import Predictor
+from ..fit.reach import Reach
 from ..fit.start import initial_gaussians
 from ..fit.state import FitState
 from ..fit.targets import form_of, plan_rows, targets_of
 from ..fit.trainer import Progress, Trainer
 from ..graph.graph import Graph
 from ..graph.receivers import Form
-from ..tasks import TASKS, task_of
+from ..tasks import TASKS
 from ..tasks.conditions import placed_receivers
 from .model import Arrays, Fitted, Model, Problem, Session
 
@@ -72,7 +73,8 @@ class FittedField(Fitted):
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna)
         ends = self.field, self.params, self.receivers, *form.size, config.skip
-        return Predictor(*ends, operator=self._problem.operator, store=self._store, graph=graph)
+        reach = _reach(self._arrays)
+        return Predictor(*ends, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """See `Fitted`."""
@@ -92,6 +94,20 @@ class FittedField(Fitted):
         """Arrays of a field with other parameters for the same receivers, see `wrf_mi.fit.packed`."""
         ends = {key: v for key, v in self._arrays.items() if not key.startswith((PARAM, "packed_"))}
         return ends | pack_params(params, precision)
+
+
+def _reach_arrays(reach: Reach | None) -> Arrays:
+    if reach is None:
+        return {}
+    counts = np.array([len(known) for known in reach.known_m])
+    return {"reach_m": np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
+
+
+def _reach(arrays: Arrays) -> Reach | None:
+    if "reach_m" not in arrays:
+        return None
+    ends = np.cumsum(arrays["known_counts"])[:-1]
+    return Reach(tuple(np.split(arrays["known_m"], ends)), float(arrays["reach_m"]))
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
@@ -124,21 +140,17 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
         **trainer.graph.form.arrays(),
         "tx_antenna": np.asarray(astuple(record.tx_antenna)),
         **receiver_arrays(trainer.graph.receivers),
+        **_reach_arrays(trainer.reach()),
     }
     fitted = load(arrays, problem, folder)
     fitted.train_seconds = trainer.seconds
     return fitted
 
 
-def _resolved(problem: Problem, rows: NDArray[np.int64]) -> TrainConfig:
-    config: TrainConfig = problem.settings
-    with_scene = problem.scene is not None and task_of(problem.record).image
-    return config.resolved(problem.record.tx_pos_m[rows], with_scene)
-
-
 def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
-    """Settings with number of steps, scale of transmitters and starting signals resolved."""
-    return _resolved(problem, np.concatenate([rows.all_train for rows in splits]))
+    """Settings with number of steps and scale of transmitters resolved."""
+    config: TrainConfig = problem.settings
+    return config.resolved(problem.record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
@@ -147,12 +159,13 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     scene = None if problem.scene is None else problem.opened_scene
     for rows in splits:
         known = rows.all_train
-        config, targets = _resolved(problem, known), targets_of(record, known, scene is not None)
+        config = problem.settings.resolved(record.tx_pos_m[known])
+        targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         field = None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)
         Graph(field, receivers, form, scene, config.traced)
-        plan_rows(config, targets, rows)
+        plan_rows(config, targets, rows, field is not None and scene is not None)
         drawn = np.random.default_rng([config.seed, 0])
         initial_gaussians(config.initial, replace(record, receivers=receivers), rows.train, drawn)
 
@@ -160,7 +173,8 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
 @cache
 def _by_data(name: str, task: str, with_scene: bool) -> Model:
     """The entry for a task: its settings begin with others, and spectra are complete."""
-    return replace(_entry(name), defaults=OF_TASK.get(task, ()), complete=TASKS[task].image, by_data=None)
+    image = TASKS[task].image
+    return replace(_entry(name), defaults=task_settings(task, image, with_scene), complete=image, by_data=None)
 
 
 def _entry(name: str) -> Model:

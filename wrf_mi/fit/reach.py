@@ -1,0 +1,122 @@
+"""How far from the training transmitters Gaussians correct what an observation is without them.
+
+    w(x) = exp(-(d(x) / reach)^2)
+
+d is the distance from a transmitter to the nearest one that trained, and w scales the Gaussians' signal: beside the
+paths of a scene, and for channels, whose value without Gaussians is zero. Paths hold everywhere, while Gaussians
+interpolate between neighbours; beyond some fraction of a wavelength, which the data tell, what they add is noise. So
+the reach is chosen on rows held out in groups: validation rows are drawn among the training rows and lie near these.
+
+A reach of 0 switches the Gaussians off, an infinite one trusts them everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from ..core import Split
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+
+GROUPS = 10
+"""Clusters of training positions, a few of which are held out together."""
+ROWS_OF_GROUP = 4
+"""Rows that a cluster has on average, at least."""
+HELD_OUT = 0.25
+"""Share of the training rows that are held out in clusters, about."""
+LENGTHS = 6
+"""Reaches that are tried beside 0: each twice the one before, the last twice the largest distance held out."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where a field's Gaussians are trusted.
+
+    Attributes:
+        known_m: transmitters that trained, of each receiver those that it observed, [k, 3] in metres.
+        length_m: the reach, metres.
+    """
+
+    known_m: tuple[FloatArray, ...]
+    length_m: float
+
+    def distance(self, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
+        """Distance of transmitters [m, 3] from the nearest known one, metres; infinite where there is none."""
+        known = self.known_m[receiver]
+        return np.asarray(cKDTree(known).query(tx_pos_m)[0]) if len(known) else np.full(len(tx_pos_m), np.inf)
+
+    def weight(self, tx_pos_m: FloatArray, receiver: int) -> NDArray[np.float32]:
+        """Weight w of the Gaussians' signal for transmitters [m, 3], 0 to 1."""
+        if self.length_m == 0 or np.isinf(self.length_m):
+            return np.full(len(tx_pos_m), float(self.length_m > 0), np.float32)
+        return np.exp(-np.square(self.distance(tx_pos_m, receiver) / self.length_m)).astype(np.float32)
+
+    def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
+        """Reaches to choose from by held-out transmitters [m, 3] of each receiver, from 0 upwards."""
+        found = [self.distance(own, r) for r, own in enumerate(tx_pos_m) if len(own) and len(self.known_m[r])]
+        largest = float(np.max(np.concatenate(found), initial=0.0)) if found else 0.0
+        return [0.0, *(2 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
+
+
+def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
+    """The split with clusters of its training rows moved to the validation rows, seeded by the split.
+
+    Args:
+        split: of a record.
+        tx_pos_m: positions of all rows [n, 3], metres.
+
+    Returns:
+        Validation rows near training rows and away from them. The split itself where its rows are too few.
+    """
+    rows: IntArray = split.train
+    count = min(GROUPS, len(rows) // ROWS_OF_GROUP)
+    if count < 2:
+        return split
+    rng = np.random.default_rng([split.seed, 3])
+    _, labels = kmeans2(tx_pos_m[rows], count, iter=50, minit="++", missing="warn", rng=rng)
+    held = np.zeros(len(rows), bool)
+    for group in rng.permutation(count):
+        more = held | (labels == group)
+        if not held.any() or more.mean() <= HELD_OUT:
+            held = more
+    if held.all():
+        return split
+    return replace(split, train=rows[~held], validation=np.sort(np.concatenate([split.validation, rows[held]])))
+
+
+def choose_reach(
+    reach: Reach,
+    lengths: Sequence[float],
+    tx_pos_m: Sequence[FloatArray],
+    score: Callable[[int, NDArray[np.float32]], FloatArray],
+    higher_is_better: bool,
+) -> tuple[float, float]:
+    """The reach by which held-out transmitters are predicted best.
+
+    Args:
+        reach: with the transmitters that trained.
+        lengths: to choose from, metres.
+        tx_pos_m: held-out transmitters that each receiver observed, [m, 3] in metres.
+        score: ``score(receiver, weight)``: scores of a receiver's held-out transmitters with weights [m].
+        higher_is_better: whether the score is an accuracy.
+
+    Returns:
+        The reach, metres, of the best mean, the first of equal ones; and its median score. Where nothing is held out,
+        the reach as it is and NaN.
+    """
+    held = [r for r, own in enumerate(tx_pos_m) if len(own)]
+    best: tuple[float, float, float] = (-np.inf, reach.length_m, np.nan)
+    for length in lengths if held else []:
+        one = replace(reach, length_m=length)
+        scores = np.concatenate([np.ravel(score(r, one.weight(tx_pos_m[r], r))) for r in held])
+        # Means differ less from draw to draw than medians, which tables state.
+        mean = float(np.nanmean(scores)) * (1 if higher_is_better else -1)
+        if mean > best[0]:
+            best = mean, length, float(np.nanmedian(scores))
+    return best[1], best[2]
