@@ -26,6 +26,7 @@ from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
+from .adam import NonFiniteReport, NumericsError, watched_groups
 from .config import PATHS_ALONE, TrainConfig
 from .fields import make_field
 from .predictor import Predictor
@@ -34,23 +35,14 @@ from .state import FitState
 from .step import (
     Loss,
     TrainingData,
-    Trouble,
     device_pose,
     evaluated,
     make_step,
-    no_trouble,
-    watched_groups,
 )
 from .targets import form_of, plan_rows, targets_of
 
 AT_ONCE = 64
 """Observations of a receiver by which its level starts."""
-
-
-class NumericsError(RuntimeError):
-    """A loss, gradient, parameter or moment was not finite; says at which step, and which of them."""
-
-    exit_status = 1
 
 
 @dataclass(frozen=True)
@@ -291,7 +283,7 @@ class Trainer:
         """
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
-        losses, trouble = dr.zeros(mi.Float), no_trouble(state.adam)
+        losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)
         since = taken = 0
         while state.step < config.steps and not (taken and stop()):
             t = state.step
@@ -388,7 +380,7 @@ class Trainer:
         if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
 
-    def _require_finite(self, trouble: Trouble) -> None:
+    def _require_finite(self, trouble: NonFiniteReport) -> None:
         """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
         step = int(trouble.step[0])
         # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
