@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.types import IntArray
-from .config import TrainConfig
+from .config import DensityConfig
+from .loop_config import LoopConfig
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,13 @@ class Schedule:
         return replace(self, factor=factor), start
 
 
-def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[IntArray]) -> Schedule:
+def plan(
+    config: LoopConfig,
+    train: Sequence[IntArray],
+    everything: Sequence[IntArray],
+    rng: np.random.Generator,
+    density: frozenset[int] = frozenset(),
+) -> Schedule:
     """The plan of a fit, a function of settings, rows and seed alone: a resumed run goes on with the same.
 
     Each epoch visits every row at every receiver that observed it once, in random order; a batch belongs to one
@@ -62,6 +69,8 @@ def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[In
         config: settings.
         train: rows (conditions) of each receiver that train while validation rows are held out.
         everything: those with the validation rows.
+        rng: draws the order of rows.
+        density: steps after which density control takes a round.
 
     Raises:
         InputError: a receiver without rows that train.
@@ -72,22 +81,29 @@ def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[In
     if not batch:
         beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
         raise InputError(f"no training row at one receiver{beside}: use more rows")
-    rng = np.random.default_rng([config.seed, 1])
     plans = [_epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)]
     t = np.arange(steps)
     o = config.optimiser
-    cosine = o.final + (1 - o.final) * 0.5 * (1 + np.cos(np.pi * t / steps))
-    d = config.density
-    first, last = int(d.start * steps), int(d.stop * steps)
-    rounds = [s for s in range(d.every, steps, d.every) if first <= s <= last] if d.every else []
+    flat = round(o.cosine_start * steps)
+    cosine = o.final + (1 - o.final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
     return Schedule(
         rows=np.concatenate([rows for rows, _ in plans]),
         receiver=np.concatenate([receiver for _, receiver in plans]),
         factor=cosine * np.minimum(1.0, (t + 1) / max(1, o.warm_up)),
         # A young mean forgets faster, or it would be mostly the starting values.
         decay=np.minimum(o.averaging, (t + 1) / (t + 10)),
-        density=frozenset(rounds),
+        density=density,
         joined=joined,
+    )
+
+
+def density_rounds(config: DensityConfig, steps: int) -> frozenset[int]:
+    """Steps after which density control takes a round, of a fit of so many."""
+    first, last = int(config.start * steps), int(config.stop * steps)
+    return (
+        frozenset(s for s in range(config.every, steps, config.every) if first <= s <= last)
+        if config.every
+        else frozenset()
     )
 
 

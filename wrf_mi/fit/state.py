@@ -116,7 +116,7 @@ class FitState:
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
         scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
-        return flat | {"urge": self.urge.numpy()} | {name: np.asarray(value) for name, value in scalars.items()}
+        return flat | {"urge": self.urge.numpy().copy()} | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FitState:

@@ -18,7 +18,7 @@ from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import task_of
 from ..tasks.conditions import normalised_uplink, outputs_of
 from .config import TrainConfig
-from .schedule import Schedule, plan
+from .schedule import Schedule, density_rounds, plan
 
 
 @dataclass(frozen=True)
@@ -138,4 +138,5 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split) -> Schedule:
     train = [targets.received(r, split.train) for r in range(len(targets.truth))]
     # A receiver whose few rows all are to choose by learns from these.
     train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
-    return plan(config, train, everything)
+    rng = np.random.default_rng([config.seed, 1])
+    return plan(config, train, everything, rng, density_rounds(config.density, config.steps))

@@ -1,12 +1,11 @@
-"""The training loop."""
+"""Training of Gaussians, of the paths of a scene, or of both."""
 
 from __future__ import annotations
 
 import resource
 import sys
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,9 +25,10 @@ from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from .adam import NonFiniteReport, NumericsError, watched_groups
+from .adam import NonFiniteReport
 from .config import PATHS_ALONE, TrainConfig
 from .fields import make_field
+from .loop import TrainingLoop
 from .predictor import Predictor
 from .start import initial_gaussians
 from .state import FitState
@@ -43,31 +43,6 @@ from .targets import form_of, plan_rows, targets_of
 
 AT_ONCE = 64
 """Observations of a receiver by which its level starts."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a listener hears at each log line.
-
-    Attributes:
-        step: steps taken.
-        seconds: training time so far, over all sittings.
-        loss: mean over the steps since the last line.
-        validation_score: median on the validation rows, where it was just computed.
-        held_out: whether the validation rows are still kept out of training.
-        gaussians: their number.
-        left_s: estimated seconds to the end.
-        label: of the score.
-    """
-
-    step: int
-    seconds: float
-    loss: float
-    validation_score: float | None
-    held_out: bool
-    gaussians: int
-    left_s: float
-    label: str = "SSIM"
 
 
 def peak_memory_mb() -> float:
@@ -88,7 +63,7 @@ def check_rows(split: Split, record: Record, source: str) -> None:
         raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
 
 
-class Trainer:
+class Trainer(TrainingLoop):
     """Fits one field to the training rows of one split.
 
     Args:
@@ -108,6 +83,8 @@ class Trainer:
         BackendError: a deterministic fit in a process that computes on a GPU already.
     """
 
+    config: TrainConfig
+
     def __init__(
         self,
         record: Record,
@@ -122,6 +99,7 @@ class Trainer:
     ) -> None:
         check_rows(split, record, f"split {split.name}")
         self.task = task_of(record)
+        self.label, self.higher_is_better = self.task.label, self.task.higher_is_better
         check_observations(record, split, complete=self.task.image)
         known = split.all_train
         config = config.resolved(record.tx_pos_m[known], scene is not None and self.task.image)
@@ -160,7 +138,6 @@ class Trainer:
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self.record_functions()
-        self.seconds = 0.0
 
     @property
     def field(self) -> Field:
@@ -261,102 +238,31 @@ class Trainer:
         ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
-    def run(
-        self,
-        listen: Callable[[Progress], None] = lambda progress: None,
-        save: Callable[[], None] = lambda: None,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> bool:
-        """Train from the current step to the last.
+    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """See `TrainingLoop`."""
+        state, schedule, t = self.state, self.schedule, self.state.step
+        receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
+        state.mean, trouble, report = self._step_of(receiver)(
+            state.adam,
+            state.mean,
+            self._data,
+            mi.UInt32(rows.tolist()),
+            mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
+            dr.opaque(mi.UInt32, receiver),
+            self._poses[receiver],
+            self._plane,
+            dr.opaque(mi.Float, float(schedule.factor[t])),
+            dr.opaque(mi.Float, float(schedule.decay[t])),
+            dr.opaque(mi.UInt32, t + 1),
+            trouble,
+        )
+        state.urge += report.urge
+        state.urge_steps += 1
+        dr.schedule(state.urge)  # evaluated together with the loop's sum of losses
+        return report.loss, trouble
 
-        Args:
-            listen: hears of progress every ``log_every`` steps and at the end.
-            save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
-            stop: asked after each step; True ends the run there.
-
-        Returns:
-            Whether the last step was reached.
-
-        Raises:
-            NumericsError: a loss or gradient that is not finite, raised right after that step, which was not taken:
-                parameters are as before it. Or parameters or moments that are not, found before a score or checkpoint.
-        """
-        config, state, schedule = self.config, self.state, self.schedule
-        start, before = time.perf_counter(), self.seconds
-        losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)
-        since = taken = 0
-        while state.step < config.steps and not (taken and stop()):
-            t = state.step
-            receiver = int(schedule.receiver[t])
-            rows = schedule.rows[t]
-            state.mean, trouble, report = self._step_of(receiver)(
-                state.adam,
-                state.mean,
-                self._data,
-                mi.UInt32(rows.tolist()),
-                mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
-                dr.opaque(mi.UInt32, receiver),
-                self._poses[receiver],
-                self._plane,
-                dr.opaque(mi.Float, float(schedule.factor[t])),
-                dr.opaque(mi.Float, float(schedule.decay[t])),
-                dr.opaque(mi.UInt32, t + 1),
-                trouble,
-            )
-            losses += report.loss
-            state.urge += report.urge
-            dr.eval(losses, state.urge)
-            state.step, state.urge_steps, since, taken = t + 1, state.urge_steps + 1, since + 1, taken + 1
-            if trouble.step[0]:  # one number, but reading it waits for the step
-                self._require_finite(trouble)
-            self.seconds = before + time.perf_counter() - start
-            last = state.step == config.steps
-            if state.step in schedule.density:
-                self._adapt()
-            choosing = config.patience > 0 and state.step <= schedule.joined and not state.chosen
-            scored = state.step % config.validate_every == 0 or last or (choosing and state.step == schedule.joined)
-            if state.step % config.log_every == 0 or scored:
-                self._require_finite(trouble)
-                score = self.validate() if scored else None
-                self.seconds = before + time.perf_counter() - start
-                left = (self.seconds - before) / taken * (config.steps - state.step)
-                held_out = state.step <= schedule.joined
-                told = (
-                    state.step,
-                    self.seconds,
-                    losses[0] / since,
-                    score,
-                    held_out,
-                    state.gaussians,
-                    left,
-                    self.task.label,
-                )
-                listen(Progress(*told))
-                losses, since = dr.zeros(mi.Float), 0
-                if score is not None and choosing and self._chosen(score):
-                    state, schedule = self.state, self.schedule
-            if state.step % config.checkpoint_every == 0 and not last:
-                self._require_finite(trouble)
-                save()
-        dr.sync_thread()
-        self.seconds = before + time.perf_counter() - start
-        self._require_finite(trouble)
-        save()
-        return state.step == config.steps
-
-    def _chosen(self, score: float) -> bool:
-        """Keep the best moment; once no better one is waited for, go on from it. Whether the fit did."""
-        state = self.state
-        state.keep_best(score if self.task.higher_is_better else -score)
-        if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
-            return False
-        self.state = state.go_back()
-        self.state.chosen = self.state.step
-        self.schedule, self.state.step = self.schedule.after(self.state.chosen)
-        self.record_functions()
-        return True
-
-    def _adapt(self) -> None:
+    def adapt(self) -> None:
+        """A round of density control."""
         d, state = self.config.density, self.state
         names = self.field.per_gaussian
         params = {name: values for name, values in state.params().items() if name in names}
@@ -379,23 +285,3 @@ class Trainer:
         rounds = sorted(self.schedule.density)
         if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
-
-    def _require_finite(self, trouble: NonFiniteReport) -> None:
-        """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
-        step = int(trouble.step[0])
-        # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
-        groups = (self.state.params(), *self.state.moments()[:2])
-        bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
-        if bad:
-            where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
-            raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
-        if step:
-            names = ["loss", *watched_groups(self.state.adam)]
-            found = ", ".join(n for n, broken in zip(names, trouble.groups.numpy(), strict=True) if broken)
-            where = f"step {step}: not finite: {found}"
-            raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")
-
-
-def final_params(arrays: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """The parameters to predict with, from a checkpoint's arrays."""
-    return {key.removeprefix("mean/"): values for key, values in arrays.items() if key.startswith("mean/")}
