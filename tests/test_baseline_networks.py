@@ -33,7 +33,7 @@ from wrf_mi.baselines.tensors import columns  # noqa: E402
 from wrf_mi.baselines.training import Descent, Training, epochs, fit_network  # noqa: E402
 from wrf_mi.baselines.vae import elbo_loss, pooled  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.fit.trainer import NumericsError  # noqa: E402
+from wrf_mi.fit.adam import NumericsError  # noqa: E402
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink  # noqa: E402
 
 pytestmark = pytest.mark.all_threads

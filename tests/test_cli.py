@@ -24,7 +24,7 @@ from made_spectra import SIZE
 from wrf_mi.cli import _parser, main
 from wrf_mi.core import InputError
 from wrf_mi.fit.checkpoint import read_checkpoint
-from wrf_mi.fit.trainer import Progress
+from wrf_mi.fit.loop import Progress
 from wrf_mi.report import demo, runs
 from wrf_mi.report.runs import open_run
 from wrf_mi.report.watch import Watch

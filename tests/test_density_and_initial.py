@@ -253,6 +253,17 @@ def test_state_survives_its_arrays() -> None:
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
 
+def test_the_best_moment_stays_as_it_was() -> None:
+    """Dr.Jit gives memory of an array that is summed to in place to the next one of that size."""
+    state, _ = trained_state(4)
+    state.keep_best(1.0)
+    for _ in range(3):
+        state.urge += to_float(np.ones(4))
+        dr.eval(state.urge)
+    assert state.best is not None
+    np.testing.assert_array_equal(state.best["urge"], np.arange(4))
+
+
 TILTED = Receiver("a", np.array([5.0, 0.3, 1.0]), np.array([0.5, -0.5, -0.5, 0.5]))
 UPSIDE_DOWN = Receiver("b", np.array([-40.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
 

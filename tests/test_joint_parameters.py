@@ -16,8 +16,9 @@ from small_fits import stop_after
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
+from wrf_mi.fit.adam import NumericsError
 from wrf_mi.fit.config import TrainConfig, calibration_config, default_config
-from wrf_mi.fit.trainer import NumericsError, Trainer
+from wrf_mi.fit.trainer import Trainer
 from wrf_mi.hybrid import PowerReceiver, TracedField, TracedOptions
 from wrf_mi.hybrid.materials import physical
 from wrf_mi.tasks import instrument_of

@@ -21,9 +21,11 @@ init()
 import drjit as dr  # noqa: E402
 
 from wrf_mi.core import InputError, Record, Split  # noqa: E402
+from wrf_mi.fit.adam import NumericsError  # noqa: E402
 from wrf_mi.fit.checkpoint import read_checkpoint  # noqa: E402
 from wrf_mi.fit.config import TrainConfig  # noqa: E402
-from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
+from wrf_mi.fit.loop import Progress  # noqa: E402
+from wrf_mi.fit.trainer import Trainer  # noqa: E402
 from wrf_mi.measure import load, load_split, make_splits, write_spectrum_folder  # noqa: E402
 from wrf_mi.report.runs import Interrupted, Run, evaluate_run, open_run, resume, train  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402

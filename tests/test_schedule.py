@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from wrf_mi.core import InputError, Split
 from wrf_mi.core.settings import with_settings
 from wrf_mi.fit.config import TrainConfig
-from wrf_mi.fit.schedule import Schedule, plan
+from wrf_mi.fit.schedule import Schedule, density_rounds, plan
 
 
 def split_of(train: int, validation: int = 3) -> Split:
@@ -26,7 +26,8 @@ def split_of(train: int, validation: int = 3) -> Split:
 
 def plan_of(split: Split, receivers: int = 1, *settings: str, **values: Any) -> Schedule:
     config = with_settings(TrainConfig(**values), settings)
-    return plan(config, [split.train] * receivers, [split.all_train] * receivers)
+    rng, rounds = np.random.default_rng([config.seed, 1]), density_rounds(config.density, config.steps)
+    return plan(config, [split.train] * receivers, [split.all_train] * receivers, rng, rounds)
 
 
 @given(
@@ -145,11 +146,20 @@ def test_rounds_of_density_control() -> None:
     assert plan_of(split_of(9), 1, *settings, "density.stop=1", steps=300).density == {100, 200}
 
 
+def test_rates_stay_until_the_cosine_starts() -> None:
+    factor = plan_of(split_of(9), 1, "optimiser.warm_up=0", "optimiser.cosine_start=0.6", steps=50).factor
+    np.testing.assert_array_equal(factor[:31], 1)
+    final = TrainConfig().optimiser.final
+    np.testing.assert_allclose(factor[40], (1 + final) / 2)
+    assert (np.diff(factor[30:]) < 0).all()
+    assert (plan_of(split_of(9), 1, "optimiser.warm_up=0", "optimiser.cosine_start=1", steps=50).factor == 1).all()
+
+
 def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
     assert plan_of(split_of(3, 2), 1, "batch=4", steps=10).rows.shape == (10, 3)
     assert plan_of(split_of(3, 1), 1, "batch=5", "hold_out=0", steps=10).rows.shape == (10, 4)
     rows = [np.array([4, 7, 9]), np.array([1, 2, 3, 5, 6, 8])]
-    schedule = plan(with_settings(TrainConfig(batch=5, steps=9), ["hold_out=1"]), rows, rows)
+    schedule = plan(with_settings(TrainConfig(batch=5, steps=9), ["hold_out=1"]), rows, rows, np.random.default_rng(0))
     assert schedule.rows.shape == (9, 3)
     # An epoch has one batch of the first receiver and two of the second, each of its own rows.
     for three in range(0, 9, 3):

@@ -21,9 +21,11 @@ import drjit as dr  # noqa: E402
 from wrf_mi.backend.device import to_float  # noqa: E402
 from wrf_mi.core import InputError, Record  # noqa: E402
 from wrf_mi.field import FIELDS, random_gaussians  # noqa: E402
+from wrf_mi.fit.adam import NumericsError  # noqa: E402
+from wrf_mi.fit.loop import Progress  # noqa: E402
 from wrf_mi.fit.predictor import Predictor  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
-from wrf_mi.fit.trainer import NumericsError, Progress, Trainer  # noqa: E402
+from wrf_mi.fit.trainer import Trainer  # noqa: E402
 from wrf_mi.loss.spectrum import spectrum_loss  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402
 

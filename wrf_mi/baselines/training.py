@@ -24,9 +24,8 @@ from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
 from ..field.network import Weights
+from ..fit.adam import NumericsError, watched_groups
 from ..fit.recorded import Recorded
-from ..fit.step import watched
-from ..fit.trainer import NumericsError
 from .method import Listen
 
 LOG_EVERY = 50
@@ -107,7 +106,7 @@ class Descent:
             params = {name: adam[name] for name in names}
             value = loss(params, data, given)
             dr.backward(value)
-            sums = [dr.sum(dr.abs(dr.grad(params[n]).array)) for n in names if watched(n)]
+            sums = [dr.sum(dr.abs(dr.grad(params[n]).array)) for n in watched_groups(names)]
             fine = fine & reduce(operator.and_, [dr.isfinite(s) for s in [dr.detach(value), *sums]])
             adam.step(eval=False, active=fine)
             share = dr.select(fine, decay, 1)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
-from .trainer import Progress, Trainer
+from .loop import Progress
+from .trainer import Trainer
 
 FORMAT = 5
 """Version of ``checkpoint.npz``."""

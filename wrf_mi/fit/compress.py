@@ -17,11 +17,12 @@ from ..splat.removal import removal
 from ..splat.tiles import perception_plane
 from .config import NetworkConfig, TrainConfig
 from .fields import make_field
+from .loop import Progress
 from .packed import PRECISIONS
 from .predictor import Predictor
 from .state import FitState
 from .step import device_pose
-from .trainer import Progress, Trainer
+from .trainer import Trainer
 
 Params = dict[str, NDArray[np.float32]]
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from numpy.typing import ArrayLike
 
 from ..core import InputError
-from ..core.settings import flat, with_settings
+from ..core.settings import with_settings
 from ..field.encoding import telling_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import TracedConfig
 from ..splat.skip import Skip
 from ..trace.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
+from .loop_config import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, RANGES, SHARE, AdamConfig, LoopConfig, Range, checked
 
 
 @dataclass(frozen=True)
@@ -102,32 +102,24 @@ class ViewConfig:
 
 
 @dataclass(frozen=True)
-class OptimiserConfig:
-    """Adam (Kingma and Ba 2015): one rate a parameter group, warm-up, then a cosine to ``final`` of each rate.
+class OptimiserConfig(AdamConfig):
+    """Adam with a rate for each parameter group of Gaussians.
 
     Attributes:
-        network: rate of all networks.
         position: rate of centres, metres.
         scale: rate of log scales.
         rotation: rate of quaternions.
         opacity: rate of opacity logits.
         signal: rate of static signals.
         level: rate of the logarithm of the unit in which each receiver sees the field, where it has one.
-        warm_up: steps over which rates rise from zero.
-        final: share of each rate that is left at the last step.
-        averaging: decay per step of the running mean of the parameters, which is what is evaluated and stored.
     """
 
-    network: float = 1e-3
     position: float = 5e-3
     scale: float = 5e-3
     rotation: float = 2e-3
     opacity: float = 2e-2
     signal: float = 5e-3
     level: float = 2e-2
-    warm_up: int = 100
-    final: float = 0.01
-    averaging: float = 0.999
 
 
 @dataclass(frozen=True)
@@ -167,24 +159,16 @@ LEAST_TX_SCALE_M = 1.0
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """All settings of a fit.
+class TrainConfig(LoopConfig):
+    """All settings of a fit of Gaussians, of the paths of a scene, or of both.
 
     Attributes:
-        model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         steps: optimiser steps; 0: as many as the model needs, see `LONG_ENOUGH`.
         batch: transmitters in a step, at most.
+        model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         seed: of starting values and of the order of rows.
         deterministic: bit-identical results from run to run, at the price of computing on one thread of the CPU.
-        hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
-            to the end, as every choice of settings must; less ends with a fit on all training rows.
-        patience: scores on the validation rows without a better one after which no more are waited for. From the best
-            of them the fit then goes on with all training rows, for a share of the steps that led there. 0: all steps
-            are taken, and the last ones count.
         structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
-        checkpoint_every: steps between two checkpoints.
-        log_every: steps between two lines of the log.
-        validate_every: steps between two scores on the validation rows.
         receiver: how the field becomes what is observed, a name of `wrf_mi.graph.receivers`. Of spectra ``"pixel"``:
             its magnitude at each direction (the papers'), ``"array"``: the Bartlett spectrum of the array's element
             signals, scaled as the instrument does; ``"auto"``: array with a scene, else pixel. Of signal strengths
@@ -194,21 +178,15 @@ class TrainConfig:
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
 
-    model: str = "wrf-gs+"
     steps: int = 0
-    batch: int = 1
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    model: str = "wrf-gs+"
     seed: int = 0
     deterministic: bool = False
-    hold_out: float = 0.7
-    patience: int = 0
     structural_weight: float = 0.2
-    checkpoint_every: int = 2000
-    log_every: int = 100
-    validate_every: int = 1000
     initial: InitialConfig = field(default_factory=InitialConfig)
     encoding: EncodingConfig = field(default_factory=EncodingConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     receiver: str = AUTO
     view: ViewConfig = field(default_factory=ViewConfig)
@@ -227,13 +205,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use."""
-        values = dict(flat(dataclasses.asdict(self), ""))
-        for name, value in values.items():
-            if not isinstance(value, int | float):
-                continue
-            good, words = _RANGES.get(name, _NOT_NEGATIVE)
-            if not math.isfinite(value) or not good(value):
-                raise InputError(f"setting {name}: {value} is out of range, choose {words}")
+        values = checked(self, _RANGES)
         sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
         if len(sources) > 1:
             raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")
@@ -242,44 +214,33 @@ class TrainConfig:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
 
 
-_Range = tuple[Callable[[float], bool], str]
-_COUNT: _Range = (lambda x: x >= 1, "1 or more")
-_POSITIVE: _Range = (lambda x: x > 0, "more than 0")
-_INSIDE: _Range = (lambda x: 0 < x < 1, "more than 0 and less than 1")
-_SHARE: _Range = (lambda x: 0 <= x <= 1, "0 to 1")
-_NOT_NEGATIVE: _Range = (lambda x: x >= 0, "0 or more")
-
-_RANGES: Mapping[str, _Range] = {
-    "batch": _COUNT,
-    "hold_out": _SHARE,
-    "structural_weight": _SHARE,
-    "checkpoint_every": _COUNT,
-    "log_every": _COUNT,
-    "validate_every": _COUNT,
-    "initial.gaussians": _COUNT,
+_RANGES: Mapping[str, Range] = {
+    **RANGES,
+    "steps": NOT_NEGATIVE,
+    "structural_weight": SHARE,
+    "initial.gaussians": COUNT,
     "initial.size_deg": (lambda x: 0 < x < 90, "more than 0 and less than 90"),
-    "initial.nearest_m": _POSITIVE,
-    "initial.farthest_m": _POSITIVE,
-    "initial.opacity": _INSIDE,
-    "encoding.position_octaves": _COUNT,
-    "encoding.position_scale_m": _POSITIVE,
-    "view.height": _COUNT,
-    "view.columns": _COUNT,
-    "view.components": _COUNT,
-    "optimiser.final": _SHARE,
-    "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-    "density.start": _SHARE,
-    "density.stop": _SHARE,
-    "density.grow": _SHARE,
-    "density.most": _COUNT,
-    "density.split_deg": _POSITIVE,
-    "density.least_opacity": _INSIDE,
-    "density.reset_opacity": _INSIDE,
+    "initial.nearest_m": POSITIVE,
+    "initial.farthest_m": POSITIVE,
+    "initial.opacity": INSIDE,
+    "encoding.position_octaves": COUNT,
+    "encoding.position_scale_m": POSITIVE,
+    "view.height": COUNT,
+    "view.columns": COUNT,
+    "view.components": COUNT,
+    "density.start": SHARE,
+    "density.stop": SHARE,
+    "density.grow": SHARE,
+    "density.most": COUNT,
+    "density.split_deg": POSITIVE,
+    "density.least_opacity": INSIDE,
+    "density.reset_opacity": INSIDE,
+    "traced.alone": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
     "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
     "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
     "traced.pattern_degree": (lambda x: 0 <= x <= MAX_DEGREE, f"0 to {MAX_DEGREE}"),
 }
-"""What numbers may be, and words for it; `_NOT_NEGATIVE` where nothing is said here."""
+"""What numbers may be, and words for it; `NOT_NEGATIVE` where nothing is said here."""
 
 
 PAPER = (
@@ -321,6 +282,8 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
 }
 """What of the traced side can be fitted, by name; rates as ``--set`` takes them."""
+JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05")
+"""What Gaussians beside the paths of a scene depart in, for one antenna: few parameters of paths are fitted soon."""
 JOINT_IMAGES = (
     "batch=8",
     "steps=1500",
@@ -329,8 +292,7 @@ JOINT_IMAGES = (
     "validate_every=50",
     "patience=6",
 )
-"""What Gaussians beside the paths of a scene depart in, where observations are images: paths explain most of an image,
-to which the Gaussians add next to nothing at first."""
+"""And where observations are images: paths explain most of one, to which Gaussians add next to nothing at first."""
 
 
 def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
@@ -343,7 +305,7 @@ def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
     """
     if image:
         return JOINT_IMAGES if with_scene else ()
-    return ONE_ANTENNA if task in ("rssi", "csi") else ()
+    return () if task not in ("rssi", "csi") else JOINT_ONE_ANTENNA if with_scene else ONE_ANTENNA
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.types import IntArray
-from .config import OptimiserConfig, TrainConfig
+from .config import DensityConfig
+from .loop_config import AdamConfig, LoopConfig
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Schedule:
         decay: decay of the running mean of the parameters at each step, [steps].
         density: steps after which density control takes a round.
         joined: first step at which the validation rows may be trained on; ``steps`` if never.
-        alone: steps for which the paths of a scene are trained alone, before the Gaussians.
+        first_stage: steps of a first stage, in which nothing is chosen: paths of a scene are trained alone.
     """
 
     rows: IntArray
@@ -33,7 +34,7 @@ class Schedule:
     decay: NDArray[np.float64]
     density: frozenset[int]
     joined: int
-    alone: int = 0
+    first_stage: int = 0
 
     def after(self, best: int) -> tuple[Schedule, int]:
         """The plan that goes on from the best of the steps before the validation rows join.
@@ -53,7 +54,14 @@ class Schedule:
         return replace(self, factor=factor), start
 
 
-def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[IntArray], alone: int = 0) -> Schedule:
+def plan(
+    config: LoopConfig,
+    train: Sequence[IntArray],
+    everything: Sequence[IntArray],
+    rng: np.random.Generator,
+    density: frozenset[int] = frozenset(),
+    first_stage: int = 0,
+) -> Schedule:
     """The plan of a fit, a function of settings, rows and seed alone: a resumed run goes on with the same.
 
     Each epoch visits every row at every receiver that observed it once, in random order; a batch belongs to one
@@ -64,42 +72,49 @@ def plan(config: TrainConfig, train: Sequence[IntArray], everything: Sequence[In
         config: settings.
         train: rows (conditions) of each receiver that train while validation rows are held out.
         everything: those with the validation rows.
-        alone: steps for which paths are trained alone: learning rates fall in them, and then anew.
+        rng: draws the order of rows.
+        density: steps after which density control takes a round.
+        first_stage: steps of a first stage: learning rates fall in it, and then anew.
 
     Raises:
-        InputError: a receiver without rows that train, or no step after those of paths alone.
+        InputError: a receiver without rows that train.
     """
     steps = config.steps
-    if alone >= steps:
-        raise InputError(f"setting traced.steps: {alone} of {steps} steps leave none for the Gaussians; choose fewer")
     joined = steps if config.hold_out >= 1 else round(config.hold_out * steps)
     batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
     if not batch:
         beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
         raise InputError(f"no training row at one receiver{beside}: use more rows")
-    rng = np.random.default_rng([config.seed, 1])
     plans = [_epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)]
     t, o = np.arange(steps), config.optimiser
-    d = config.density
-    first, last = int(d.start * steps), int(d.stop * steps)
-    rounds = [s for s in range(d.every, steps, d.every) if first <= s <= last] if d.every else []
     return Schedule(
         rows=np.concatenate([rows for rows, _ in plans]),
         receiver=np.concatenate([receiver for _, receiver in plans]),
-        factor=np.concatenate([_falling(part, o) for part in (alone, steps - alone)]),
+        factor=np.concatenate([_falling(part, o) for part in (first_stage, steps - first_stage)]),
         # A young mean forgets faster, or it would be mostly the starting values.
         decay=np.minimum(o.averaging, (t + 1) / (t + 10)),
-        density=frozenset(rounds),
+        density=density,
         joined=joined,
-        alone=alone,
+        first_stage=first_stage,
     )
 
 
-def _falling(steps: int, optimiser: OptimiserConfig) -> NDArray[np.float64]:
+def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
     """Share of the learning rates at each of some steps: a linear warm-up, and half a cosine."""
     t, final = np.arange(steps), optimiser.final
-    cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * t / max(steps, 1)))
+    flat = round(optimiser.cosine_start * steps)
+    cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
     return np.asarray(cosine * np.minimum(1.0, (t + 1) / max(1, optimiser.warm_up)))
+
+
+def density_rounds(config: DensityConfig, steps: int) -> frozenset[int]:
+    """Steps after which density control takes a round, of a fit of so many."""
+    first, last = int(config.start * steps), int(config.stop * steps)
+    return (
+        frozenset(s for s in range(config.every, steps, config.every) if first <= s <= last)
+        if config.every
+        else frozenset()
+    )
 
 
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:

@@ -92,9 +92,8 @@ class FitState:
 
     def forget_moments(self) -> None:
         """Let Adam start anew from the parameters as they are."""
-        first, second, _ = self.moments()
-        nothing = {name: np.zeros_like(values) for name, values in first.items()}
-        self._set_moments(nothing, {name: np.zeros_like(values) for name, values in second.items()}, 0)
+        nothing = {name: np.zeros_like(values) for name, values in self.params().items()}
+        self._set_moments(nothing, nothing, 0)
 
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and forget its momentum (opacity reset)."""
@@ -125,7 +124,7 @@ class FitState:
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
         scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
-        flat |= {"urge": self.urge.numpy(), "reach_m": np.asarray(self.reach_m)}
+        flat |= {"urge": self.urge.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
         return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod

@@ -7,10 +7,8 @@ recorded kernels; a captured array or a changing Python number would be traced a
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -24,15 +22,14 @@ from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
 from ..graph.graph import Batch, Field, Report
-from ..graph.settings import TRACED_NAMES
 from ..project.footprint import Pose
 from ..splat.render import splat
 from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
+from .adam import NonFiniteReport, Params, guarded_step, rated_params
 
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
-Params = dict[str, Any]
 
 CENTRES = "position"
 """Parameter [3, n] of every field; where it is missing there are no Gaussians."""
@@ -102,48 +99,6 @@ class StepReport:
     urge: Any
 
 
-@dataclass
-class Trouble:
-    """The first step whose loss, parameters, gradient or its square were not finite; from then on no step is taken.
-
-    Attributes:
-        step: its number from 1; 0: none so far.
-        groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
-    """
-
-    step: Any
-    groups: Any
-
-
-def watched_groups(names: Iterable[str]) -> list[str]:
-    """The parameters that `Trouble` watches, in its order, after the loss."""
-    return [name for name in names if watched(name)]
-
-
-def no_trouble(names: Iterable[str]) -> Trouble:
-    """None so far, for parameters of these names."""
-    none = Trouble(mi.UInt32(0), dr.zeros(mi.Float, 1 + len(watched_groups(names))))
-    dr.make_opaque(none)  # a constant would be recorded as one
-    return none
-
-
-def watched(name: str) -> bool:
-    """Whether a parameter's gradient shows any NaN or infinity of its group.
-
-    Per-Gaussian attributes and what the traced side is made of are watched themselves, a layer through its bias, whose
-    gradient is the sum of all that reaches the layer.
-    """
-    return "." not in name or name.endswith(".bias") or name.startswith(TRACED_NAMES)
-
-
-def _health(param: Any) -> Any:
-    """A number that is finite where a parameter, its gradient and the square of that, which Adam takes, are.
-
-    A Gaussian whose shape or place is NaN is not seen, so that the loss alone would not tell.
-    """
-    return dr.sum(dr.square(dr.grad(param).array) + dr.abs(dr.detach(param).array))
-
-
 def make_step(
     report: Report,
     rates: Mapping[str, float],
@@ -165,7 +120,6 @@ def make_step(
         StepReport)``. It takes one step of ``adam`` in place, that of this number from 1, and returns the new running
         mean of the parameters. After trouble nothing changes any more.
     """
-    groups = watched_groups(rates)
     values = math.prod(shape)
 
     def step(
@@ -180,35 +134,21 @@ def make_step(
         factor: Any,
         decay: Any,
         number: Any,
-        trouble: Trouble,
-    ) -> tuple[Params, Trouble, StepReport]:
-        # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
-        adam.set_learning_rate({name: factor * rates[name] for name in rates})
-        params = {name: adam[name] for name in rates}
+        trouble: NonFiniteReport,
+    ) -> tuple[Params, NonFiniteReport, StepReport]:
+        params = rated_params(adam, rates, factor)
         condition, truth = data.select(rows, receiver, values)
         batch = dr.width(rows)
         prediction = report(params, Batch(condition, slots, receiver, pose, plane))
         scale = dr.gather(type(truth), data.scale, receiver)
         loss = loss_of(prediction * scale, truth * scale, batch, *shape)
-        dr.backward(loss)
-        sums = [dr.detach(loss), *(_health(params[name]) for name in groups)]
-        fine = [dr.isfinite(s) for s in sums]
-        good = reduce(operator.and_, fine)
-        untroubled = trouble.step == 0
-        finite = good & untroubled
+        mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
         urge = mi.Float(0)
         if CENTRES in params:
             offset = [dr.detach(params[CENTRES])[k].array - pose.position[k] for k in range(3)]
             pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
             distance = dr.sqrt(sum(c * c for c in offset))
             urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
-        adam.step(eval=False, active=finite)
-        share = dr.select(finite, decay, 1)
-        mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
-        now = dr.concat([dr.select(f, mi.Float(0), mi.Float(1)) for f in fine])
-        trouble = Trouble(
-            dr.select(untroubled & ~good, number, trouble.step), dr.select(untroubled, now, trouble.groups)
-        )
         told = StepReport(dr.detach(loss), urge)
         dr.eval(adam, mean, trouble, told)
         return mean, trouble, told

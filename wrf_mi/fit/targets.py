@@ -18,7 +18,7 @@ from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import task_of
 from ..tasks.conditions import normalised_uplink, outputs_of
 from .config import TrainConfig
-from .schedule import Schedule, plan
+from .schedule import Schedule, density_rounds, plan
 
 
 @dataclass(frozen=True)
@@ -138,10 +138,15 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool =
         joint: whether Gaussians are trained beside paths of a scene.
 
     Raises:
-        InputError: see `wrf_mi.fit.schedule.plan`.
+        InputError: see `wrf_mi.fit.schedule.plan`, or no step is left for the Gaussians.
     """
     everything = [targets.received(r, split.all_train) for r in range(len(targets.truth))]
     train = [targets.received(r, split.train) for r in range(len(targets.truth))]
     # A receiver whose few rows all are to choose by learns from these.
     train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
-    return plan(config, train, everything, config.traced.steps if joint else 0)
+    first = round(config.traced.alone * config.steps) if joint else 0
+    if joint and config.patience and 0 < config.hold_out <= config.traced.alone:
+        text = f"{config.traced.alone} of the steps are not less than hold_out, {config.hold_out}"
+        raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
+    rng = np.random.default_rng([config.seed, 1])
+    return plan(config, train, everything, rng, density_rounds(config.density, config.steps), first)

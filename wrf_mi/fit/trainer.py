@@ -1,12 +1,11 @@
-"""The training loop."""
+"""Training of Gaussians, of the paths of a scene, or of both."""
 
 from __future__ import annotations
 
 import resource
 import sys
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,8 +25,10 @@ from ..measure.observations import check_observations
 from ..splat.tiles import perception_plane
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
+from .adam import NonFiniteReport
 from .config import PATHS_ALONE, TrainConfig
 from .fields import make_field
+from .loop import TrainingLoop
 from .predictor import Predictor
 from .reach import Reach, choose_reach, hold_out_groups
 from .start import initial_gaussians
@@ -35,48 +36,14 @@ from .state import FitState
 from .step import (
     Loss,
     TrainingData,
-    Trouble,
     device_pose,
     evaluated,
     make_step,
-    no_trouble,
-    watched_groups,
 )
 from .targets import form_of, plan_rows, targets_of
 
 AT_ONCE = 64
 """Observations of a receiver by which its level starts."""
-
-
-class NumericsError(RuntimeError):
-    """A loss, gradient, parameter or moment was not finite; says at which step, and which of them."""
-
-    exit_status = 1
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a listener hears at each log line.
-
-    Attributes:
-        step: steps taken.
-        seconds: training time so far, over all sittings.
-        loss: mean over the steps since the last line.
-        validation_score: median on the validation rows, where it was just computed.
-        held_out: whether the validation rows are still kept out of training.
-        gaussians: their number.
-        left_s: estimated seconds to the end.
-        label: of the score.
-    """
-
-    step: int
-    seconds: float
-    loss: float
-    validation_score: float | None
-    held_out: bool
-    gaussians: int
-    left_s: float
-    label: str = "SSIM"
 
 
 def peak_memory_mb() -> float:
@@ -97,7 +64,7 @@ def check_rows(split: Split, record: Record, source: str) -> None:
         raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
 
 
-class Trainer:
+class Trainer(TrainingLoop):
     """Fits one field to the training rows of one split.
 
     Args:
@@ -117,6 +84,8 @@ class Trainer:
         BackendError: a deterministic fit in a process that computes on a GPU already.
     """
 
+    config: TrainConfig
+
     def __init__(
         self,
         record: Record,
@@ -131,6 +100,7 @@ class Trainer:
     ) -> None:
         check_rows(split, record, f"split {split.name}")
         self.task = task_of(record)
+        self.label, self.higher_is_better = self.task.label, self.task.higher_is_better
         check_observations(record, split, complete=self.task.image)
         known = split.all_train
         config = config.resolved(record.tx_pos_m[known])
@@ -173,7 +143,6 @@ class Trainer:
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self.record_functions()
-        self.seconds = 0.0
 
     @property
     def field(self) -> Field:
@@ -224,7 +193,9 @@ class Trainer:
         if side is not None:
             side.refresh({name: self.state.adam[name] for name in self.state.adam})
         state = self.state
-        learned = side is None or (state.step >= self.schedule.alone and not (state.chosen and state.reach_m == 0))
+        learned = side is None or (
+            state.step >= self.schedule.first_stage and not (state.chosen and state.reach_m == 0)
+        )
         arrays = self.graph.arrays(receiver, side)
         key = None if side is None and not arrays else (receiver, side and side.searches, learned)
         if key not in self._steps:
@@ -275,7 +246,7 @@ class Trainer:
         return Reach(tuple(known), self.state.reach_m)
 
     def _corrected_score(self) -> float:
-        """Median score of what Gaussians correct; until the fit has chosen, with the reach that is best at this moment."""
+        """Median score where Gaussians correct something; with the best reach until one is chosen."""
         predict, record, reach = self.predictor(), self.record, self.reach()
         chosen = self._choosing if self._chooses_reach and not self.state.chosen else self.split
         rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
@@ -305,108 +276,40 @@ class Trainer:
         ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
-    def run(
-        self,
-        listen: Callable[[Progress], None] = lambda progress: None,
-        save: Callable[[], None] = lambda: None,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> bool:
-        """Train from the current step to the last.
-
-        Args:
-            listen: hears of progress every ``log_every`` steps and at the end.
-            save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
-            stop: asked after each step; True ends the run there.
-
-        Returns:
-            Whether the last step was reached.
-
-        Raises:
-            NumericsError: a loss or gradient that is not finite, raised right after that step, which was not taken:
-                parameters are as before it. Or parameters or moments that are not, found before a score or checkpoint.
-        """
-        config, state, schedule = self.config, self.state, self.schedule
-        start, before = time.perf_counter(), self.seconds
-        losses, trouble = dr.zeros(mi.Float), no_trouble(state.adam)
-        since = taken = 0
-        while state.step < config.steps and not (taken and stop()):
-            t = state.step
-            if 0 < t == schedule.alone:
-                state.forget_moments()
-            receiver = int(schedule.receiver[t])
-            rows = schedule.rows[t]
-            state.mean, trouble, report = self._step_of(receiver)(
-                state.adam,
-                state.mean,
-                self._data,
-                mi.UInt32(rows.tolist()),
-                mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
-                dr.opaque(mi.UInt32, receiver),
-                self._poses[receiver],
-                self._plane,
-                dr.opaque(mi.Float, float(schedule.factor[t])),
-                dr.opaque(mi.Float, float(schedule.decay[t])),
-                dr.opaque(mi.UInt32, t + 1),
-                trouble,
-            )
-            losses += report.loss
-            state.urge += report.urge
-            dr.eval(losses, state.urge)
-            state.step, state.urge_steps, since, taken = t + 1, state.urge_steps + 1, since + 1, taken + 1
-            if trouble.step[0]:  # one number, but reading it waits for the step
-                self._require_finite(trouble)
-            self.seconds = before + time.perf_counter() - start
-            last = state.step == config.steps
-            if state.step in schedule.density:
-                self._adapt()
-            after_paths = state.step >= schedule.alone
-            choosing = config.patience > 0 and after_paths and state.step <= schedule.joined and not state.chosen
-            scored = (state.step % config.validate_every == 0 and after_paths) or last
-            scored = scored or (choosing and state.step in (schedule.alone, schedule.joined))
-            if state.step % config.log_every == 0 or scored:
-                self._require_finite(trouble)
-                score = self.validate() if scored else None
-                self.seconds = before + time.perf_counter() - start
-                left = (self.seconds - before) / taken * (config.steps - state.step)
-                held_out = state.step <= schedule.joined
-                told = (
-                    state.step,
-                    self.seconds,
-                    losses[0] / since,
-                    score,
-                    held_out,
-                    state.gaussians,
-                    left,
-                    self.task.label,
-                )
-                listen(Progress(*told))
-                losses, since = dr.zeros(mi.Float), 0
-                if score is not None and choosing and self._chosen(score):
-                    state, schedule = self.state, self.schedule
-            if state.step % config.checkpoint_every == 0 and not last:
-                self._require_finite(trouble)
-                save()
-        dr.sync_thread()
-        self.seconds = before + time.perf_counter() - start
-        self._require_finite(trouble)
-        save()
-        return state.step == config.steps
-
-    def _chosen(self, score: float) -> bool:
-        """Keep the best moment; once no better one is waited for, go on from it. Whether the fit did."""
-        state = self.state
-        state.keep_best(score if self.task.higher_is_better else -score)
-        if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
-            return False
-        self.state = state.go_back()
-        self.state.chosen = self.state.step
-        self.schedule, self.state.step = self.schedule.after(self.state.chosen)
-        if self.state.reach_m == 0 and self.graph.scene is None:
+    def choose(self, score: float) -> bool:
+        """See `TrainingLoop`."""
+        chosen = super().choose(score)
+        if chosen and self.state.reach_m == 0 and self.graph.scene is None:
             self.state.step = self.config.steps  # nothing is predicted better than zero: there is nothing to train
-        self.record_functions()
-        return True
+        return chosen
 
-    def _adapt(self) -> None:
+    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """See `TrainingLoop`."""
+        state, schedule, t = self.state, self.schedule, self.state.step
+        receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
+        if 0 < t == schedule.first_stage:
+            state.forget_moments()
+        state.mean, trouble, report = self._step_of(receiver)(
+            state.adam,
+            state.mean,
+            self._data,
+            mi.UInt32(rows.tolist()),
+            mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
+            dr.opaque(mi.UInt32, receiver),
+            self._poses[receiver],
+            self._plane,
+            dr.opaque(mi.Float, float(schedule.factor[t])),
+            dr.opaque(mi.Float, float(schedule.decay[t])),
+            dr.opaque(mi.UInt32, t + 1),
+            trouble,
+        )
+        state.urge += report.urge
+        state.urge_steps += 1
+        dr.schedule(state.urge)  # evaluated together with the loop's sum of losses
+        return report.loss, trouble
+
+    def adapt(self) -> None:
+        """A round of density control."""
         d, state = self.config.density, self.state
         names = self.field.per_gaussian
         params = {name: values for name, values in state.params().items() if name in names}
@@ -429,23 +332,3 @@ class Trainer:
         rounds = sorted(self.schedule.density)
         if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
-
-    def _require_finite(self, trouble: Trouble) -> None:
-        """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
-        step = int(trouble.step[0])
-        # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
-        groups = (self.state.params(), *self.state.moments()[:2])
-        bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
-        if bad:
-            where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
-            raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
-        if step:
-            names = ["loss", *watched_groups(self.state.adam)]
-            found = ", ".join(n for n, broken in zip(names, trouble.groups.numpy(), strict=True) if broken)
-            where = f"step {step}: not finite: {found}"
-            raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")
-
-
-def final_params(arrays: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """The parameters to predict with, from a checkpoint's arrays."""
-    return {key.removeprefix("mean/"): values for key, values in arrays.items() if key.startswith("mean/")}

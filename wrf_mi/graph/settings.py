@@ -23,7 +23,7 @@ class TracedConfig:
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
         materials: ``named``: each named material has a permittivity and a conductivity; ``surface``: each surface has
             its own, the faces of one object in one plane, started from the named material.
-        steps: for which the paths are trained alone, before the Gaussians.
+        alone: share of the steps for which the paths are trained alone, before the Gaussians.
         material: rate of permittivities and conductivities (of their logarithms).
         gain: rate of each receiver's gain (of its logarithm, and of its phase in rad).
         pattern: rate of the patterns' coefficients.
@@ -39,7 +39,7 @@ class TracedConfig:
     rays: int = 1 << 16
     pattern_degree: int = 0
     materials: Literal["named", "surface"] = "named"
-    steps: int = 400
+    alone: float = 0.25
     material: float = 0.05
     gain: float = 0.05
     pattern: float = 0.01

@@ -20,13 +20,14 @@ from ..core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
 from ..fit.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ..fit.config import PATHS_ALONE, PRESETS, TrainConfig, task_settings
 from ..fit.fields import make_field
+from ..fit.loop import Progress
 from ..fit.packed import pack_params, unpack_params
 from ..fit.predictor import Predictor
 from ..fit.reach import Reach
 from ..fit.start import initial_gaussians
 from ..fit.state import FitState
 from ..fit.targets import form_of, plan_rows, targets_of
-from ..fit.trainer import Progress, Trainer
+from ..fit.trainer import Trainer
 from ..graph.graph import Graph
 from ..graph.receivers import Form
 from ..tasks import TASKS

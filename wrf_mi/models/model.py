@@ -19,7 +19,7 @@ from ..core.types import IntArray
 from ..parallel import Scheduler
 
 if TYPE_CHECKING:
-    from ..fit.trainer import Progress
+    from ..fit.loop import Progress
 
 Arrays = dict[str, NDArray[Any]]
 Listen = Callable[[str, float, "Progress | None"], None]

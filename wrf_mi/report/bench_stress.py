@@ -19,8 +19,9 @@ from ..core import Record
 from ..core.settings import with_settings
 from ..field import FIELDS, Encoding, random_gaussians
 from ..field.network import Weights
+from ..fit.adam import NumericsError
 from ..fit.config import TrainConfig
-from ..fit.trainer import NumericsError, Trainer
+from ..fit.trainer import Trainer
 from ..measure import make_splits
 from .bench import BenchFailed
 from .stress_curves import curves, draw

@@ -16,8 +16,8 @@ from ..core import InputError, Record
 from ..core.files import write_atomically
 from ..fit.checkpoint import append_log
 from ..fit.compress import Compression, compress
+from ..fit.loop import Progress
 from ..fit.predictor import Predictor
-from ..fit.trainer import Progress
 from ..measure import save_split
 from .evaluate import stored_metrics
 from .run_folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted

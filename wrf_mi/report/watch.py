@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from ..fit.trainer import Progress as FitProgress
+from ..fit.loop import Progress as FitProgress
 
 
 class Watch:

@@ -1,0 +1,100 @@
+"""A guarded step of Adam, as part of a function that `dr.freeze` can record."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from drjit.opt import Adam
+
+from ..graph.settings import TRACED_NAMES
+
+Params = dict[str, Any]
+
+
+class NumericsError(RuntimeError):
+    """A loss, gradient, parameter or moment was not finite; says at which step, and which of them."""
+
+    exit_status = 1
+
+
+@dataclass
+class NonFiniteReport:
+    """The first step whose loss, parameters, gradient or its square were not finite; from then on no step is taken.
+
+    Attributes:
+        step: its number from 1; 0: none so far.
+        groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
+    """
+
+    step: Any
+    groups: Any
+
+    @classmethod
+    def none(cls, names: Iterable[str]) -> NonFiniteReport:
+        """None so far, for parameters of these names."""
+        none = cls(mi.UInt32(0), dr.zeros(mi.Float, 1 + len(watched_groups(names))))
+        dr.make_opaque(none)  # a constant would be recorded as one
+        return none
+
+
+def watched_groups(names: Iterable[str]) -> list[str]:
+    """The parameters that `NonFiniteReport` watches, in its order, after the loss.
+
+    Attributes of Gaussians and of the traced side are watched themselves, a layer through its bias, whose gradient is
+    the sum of all that reaches the layer.
+    """
+    return [n for n in names if "." not in n or n.endswith(".bias") or n.startswith(TRACED_NAMES)]
+
+
+def _health(param: Any) -> Any:
+    """A number that is finite where a parameter, its gradient and the square of that, which Adam takes, are.
+
+    A Gaussian whose shape or place is NaN is not seen, so that the loss alone would not tell.
+    """
+    return dr.sum(dr.square(dr.grad(param).array) + dr.abs(dr.detach(param).array))
+
+
+def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
+    """Parameters of the coming step, whose learning rates are set to ``factor`` times ``rates``."""
+    # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
+    adam.set_learning_rate({name: factor * rates[name] for name in rates})
+    return {name: adam[name] for name in rates}
+
+
+def guarded_step(
+    adam: Adam, params: Params, loss: Any, mean: Params, decay: Any, number: Any, trouble: NonFiniteReport
+) -> tuple[Params, NonFiniteReport, Any]:
+    """Differentiate a loss and take a step of Adam in place, unless something is or was not finite.
+
+    Args:
+        adam: owns the parameters.
+        params: from `rated_params`; they hold gradients afterwards.
+        loss: of these, one value.
+        mean: running mean of the parameters.
+        decay: of the running mean.
+        number: of the step, from 1.
+        trouble: so far.
+
+    Returns:
+        Running mean, report, and whether the step was taken; none of them evaluated.
+    """
+    dr.backward(loss)
+    sums = [dr.detach(loss), *(_health(params[name]) for name in watched_groups(params))]
+    fine = [dr.isfinite(s) for s in sums]
+    good = reduce(operator.and_, fine)
+    untroubled = trouble.step == 0
+    finite = good & untroubled
+    adam.step(eval=False, active=finite)
+    share = dr.select(finite, decay, 1)
+    mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
+    now = dr.concat([dr.select(f, mi.Float(0), mi.Float(1)) for f in fine])
+    report = NonFiniteReport(
+        dr.select(untroubled & ~good, number, trouble.step), dr.select(untroubled, now, trouble.groups)
+    )
+    return mean, report, finite

@@ -1,0 +1,165 @@
+"""The training loop of every model that is trained by gradients: Gaussians, paths of a scene, both, and networks."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .adam import NonFiniteReport, NumericsError, watched_groups
+from .loop_config import LoopConfig
+from .schedule import Schedule
+from .state import FitState
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a listener hears at each log line.
+
+    Attributes:
+        step: steps taken.
+        seconds: training time so far, over all sittings.
+        loss: mean over the steps since the last line.
+        validation_score: median on the validation rows, where it was just computed.
+        held_out: whether the validation rows are still kept out of training.
+        gaussians: their number; 0 where there are none.
+        left_s: estimated seconds to the end.
+        label: of the score.
+    """
+
+    step: int
+    seconds: float
+    loss: float
+    validation_score: float | None
+    held_out: bool
+    gaussians: int
+    left_s: float
+    label: str = "SSIM"
+
+
+class TrainingLoop(ABC):
+    """Steps of Adam, with validation, the choice of the best moment, progress and checkpoints.
+
+    Attributes:
+        config: settings of the loop.
+        schedule: what happens at which step.
+        state: between two steps.
+        seconds: training time so far, over all sittings.
+        label: of the validation score.
+        higher_is_better: which way of that is better.
+    """
+
+    config: LoopConfig
+    schedule: Schedule
+    state: FitState
+    seconds: float = 0.0
+    label: str
+    higher_is_better: bool
+
+    @abstractmethod
+    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """Take the step after ``state.step`` steps; the loss before it, and the report after it."""
+
+    @abstractmethod
+    def validate(self) -> float:
+        """Score of the running mean of the parameters on the validation rows; NaN without such rows."""
+
+    @abstractmethod
+    def record_functions(self) -> None:
+        """Forget recorded kernels, which hold for the former state."""
+
+    def adapt(self) -> None:
+        """Take a round of density control, after a step of ``schedule.density``."""
+        raise NotImplementedError("no density control without Gaussians")
+
+    def run(
+        self,
+        listen: Callable[[Progress], None] = lambda progress: None,
+        save: Callable[[], None] = lambda: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train from the current step to the last.
+
+        Args:
+            listen: hears of progress every ``log_every`` steps and at the end.
+            save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
+            stop: asked after each step; True ends the run there.
+
+        Returns:
+            Whether the last step was reached.
+
+        Raises:
+            NumericsError: a loss or gradient that is not finite, raised right after that step, which was not taken:
+                parameters are as before it. Or parameters or moments that are not, found before a score or checkpoint.
+        """
+        config, state, schedule = self.config, self.state, self.schedule
+        start, before = time.perf_counter(), self.seconds
+        losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)
+        since = taken = 0
+        while state.step < config.steps and not (taken and stop()):
+            loss, trouble = self.take_step(trouble)
+            losses += loss
+            dr.eval(losses)
+            state.step, since, taken = state.step + 1, since + 1, taken + 1
+            if trouble.step[0]:  # one number, but reading it waits for the step
+                self._require_finite(trouble)
+            self.seconds = before + time.perf_counter() - start
+            last = state.step == config.steps
+            if state.step in schedule.density:
+                self.adapt()
+            second_stage = state.step >= schedule.first_stage
+            choosing = config.patience > 0 and second_stage and state.step <= schedule.joined and not state.chosen
+            scored = (state.step % config.validate_every == 0 and second_stage) or last
+            scored = scored or (choosing and state.step in (schedule.first_stage, schedule.joined))
+            if state.step % config.log_every == 0 or scored:
+                self._require_finite(trouble)
+                score = self.validate() if scored else None
+                self.seconds = before + time.perf_counter() - start
+                left = (self.seconds - before) / taken * (config.steps - state.step)
+                held_out = state.step <= schedule.joined
+                told = state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left, self.label
+                listen(Progress(*told))
+                losses, since = dr.zeros(mi.Float), 0
+                if score is not None and choosing and self.choose(score):
+                    state, schedule = self.state, self.schedule
+            if state.step % config.checkpoint_every == 0 and not last:
+                self._require_finite(trouble)
+                save()
+        dr.sync_thread()
+        self.seconds = before + time.perf_counter() - start
+        self._require_finite(trouble)
+        save()
+        return state.step == config.steps
+
+    def choose(self, score: float) -> bool:
+        """Keep the best moment; once no better one is waited for, go on from it. Whether the fit did."""
+        state = self.state
+        state.keep_best(score if self.higher_is_better else -score)
+        if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
+            return False
+        self.state = state.go_back()
+        self.state.chosen = self.state.step
+        self.schedule, self.state.step = self.schedule.after(self.state.chosen)
+        self.record_functions()
+        return True
+
+    def _require_finite(self, trouble: NonFiniteReport) -> None:
+        """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
+        step = int(trouble.step[0])
+        # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
+        groups = (self.state.params(), *self.state.moments()[:2])
+        bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
+        if bad:
+            where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
+            raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
+        if step:
+            names = ["loss", *watched_groups(self.state.adam)]
+            found = ", ".join(n for n, broken in zip(names, trouble.groups.numpy(), strict=True) if broken)
+            where = f"step {step}: not finite: {found}"
+            raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")
