@@ -1,8 +1,10 @@
-"""Calls of the command within this process."""
+"""Calls of the command within this process, and the run folders that it writes."""
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -42,3 +44,43 @@ def stored(run: Path) -> dict[str, np.ndarray]:
     """What ``predictions.npz`` of a run holds."""
     with np.load(run / "predictions.npz", allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def contents(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def copied(run: Path, to: Path) -> Path:
+    return Path(shutil.copytree(run, to))
+
+
+def scored_again_as_before(run: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """``evaluate`` finds and writes the scores and predictions that the run holds, all but the time of a prediction.
+
+    Returns:
+        The metrics.
+    """
+    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
+    status, out, err = call(["evaluate", run, "--json"], capsys)
+    assert (status, err) == (0, "")
+    again = json.loads(out)
+    assert again == json.loads((run / "metrics.json").read_text())
+    for name in before.keys() - {"ms_per_sample"}:
+        assert again[name] == before[name], name
+    for name, values in stored(run).items():
+        np.testing.assert_array_equal(values, arrays[name])
+    return dict(again)
+
+
+def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """``evaluate`` refuses a model that is cut, lacks the array ``key``, or is of another format."""
+    model, asked = run / "model.npz", ["evaluate", run]
+    whole = model.read_bytes()
+    with np.load(model) as held:
+        arrays = dict(held)
+    model.write_bytes(whole[: len(whole) // 2])
+    refused(asked, "model.npz: not readable .*; train the run anew", capsys)
+    np.savez(model, **{name: value for name, value in arrays.items() if name != key})
+    refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)
+    np.savez(model, **arrays | {"run/format": np.array(99)})
+    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from calling import call, refused, stored
+from calling import call, contents, copied, damaged_models_refused, refused, scored_again_as_before, stored
 from made_channels import channels
 
 from wrf_mi.core import InputError
@@ -28,10 +27,6 @@ ROUNDING = 1e-4
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
-
-
-def contents(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
 
 
 def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
@@ -95,19 +90,12 @@ def test_command_trains_as_the_function_does(
 
 
 def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
-    status, out, err = call(["evaluate", run, "--json"], capsys)
-    assert (status, err) == (0, "")
-    again = json.loads(out)
-    for name in before.keys() - {"ms_per_sample"}:
-        assert again[name] == before[name], name
-    for name, values in stored(run).items():
-        np.testing.assert_array_equal(values, arrays[name])
+    again = scored_again_as_before(run, capsys)
     other = evaluate_run(run, "random")
     assert other["split"] == "random (rows unseen by official)"
     record = load(json.loads((run / "metrics.json").read_text())["dataset"])
     (drawn,) = make_splits(record, "random")
-    assert 0 < other["n_test"] == np.isin(drawn.test, arrays["row"]).sum() < len(drawn.test)
+    assert 0 < other["n_test"] == np.isin(drawn.test, stored(run)["row"]).sum() < len(drawn.test)
     assert json.loads((run / "metrics.json").read_text()) == again
 
 
@@ -234,18 +222,10 @@ def test_what_cannot_be_fitted_leaves_nothing_behind(flat_folder: Path, tmp_path
 
 
 def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    damaged = Path(shutil.copytree(run, tmp_path / "run"))
-    model, asked = damaged / "model.npz", ["evaluate", damaged]
-    whole = model.read_bytes()
-    with np.load(model) as stored_model:
-        arrays = dict(stored_model)
-    model.write_bytes(whole[: len(whole) // 2])
-    refused(asked, "model.npz: not readable .*; train the run anew", capsys)
-    np.savez(model, **{key: value for key, value in arrays.items() if key != "1/law"})
-    refused(asked, "model.npz: not readable .*law.*; train the run anew", capsys)
-    np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)
-    model.unlink()
+    damaged = copied(run, tmp_path / "run")
+    asked = ["evaluate", damaged]
+    damaged_models_refused(damaged, "1/law", capsys)
+    (damaged / "model.npz").unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")
     refused(["train", "--resume", damaged], "split.npz: not a split file", capsys)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from calling import call, refused
+from calling import call, contents, copied, damaged_models_refused, refused, scored_again_as_before, stored
 from made_waves import SIZE, wave_record
 from traced_rooms import FREQUENCY_HZ, inside, write_xml
 from traced_rooms import SHOEBOX as ROOM
@@ -58,19 +57,6 @@ def strengths(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return train(flat_folder, tmp_path_factory.mktemp("runs") / "strengths", "hybrid").folder
 
 
-def contents(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
-
-
-def stored(folder: Path) -> dict[str, np.ndarray]:
-    with np.load(folder / "predictions.npz", allow_pickle=False) as arrays:
-        return dict(arrays)
-
-
-def copied(run: Path, to: Path) -> Path:
-    return Path(shutil.copytree(run, to))
-
-
 def test_run_folder_holds_the_model_and_what_it_is_sure_of(waves: Path, run: Path) -> None:
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -113,15 +99,7 @@ def test_command_trains_as_the_function_does(
 
 
 def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
-    status, out, err = call(["evaluate", run, "--json"], capsys)
-    assert (status, err) == (0, "")
-    again = json.loads(out)
-    assert again == json.loads((run / "metrics.json").read_text())
-    for name in before.keys() - {"ms_per_sample"}:
-        assert again[name] == before[name], name
-    for name, values in stored(run).items():
-        np.testing.assert_array_equal(values, arrays[name])
+    scored_again_as_before(run, capsys)
 
 
 def test_scoring_other_rows_writes_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -381,18 +359,9 @@ def test_calls_that_are_refused(
 
 def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damaged = copied(run, tmp_path / "run")
-    model = damaged / "model.npz"
-    whole = model.read_bytes()
-    with np.load(model) as stored:
-        arrays = dict(stored)
     asked = ["evaluate", damaged]
-    model.write_bytes(whole[: len(whole) // 2])
-    refused(asked, "model.npz: not readable .*; train the run anew", capsys)
-    np.savez(model, **{key: value for key, value in arrays.items() if key != "0/weights"})
-    refused(asked, "model.npz: not readable .*0/weights.*; train the run anew", capsys)
-    np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)
-    model.unlink()
+    damaged_models_refused(damaged, "0/weights", capsys)
+    (damaged / "model.npz").unlink()
     refused(asked, "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     config = damaged / "config.yaml"
     content = yaml.safe_load(config.read_text())

@@ -1,13 +1,11 @@
 """Sums over paths against sums written out."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
 
-from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receive import antenna_csi, channel, csi, element_signals, received_power, rssi_dbm
@@ -115,37 +113,3 @@ def test_signals_of_several_arrays_and_parts(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(channel, "PAIRS_AT_ONCE", 20)
     np.testing.assert_allclose(element_signals(paths, everyone, array_m, 1e9), signals, rtol=EXACT)
     np.testing.assert_allclose(csi(paths, [1e9, 2e9]), coefficients, rtol=EXACT)
-
-
-@pytest.mark.gradcheck
-def test_signal_strength_with_derivatives():
-    """The same sums in float64 on the device; derivatives against central differences."""
-    from wrf_mi import backend
-
-    backend.init()
-    import drjit as dr
-    import mitsuba as mi
-
-    from wrf_mi.receive.graph import path_power, power_sum_db
-
-    double: Any = dr.float64_array_t(mi.Float)
-    paths = made()
-    pair = to_uint(paths.rx * paths.n_tx + paths.tx)
-    weights = double(np.random.default_rng(2).normal(size=12))
-
-    def strengths(real: Any) -> Any:
-        return power_sum_db(path_power((real, double(paths.gain.imag))), pair, 12)
-
-    real = double(paths.gain.real)
-    dark = np.isnan(rssi_dbm(paths)).ravel()
-    np.testing.assert_allclose(strengths(real).numpy()[~dark], rssi_dbm(paths).ravel()[~dark], rtol=EXACT)
-    assert strengths(real).numpy()[dark] == pytest.approx(-300)
-    dr.enable_grad(real)
-    dr.backward(dr.sum(strengths(real) * weights))
-    step = 1e-6
-    for p in range(0, len(paths), 7):
-        change = np.zeros(len(paths))
-        change[p] = step
-        ends = [float(dr.sum(strengths(double(paths.gain.real + sign * change)) * weights)[0]) for sign in (1, -1)]
-        difference = (ends[0] - ends[1]) / (2 * step)
-        assert float(dr.grad(real)[p]) == pytest.approx(difference, rel=1e-5, abs=1e-6)

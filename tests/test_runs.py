@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from calling import contents, copied, stored
 from made_spectra import SIZE
 from small_fits import official, settings, stop_after
 
@@ -114,7 +115,7 @@ def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -
     config = settings("steps=40", "checkpoint_every=8")
     train(folder, tmp_path / "whole", settings=config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
-    greys = [np.load(tmp_path / name / "predictions.npz")["prediction"] for name in ("whole", "resumed")]
+    greys = [stored(tmp_path / name)["prediction"] for name in ("whole", "resumed")]
     np.testing.assert_allclose(greys[0], greys[1], atol=PARALLEL_TOLERANCE)
 
 
@@ -194,14 +195,8 @@ def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None
 
 def test_run_folder_says_all(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     run = train(folder, tmp_path / "run", settings=settings("steps=10", "seed=3"), split="random", n_train=0.5)
-    assert sorted(p.name for p in run.folder.iterdir()) == [
-        "config.yaml",
-        "log.jsonl",
-        "metrics.json",
-        "model.npz",
-        "predictions.npz",
-        "split.npz",
-    ]
+    files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
+    assert contents(run.folder) == files
     config = yaml.safe_load((run.folder / "config.yaml").read_text())
     assert (config["dataset"], config["split"], config["n_train"], config["seed"]) == (str(folder), "random", 0.5, 3)
     assert config["settings"]["initial"]["gaussians"] == 8
@@ -215,18 +210,16 @@ def test_run_folder_says_all(folder: Path, tmp_path: Path, one_gateway: Record) 
     assert m["ms_per_sample"] > 0
     assert m["peak_memory_mb"] > 50
     assert "receivers" not in m
-    with np.load(run.folder / "predictions.npz") as stored:
-        np.testing.assert_array_equal(stored["row"], split.test)
-        np.testing.assert_array_equal(stored["tx_pos"], one_gateway.tx_pos_m[split.test])
-        assert stored["prediction"].shape == (5, *SIZE)
-        # 16 bits a grey.
-        np.testing.assert_allclose(stored["truth"], one_gateway.observation[0, split.test], atol=1e-5)
-        median = float(np.median(ssim(stored["prediction"], stored["truth"])))
-    assert m["ssim"]["median"] == pytest.approx(median)
+    held = stored(run.folder)
+    np.testing.assert_array_equal(held["row"], split.test)
+    np.testing.assert_array_equal(held["tx_pos"], one_gateway.tx_pos_m[split.test])
+    assert held["prediction"].shape == (5, *SIZE)
+    # 16 bits a grey.
+    np.testing.assert_allclose(held["truth"], one_gateway.observation[0, split.test], atol=1e-5)
+    assert m["ssim"]["median"] == pytest.approx(float(np.median(ssim(held["prediction"], held["truth"]))))
     # The stored field predicts what was scored.
-    with np.load(run.folder / "predictions.npz") as stored:
-        again = run.predictor()(one_gateway.tx_pos_m[split.test])
-        np.testing.assert_allclose(again, stored["prediction"], atol=FLOAT32_TOLERANCE)
+    again = run.predictor()(one_gateway.tx_pos_m[split.test])
+    np.testing.assert_allclose(again, held["prediction"], atol=FLOAT32_TOLERANCE)
 
 
 def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_path: Path) -> None:
@@ -234,9 +227,9 @@ def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_pat
     run = train(data, tmp_path / "run", settings=settings("steps=20"))
     m = run.metrics
     assert list(m["receivers"]) == ["gateway1", "gateway2"]
-    with np.load(run.folder / "predictions.npz") as stored:
-        prediction, truth = stored["prediction"], stored["truth"]
-        assert list(stored["receiver_name"]) == ["gateway1", "gateway2"]
+    held = stored(run.folder)
+    prediction, truth = held["prediction"], held["truth"]
+    assert list(held["receiver_name"]) == ["gateway1", "gateway2"]
     assert prediction.shape == truth.shape == (2, 5, *SIZE)
     scores = ssim(prediction, truth)
     assert m["ssim"]["mean"] == pytest.approx(scores.mean())
@@ -255,19 +248,12 @@ def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(folder, tmp_path_factory.mktemp("runs") / "finished", settings=settings("steps=10"), n_train=10).folder
 
 
-def copy_of(run: Path, to: Path) -> Path:
-    to.mkdir()
-    for file in run.iterdir():
-        (to / file.name).write_bytes(file.read_bytes())
-    return to
-
-
 def predictor(run: Path) -> Any:
     return open_run(run).predictor()
 
 
 def test_damaged_models(finished: Path, tmp_path: Path) -> None:
-    run = copy_of(finished, tmp_path / "run")
+    run = copied(finished, tmp_path / "run")
     path = run / "model.npz"
     whole = path.read_bytes()
     for content in (whole[: len(whole) // 2], b"", b"no archive"):
@@ -277,8 +263,8 @@ def test_damaged_models(finished: Path, tmp_path: Path) -> None:
                 use(run)
             assert "\n" not in str(caught.value)
     path.write_bytes(whole)
-    with np.load(path) as stored:
-        arrays = dict(stored)
+    with np.load(path) as held:
+        arrays = dict(held)
     np.savez(path, **(arrays | {"run/format": np.asarray(99)}))
     with pytest.raises(InputError, match="format 99, this version reads 2"):
         predictor(run)
@@ -288,7 +274,7 @@ def test_damaged_models(finished: Path, tmp_path: Path) -> None:
 
 
 def test_damaged_configurations(finished: Path, tmp_path: Path) -> None:
-    run = copy_of(finished, tmp_path / "run")
+    run = copied(finished, tmp_path / "run")
     path = run / "config.yaml"
     for content in ("settings: [1", "just text", "", "format: 2\ndataset: x\n"):
         path.write_text(content)
@@ -300,7 +286,7 @@ def test_damaged_configurations(finished: Path, tmp_path: Path) -> None:
 
 
 def test_scores_are_found_again(finished: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = copy_of(finished, tmp_path / "run")
+    run = copied(finished, tmp_path / "run")
     before = json.loads((run / "metrics.json").read_text())
     (run / "predictions.npz").unlink()
     after = evaluate_run(run)
@@ -343,7 +329,7 @@ def test_unfinished_runs_have_no_scores(folder: Path, tmp_path: Path) -> None:
 
 
 def test_damaged_metrics_are_written_anew(finished: Path, tmp_path: Path) -> None:
-    run = copy_of(finished, tmp_path / "run")
+    run = copied(finished, tmp_path / "run")
     before = json.loads((run / "metrics.json").read_text())
     for content in ("{", "[]", ""):
         (run / "metrics.json").write_text(content)
@@ -362,7 +348,7 @@ def test_rows_that_the_record_has_not(finished: Path, tmp_path: Path, one_gatewa
             train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=own)
     assert not (tmp_path / "run").exists()
     # A data set that has become shorter since.
-    run = copy_of(finished, tmp_path / "copy")
+    run = copied(finished, tmp_path / "copy")
     short = replace(
         one_gateway, tx_pos_m=one_gateway.tx_pos_m[:20], observation=one_gateway.observation[:, :20],
         official=None, folds=None,
@@ -382,10 +368,9 @@ def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: 
     parts = [Run(run.folder / f"fold{k}").metrics for k in range(3)]
     assert [p["split"] for p in parts] == ["blocked:0", "blocked:1", "blocked:2"]
     assert m["train_seconds"] == pytest.approx(sum(p["train_seconds"] for p in parts))
-    with np.load(run.folder / "predictions.npz") as stored:
-        assert sorted(stored["row"]) == list(range(24))
-        scores = ssim(stored["prediction"], stored["truth"])
-        folds = one_gateway.folds[stored["row"]]
+    held = stored(run.folder)
+    assert sorted(held["row"]) == list(range(24))
+    scores, folds = ssim(held["prediction"], held["truth"]), one_gateway.folds[held["row"]]
     assert m["ssim"]["median"] == pytest.approx(np.median(scores))
     for k, part in enumerate(parts):
         assert part["ssim"]["mean"] == pytest.approx(scores[folds == k].mean())
@@ -417,7 +402,7 @@ def test_folders_that_hold_something_are_left_alone(folder: Path, tmp_path: Path
     for split in ("official", "blocked"):
         with pytest.raises(InputError, match="exists and is not empty"):
             train(folder, tmp_path / "run", settings=settings("steps=5"), split=split)
-    assert [p.name for p in (tmp_path / "run").iterdir()] == ["mine.txt"]
+    assert contents(tmp_path / "run") == {"mine.txt"}
     with pytest.raises(InputError, match="exists and is not empty"):
         train(folder, tmp_path / "run" / "mine.txt", settings=settings("steps=5"))
 

@@ -19,7 +19,7 @@ def bench_command(a: argparse.Namespace) -> int:
     if a.backend is not None:  # before anything that computes is imported
         init(a.backend)
     from .parallel import open_scheduler
-    from .report.bench import CASES, CHECKS, bench
+    from .report.bench import CASES, CHECKS, REFUSED, BenchFailed, CheckRefused, bench, own_table
 
     if a.quick and TABLES not in a.names:
         return _quick(a)
@@ -31,9 +31,17 @@ def bench_command(a: argparse.Namespace) -> int:
             most_s = None if a.hours is None else 3600 * a.hours
             rows = tables(Path(a.out), Path(a.runs), a.quick, given, most_s)
         else:
-            rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs), given)
+            try:
+                rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs), given)
+            except CheckRefused:  # said on standard error already
+                return REFUSED
+            for row in rows if not a.json else ():
+                if row["case"] in CHECKS:
+                    print(own_table(row))
     if a.json:
         print_json(rows)
+    if failed := [f"bench {row['case']}: {why}" for row in rows if (why := row.get("figures", {}).get("failed"))]:
+        raise BenchFailed("; ".join(failed))
     return 0
 
 

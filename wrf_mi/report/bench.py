@@ -37,6 +37,14 @@ class BenchFailed(RuntimeError):
     exit_status = 1
 
 
+REFUSED = 2
+"""Exit status of bad input."""
+
+
+class CheckRefused(InputError):
+    """What a check needs is not on this machine; its process has said so on standard error."""
+
+
 ENTRY_POINTS = "wrf_mi.benchmarks"
 """Group of the entry points by which other packages add checks."""
 
@@ -66,17 +74,23 @@ class Check:
 
     Attributes:
         title: for the table.
-        function: ``module:function``; it takes nothing and returns ``rows``, a list of
-            dictionaries ``what``, ``value`` (text with its unit) and ``asked``, beside whatever else it measured.
+        function: ``module:function``; it takes nothing and returns ``rows``, a list of dictionaries ``what``, ``value``
+            (text with its unit) and ``asked``, beside whatever else it measured, and ``failed``, a line, where the
+            command has to end with status 1 after all is stored.
         quick: likewise, the same with few cases, for `quick_checks`; it raises `BenchFailed` where a bound is not held.
             Empty: there is none.
         data: data sets that it reads where they are on this machine.
+        resumes: whether the function keeps what it measured, and every call of the benchmark calls it; others are
+            called again with other versions or data only.
+        table: ``module:function`` that makes a table of ``rows``; empty: their ``what``, ``value`` and ``asked``.
     """
 
     title: str
     function: str
     quick: str = ""
     data: tuple[str, ...] = ()
+    resumes: bool = False
+    table: str = ""
 
 
 MEASURED, STORED_CHECK = "bench.json", "check.json"
@@ -131,6 +145,13 @@ _OWN: Mapping[str, Check] = {
     "operator": Check("prediction by operator", _here("bench_operator:main")),
     "budgets": Check("fields at budgets", _here("bench_budget:main"), data=(RFID,)),
     "training": Check("training", _here("bench_training:main"), data=(RFID,)),
+    "sentinels": Check(
+        "figures kept",
+        _here("bench_sentinels:main"),
+        data=(RFID, FLAT, CONFERENCE, OFFICE),
+        resumes=True,
+        table=_here("bench_sentinels:table"),
+    ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
 CHECKS: Mapping[str, Check] = _CHECKS
@@ -169,7 +190,7 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
         One dictionary a case, as in its JSON file.
 
     Raises:
-        InputError: an unknown case.
+        InputError: an unknown case, or what a check needs is not on this machine.
         BenchFailed: a case that did not finish.
     """
     for name in names:
@@ -218,7 +239,8 @@ def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:
 
 def _case(runs: Path, name: str) -> dict[str, Any]:
     folder = case_folder(runs, name)
-    if (folder / (STORED_CHECK if name in CHECKS else MEASURED)).exists():
+    resumes = name in CHECKS and CHECKS[name].resumes
+    if not resumes and (folder / (STORED_CHECK if name in CHECKS else MEASURED)).exists():
         print(f"{name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
     return _check(name, folder) if name in CHECKS else _measure(name, folder)
 
@@ -259,10 +281,13 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
 def _check(name: str, folder: Path) -> dict[str, Any]:
     """The stored result of a check, measured now if there is none; in a process of its own, as it states its memory."""
     stored = folder / STORED_CHECK
-    if not stored.exists():
+    if CHECKS[name].resumes or not stored.exists():
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
         status, said = run_module("wrf_mi.report.check", [CHECKS[name].function, str(stored)])
+        if status == REFUSED:
+            # A worker's process is quiet, and its last line comes back.
+            raise InputError(said.removeprefix("wrf-mi: ")) if said else CheckRefused(f"bench {name}: refused")
         if status != 0:
             raise BenchFailed(f"bench {name}: ended with status {status} {said}".rstrip())
         measured = json.loads(stored.read_text())
@@ -322,6 +347,12 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
             f"| {blend:.3f} | {m['steps']:,} | {minutes} | {m['ms_per_sample']:.1f} | {m['peak_memory_mb']:.0f} MB |"
         )
     return "\n".join(lines)
+
+
+def own_table(result: Mapping[str, Any]) -> str:
+    """Markdown table of one check, in the form that it states."""
+    form = CHECKS[result["case"]].table
+    return str(resolve(form)(result["figures"]["rows"])) if form else check_table([result])
 
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:

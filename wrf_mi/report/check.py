@@ -15,13 +15,15 @@ def main(function: str, out: str) -> int:
     """Call ``function`` (``module:name``) and write what it returns as JSON.
 
     Returns:
-        The exit status: 2 with one line where data are missing.
+        The exit status: 2 with one line where data are missing, 130 where it was interrupted.
     """
     try:
         figures = resolve(function)()
     except InputError as error:
         print(f"wrf-mi: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     write_atomically(Path(out), json.dumps(figures, indent=1) + "\n")
     return 0
 

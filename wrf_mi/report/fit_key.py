@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -25,6 +26,7 @@ from .run_folder import METRICS, versions
 
 logger = logging.getLogger(__name__)
 
+PACKAGES, COMPILED = ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"), "__pycache__"
 DIGITS = 16
 """Of a key, hexadecimal: two of a million fits have the same one with a probability of 3e-8."""
 
@@ -90,6 +92,17 @@ def _files_below(folder: Path) -> list[Path]:
     """All files of a folder, those of folders that are links too."""
     below = (Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
     return sorted(path for path in below if path.is_file())
+
+
+def source_files() -> dict[str, Path]:
+    """Every file of this package, its plugins and its scenes by name, compiled ones left out."""
+    found: dict[str, Path] = {}
+    for name in PACKAGES:
+        spec = find_spec(name)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            files = [path for path in _files_below(Path(folder)) if COMPILED not in path.parts]
+            found |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in files}
+    return found
 
 
 def dataset_files(name_or_folder: str) -> list[Path]:

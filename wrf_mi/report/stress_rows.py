@@ -117,7 +117,7 @@ def row(what: str, worst: float, bound: float, more: str = "") -> Row:
     return {"what": what, "value": f"worst {worst:.1e}{more}", "asked": f"at most {bound:g}"}
 
 
-def worst_of(row: Row) -> tuple[float, float]:
+def worst_of(row: Mapping[str, str]) -> tuple[float, float]:
     """The worst case of a row and its bound."""
     return float(row["value"].split()[1].rstrip(";")), float(row["asked"].split()[2])
 

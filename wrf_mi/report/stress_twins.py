@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
 
-from ..backend.device import on_device, to_uint
+from ..backend.device import on_device
 from ..core import Paths, Receiver, unit_vectors
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
@@ -18,7 +18,7 @@ from ..hybrid.ports import Ports, path_sum
 from ..hybrid.traced import TracedPaths
 from ..receive import Lags, csi, element_signals
 from ..receive.footprints import gaussian_signals
-from ..receive.graph import LagMatrix, power_sum_db, with_gains
+from ..receive.graph import LagMatrix, with_gains
 from ..receive.graph import gaussian_signals as device_signals
 from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
 
@@ -26,8 +26,6 @@ CARRIER_HZ = 920e6
 WAVENUMBER = 2 * np.pi * CARRIER_HZ / speed_of_light
 ELEMENTS_M = planar_array(4, 4, 0.16)
 DOUBLE: Any = dr.float64_array_t(mi.Float)
-MANY = 20_000
-"""Paths whose powers are added to one."""
 Inputs = Mapping[str, FloatArray]
 Function = Callable[[Mapping[str, Any]], Sequence[Any]]
 """Of flat arrays by name, of one float type: flat arrays of that type."""
@@ -39,7 +37,6 @@ def twins(count: int) -> list[Row]:
     for name, kinds, function in (
         ("closed-form footprints", FOOTPRINTS, _footprints),
         ("lags, squared spectra and gains", SIGNALS, _lags),
-        ("powers of paths added, dB", POWERS, _powers),
     ):
         value, slope = Worst(), GradientWorst()
         for kind, make in kinds.items():
@@ -125,23 +122,6 @@ def _lags(given: Mapping[str, Any]) -> Sequence[Any]:
         _LAGS.append(LagMatrix(Lags(ELEMENTS_M, CARRIER_HZ, 15, 30)))
     h, gain = (tuple(_parts(given[name], 2)) for name in ("h", "gain"))
     return [_LAGS[0].squared(_LAGS[0].of_signals(with_gains(h, gain)))]
-
-
-def _shared(count: int, pairs: int) -> Any:
-    return to_uint(np.arange(count) % pairs)
-
-
-POWERS: Mapping[str, Callable[[np.random.Generator], Inputs]] = {
-    "of 1e-25 to 1": lambda r: {"power": 10 ** r.uniform(-25, 0, 1000)},
-    "all of a size, 1e-12": lambda r: {"power": 1e-12 * r.uniform(0.5, 1, 1000)},
-    f"{MANY} paths": lambda r: {"power": 1e-9 * r.uniform(0.5, 1, MANY)},
-}
-
-
-def _powers(given: Mapping[str, Any]) -> Sequence[Any]:
-    power = given["power"]
-    pairs = 1 if dr.width(power) == MANY else 200
-    return [power_sum_db(power, _shared(dr.width(power), pairs), pairs)]
 
 
 def _against_numpy(count: int) -> Row:
