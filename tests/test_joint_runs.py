@@ -21,7 +21,7 @@ from wrf_mi.cli import main
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
-from wrf_mi.fit.config import TrainConfig
+from wrf_mi.fit.config import TrainConfig, default_config
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.measure import make_splits, write_spectrum_folder
 from wrf_mi.report.runs import Interrupted, evaluate_run, open_run, resume, train
@@ -74,8 +74,8 @@ def data(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
     return write_spectrum_folder(tmp_path_factory.mktemp("data") / "room", replace(record, observation=spectra))
 
 
-def config(*settings: str) -> TrainConfig:
-    return with_settings(TrainConfig(), [*SETTINGS, *settings])
+def config(*settings: str, with_scene: bool = True) -> TrainConfig:
+    return with_settings(default_config("spectrum", with_scene), [*SETTINGS, *settings])
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def median(run: Path) -> float:
 def test_trained_together_they_predict_better_than_either_alone(
     rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
 ) -> None:
-    train(str(data), tmp_path / "field", settings=config())
+    train(str(data), tmp_path / "field", settings=config(with_scene=False))
     asked = ["trace", rooms["known"], data, "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"]
     assert main([str(word) for word in asked]) == 0
     assert median(run) > median(tmp_path / "field") + 0.03

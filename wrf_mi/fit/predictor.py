@@ -151,7 +151,7 @@ class Predictor:
         slots: IntArray | None,
         weight: NDArray[Any] | None,
     ) -> Any:
-        learned = weight is None or bool(np.any(weight))
+        learned = side is None or weight is None or bool(np.any(weight))
         report, pose = self.graph.report(receiver, side, learned), self._poses[receiver]
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
 

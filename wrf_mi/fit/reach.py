@@ -30,8 +30,8 @@ ROWS_OF_GROUP = 4
 """Rows that a cluster has on average, at least."""
 HELD_OUT = 0.25
 """Share of the training rows that are held out in clusters, about."""
-LENGTHS = 6
-"""Reaches that are tried beside 0: each twice the one before, the last twice the largest distance held out."""
+LENGTHS = 7
+"""Reaches that are tried beside 0: each twice the one before, the last four times the largest distance held out."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Reach:
         """Reaches to choose from by held-out transmitters [m, 3] of each receiver, from 0 upwards."""
         found = [self.distance(own, r) for r, own in enumerate(tx_pos_m) if len(own) and len(self.known_m[r])]
         largest = float(np.max(np.concatenate(found), initial=0.0)) if found else 0.0
-        return [0.0, *(2 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
+        return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
 
 
 def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:

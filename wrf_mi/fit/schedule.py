@@ -107,14 +107,12 @@ def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
     return np.asarray(cosine * np.minimum(1.0, (t + 1) / max(1, optimiser.warm_up)))
 
 
-def density_rounds(config: DensityConfig, steps: int) -> frozenset[int]:
-    """Steps after which density control takes a round, of a fit of so many."""
-    first, last = int(config.start * steps), int(config.stop * steps)
-    return (
-        frozenset(s for s in range(config.every, steps, config.every) if first <= s <= last)
-        if config.every
-        else frozenset()
-    )
+def density_rounds(config: DensityConfig, steps: int, first_stage: int = 0) -> frozenset[int]:
+    """Steps after which density control takes a round, of a fit of so many, the first of them without Gaussians."""
+    left = steps - first_stage
+    first, last = int(config.start * left), int(config.stop * left)
+    rounds = range(config.every, left, config.every) if config.every else ()
+    return frozenset(first_stage + s for s in rounds if first <= s <= last)
 
 
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:

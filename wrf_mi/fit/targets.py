@@ -44,7 +44,7 @@ class Targets:
     def received(self, receiver: int, rows: IntArray) -> IntArray:
         """Conditions of those rows that a receiver observed."""
         chosen = self.conditions(rows)
-        seen = np.isfinite(self.truth[receiver, chosen]).reshape(len(chosen), -1).all(axis=1)
+        seen = np.isfinite(self.truth[receiver, chosen]).all(axis=tuple(range(1, self.truth.ndim - 1)))
         return chosen[seen]
 
 
@@ -149,4 +149,4 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool =
         text = f"{config.traced.alone} of the steps are not less than hold_out, {config.hold_out}"
         raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
     rng = np.random.default_rng([config.seed, 1])
-    return plan(config, train, everything, rng, density_rounds(config.density, config.steps), first)
+    return plan(config, train, everything, rng, density_rounds(config.density, config.steps, first), first)
