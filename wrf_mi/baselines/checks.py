@@ -46,7 +46,7 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
 
     Raises:
         InputError: another task; no uplink for a method that needs one; numbers of rows, antennas, subcarriers and
-            frequencies that differ.
+            frequencies that differ; numbers of readings or standard deviations that do not fit the observations.
     """
     if not method.serves(record.task):
         *most, last = method.tasks or ("nothing",)
@@ -60,6 +60,26 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
             f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         )
     task_of(record).check(record)
+    _check_noise(record)
+
+
+def _check_noise(record: Record) -> None:
+    """Refuse numbers of readings and standard deviations that do not fit the observations."""
+    stated = {"n_readings": record.n_readings, "std": record.std}
+    for name, values in stated.items():
+        if values is None:
+            continue
+        if not task_of(record).in_decibel:
+            text = f"{name} belongs to signal strengths, not to {record.task}"
+            raise InputError(f"{place_of(record)}: {text}; set Record.{name} to None")
+        if values.shape != record.observation.shape:
+            text = f"{name} {list(values.shape)} beside observations {list(record.observation.shape)}"
+            raise InputError(f"{place_of(record)}: {text}; give one for each receiver and row")
+        wrong = np.argwhere(np.isfinite(record.observation) & ~((values > 0) & np.isfinite(values)))
+        if len(wrong):
+            receiver, row = wrong[0]
+            where = f"{place_of(record)}, receiver {record.receivers[receiver].name}, row {row}"
+            raise InputError(f"{where}: {name} is {values[receiver, row]:g}; give a number above 0 where it received")
 
 
 def check_inputs(inputs: Inputs, record: Record, method: Served) -> None:

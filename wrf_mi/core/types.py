@@ -63,6 +63,11 @@ class Record:
         uplink_hz: frequency of each subcarrier of ``uplink``, or None.
         truth: ``observation`` without its noise, where it is synthetic, or None. For scores alone (see `scored`): a
             method may not look at it.
+        n_readings: number of readings of which each signal strength is the mean, [n_rx, n], 0 where nothing was
+            received; None where the data do not tell.
+        std: standard deviation of the noise of each signal strength in dB, [n_rx, n], NaN where nothing was received;
+            of the mean itself (the readings' divided by the root of their number) where it is one of several readings.
+            None where the data do not tell.
         source: where it was read from.
     """
 
@@ -79,6 +84,8 @@ class Record:
     uplink: NDArray[np.complex64] | None = None
     uplink_hz: FloatArray | None = None
     truth: NDArray[np.float32] | NDArray[np.complex64] | None = None
+    n_readings: IntArray | None = None
+    std: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:
@@ -93,6 +100,25 @@ class Record:
     def with_array(self, array_m: FloatArray | None) -> Record:
         """The same measurements by receivers that all have one array, elements [m, 3] in metres, or None."""
         return replace(self, receivers=tuple(replace(one, array_m=array_m) for one in self.receivers))
+
+    def precision(self, rows: IntArray) -> FloatArray | None:
+        """Inverse variance of the noise of some rows' observations, relative to that of a usual reading.
+
+        It is (median of ``std`` / ``std``)^2 where the data state ``std``, the median over what was received in these
+        rows, and else ``n_readings``: the noise of a mean of n independent readings has an n-th of their variance.
+
+        Args:
+            rows: numbers of rows [m].
+
+        Returns:
+            Shape [n_rx, m], 1 where nothing was received; None where the data state neither.
+        """
+        if self.std is None:
+            return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)
+        std = self.std[:, rows]
+        known = np.isfinite(std)
+        relative = std / (np.median(std[known]) if known.any() else 1.0)
+        return np.where(known, relative, 1.0) ** -2
 
     @property
     def has_positions(self) -> bool:
