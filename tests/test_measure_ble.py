@@ -341,7 +341,7 @@ def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
     [
         ({"official": None}, "it needs signal strengths with an official split"),
         ({"official": (np.arange(4), np.arange(4))}, "each row must be in one part of the official split"),
-        ({"frequencies_hz": np.array([2.402e9])}, r"its carrier is 2\.402e\+09 and that of the layout 2\.44e\+09 Hz"),
+        ({"frequencies_hz": None}, r"its carrier is not known; set Record\.frequencies_hz"),
         ({"folds": np.zeros(5, int)}, "it does not state folds"),
         ({"tx_pos_m": np.full((5, 3), np.nan)}, "a position, heading or signal strength is not finite"),
         ({"name of a receiver": "anchor03"}, r"receiver 'anchor03' would be read as another; rename it"),
@@ -359,3 +359,18 @@ def test_what_the_layout_does_not_state_is_not_written(folder: Path, change: dic
     with pytest.raises(InputError, match=message):
         write_ble_folder(tmp_path / "new", replace(record, **change))
     assert not (tmp_path / "new").exists()
+
+
+def test_the_carrier_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
+    record, carriers = read_ble_folder(folder), np.array([2.402e9, 2.426e9, 2.48e9, 2.402e9, 2.48e9])
+    for own in (record.at_carriers(carriers), record.at_carrier(868e6), record):
+        again = read_ble_folder(write_ble_folder(tmp_path / "again", own, replace=True))
+        np.testing.assert_equal(again.carriers_hz, own.carriers_hz)
+        np.testing.assert_equal(again.frequencies_hz, own.frequencies_hz)
+    text(TEST_FILE, "ts", "frequency_hz")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: line 1: no column frequency_hz, but {TEST_FILE} has one"):
+        read_ble_folder(folder)
+    text(TRAIN_FILE, ",ts", ",frequency_hz")(folder)
+    text(TRAIN_FILE, "^1,1.6e18", "1,0")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: row 2: frequency_hz is 0; give the carrier"):
+        read_ble_folder(folder)

@@ -116,7 +116,7 @@ def _predict(a: Arguments) -> int:
     with open_scheduler(a.scheduler) as scheduler:
         given = scheduler if a.scheduler else None
         asked = (a.run, inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
-        shapes = predict_to_file(*asked, given, not a.no_operator, inputs.uplink)
+        shapes = predict_to_file(*asked, given, not a.no_operator, inputs.uplink, inputs.carriers_hz)
     if a.json:
         print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
@@ -238,8 +238,10 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
     given = sub.add_mutually_exclusive_group(required=True)
-    text = "array tx_pos [m, 3] in metres (and heading_rad [m]), or uplink [m, antennas, subcarriers]"
-    given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
+    text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
+    given.add_argument(
+        "--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
+    )
     given.add_argument("--input", metavar="FILE.npz", help=text)
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
     sub.add_argument("--out", required=True, metavar="FILE", help=text)

@@ -55,7 +55,7 @@ class Record:
         official: training and test rows (from 0) that came with the data, or None.
         folds: the spatial block of each row, shape [n], or None.
         frequencies_hz: of the carrier, shape [1], or of each subcarrier of ``observation``; None where the data do not
-            tell.
+            tell, and with ``carriers_hz``.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         tx_antenna: antenna of the transmitter.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
@@ -68,6 +68,8 @@ class Record:
         std: standard deviation of the noise of each signal strength in dB, [n_rx, n], NaN where nothing was received;
             of the mean itself (the readings' divided by the root of their number) where it is one of several readings.
             None where the data do not tell.
+        carriers_hz: carrier of each row in Hz, [n], of spectra and signal strengths that were measured at several;
+            None where all rows have one.
         source: where it was read from.
     """
 
@@ -86,6 +88,7 @@ class Record:
     truth: NDArray[np.float32] | NDArray[np.complex64] | None = None
     n_readings: IntArray | None = None
     std: FloatArray | None = None
+    carriers_hz: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:
@@ -100,6 +103,16 @@ class Record:
     def with_array(self, array_m: FloatArray | None) -> Record:
         """The same measurements by receivers that all have one array, elements [m, 3] in metres, or None."""
         return replace(self, receivers=tuple(replace(one, array_m=array_m) for one in self.receivers))
+
+    def at_carrier(self, carrier_hz: float) -> Record:
+        """The same record with one carrier in Hz for every row."""
+        return replace(self, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
+
+    def at_carriers(self, carriers_hz: FloatArray) -> Record:
+        """The same record with the carrier in Hz of each row, [n]; where all are equal, with one carrier."""
+        if len(np.unique(carriers_hz)) == 1:
+            return self.at_carrier(carriers_hz[0])
+        return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
 
     def precision(self, rows: IntArray) -> FloatArray | None:
         """Inverse variance of the noise of some rows' observations, relative to that of a usual reading.

@@ -12,7 +12,7 @@ learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.54575
   Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Optional and
   ours, of every receiver or of none: ``count_<id>``, the number of readings of which ``rssi_<id>`` is the mean (0 or
   empty where nothing was received), and ``std_<id>``, the standard deviation of that mean's noise in dB (empty where
-  nothing was received). Other columns (``ts``, the time) are not used.
+  nothing was received); and ``frequency_hz``, the carrier of the row. Other columns (``ts``, the time) are not used.
 - ``test_robot_df.csv``: the same for another run; these rows test. An optional column is in both files or in neither.
 
 Without a column ``z`` the height is that of the published data, whose transmitter stood on a pole 1.3 m above the
@@ -34,10 +34,11 @@ from numpy.typing import NDArray
 from ..core import Antenna, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT
+from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line
 from ..core.types import IntArray
 from .csv_table import CsvTable, read_csv
-from .folder_files import TX_ANTENNA_WORDS, read_antenna, shown
+from .folder_files import TX_ANTENNA_WORDS, carriers_of, read_antenna, shown
 
 logger = logging.getLogger(__name__)
 
@@ -45,8 +46,8 @@ ANCHORS, TRAINING, TEST = "anchors.csv", "calibration_df.csv", "test_robot_df.cs
 TAG_HEIGHT_M = 1.3
 """Height of the transmitter above the floor where the files have no column ``z`` (the data set's description)."""
 CARRIER_HZ = 2.44e9
-"""The data are means over BLE's three advertising channels, 2402, 2426 and 2480 MHz (Bluetooth Core Specification,
-volume 6, part A): the middle of that band."""
+"""Where the files have no column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402, 2426
+and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
 RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
 COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
 """Of ``anchors.csv``."""
@@ -81,6 +82,10 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(n_train + n_test, TAG_HEIGHT_M)
+    for table in tables:
+        if FREQUENCY in table.header:
+            carriers_of(table.path, table.numbers(FREQUENCY))
+    carriers = _in_both(FREQUENCY, tables)
     x, y = (np.concatenate([table.numbers(axis) for table in tables]) for axis in "xy")
     strengths = [_signal_strength(table, ids) for table in tables]
     strength, counts, std = (
@@ -91,7 +96,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     if len(deaf):
         text = f"{RSSI}{ids[deaf[0]]} is empty in every row, in {TEST} too"
         raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
-    return Record(
+    record = Record(
         name=name or folder.resolve().name,
         task="rssi",
         tx_pos_m=np.stack([x, y, height], axis=-1),
@@ -108,6 +113,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         std=std,
         source=str(folder),
     )
+    return record if carriers is None else record.at_carriers(carriers)
 
 
 def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
@@ -124,6 +130,9 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
             cannot state.
     """
     official, ids = _writable(path, record)
+    carriers, hz = record.carriers_hz, record.frequencies_hz
+    if hz is not None and hz[0] != CARRIER_HZ:
+        carriers = np.full(len(record), hz[0])
     with atomic_folder(Path(path), replace) as part:
         antennas = {TX: [record.tx_antenna] * len(ids), "": [receiver.antenna for receiver in record.receivers]}
         stated = {
@@ -138,6 +147,8 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
             columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
             if record.tx_heading_rad is not None:
                 columns["heading"] = record.tx_heading_rad[rows].tolist()
+            if carriers is not None:
+                columns[FREQUENCY] = carriers[rows].tolist()
             for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
                 if values is not None:
                     columns |= {prefix + anchor: own[rows] for anchor, own in zip(ids, values, strict=True)}
@@ -152,10 +163,8 @@ def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArra
         raise InputError(f"{text}: it needs signal strengths with an official split; set Record.official")
     if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
         raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
-    hz = record.frequencies_hz
-    if hz is None or hz.tolist() != [CARRIER_HZ]:
-        found = "unknown" if hz is None else ", ".join(f"{one:g}" for one in hz)
-        raise InputError(f"{text}: its carrier is {found} and that of the layout {CARRIER_HZ:g} Hz; use another layout")
+    if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
+        raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
     for name in ("folds", "truth", "uplink"):
         if getattr(record, name) is not None:
             raise InputError(f"{text}: it does not state {name}; set Record.{name} to None")

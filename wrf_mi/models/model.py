@@ -197,6 +197,7 @@ class Model:
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from how the transmitter is turned.
         complete: whether it needs every receiver's observation of every training row.
+        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         given: those of the arguments ``model``, ``seed``, ``deterministic`` and ``receiver`` of `wrf_mi.train` that
             are settings of its own.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
@@ -219,6 +220,7 @@ class Model:
     uplink: Literal["none", "optional", "required"] = "none"
     headings: bool = False
     complete: bool = False
+    several_carriers: bool = False
     given: tuple[str, ...] = ()
     defaults: tuple[str, ...] = ()
     presets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -267,4 +269,5 @@ def model_of(method: Method) -> Model:
 
     needed: Any = "required" if method.needs_uplink else "optional"
     ends = fit, load, method.source
-    return Model(method.name, method.tasks, method.settings, *ends, uplink=needed, headings=True)
+    kept: dict[str, Any] = {"uplink": needed, "several_carriers": method.several_carriers}
+    return Model(method.name, method.tasks, method.settings, *ends, **kept, headings=True)
