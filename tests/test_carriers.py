@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,7 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.carriers import by_carrier
-from wrf_mi.measure import load, write_ble_folder
+from wrf_mi.measure import load, write_ble_folder, write_nerf2_csi
 from wrf_mi.models import MODELS
 from wrf_mi.report.references import reference_predictions
 from wrf_mi.report.results import read_run
@@ -233,3 +234,33 @@ def test_the_reference_blends_rows_of_one_carrier(flat: Record) -> None:
     shifted = replace(flat, observation=flat.observation + np.where(flat.carriers_hz == LOW, 30, 0).astype(np.float32))
     moved = reference_predictions(shifted, known, rows)[key] - found
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
+
+
+def test_the_command_shows_carriers_readings_and_noise(
+    flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = flat.observation.shape
+    readings = np.ones(shape, np.int64)
+    readings[:, ::2] = 5
+    own = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
+    folder = write_ble_folder(tmp_path / "flat", own)
+    status, out, _ = call(["data", "info", folder, "--json"], capsys)
+    found = json.loads(out)
+    assert status == 0
+    assert found["carriers_hz"] == {str(LOW): 10, str(HIGH): 20}
+    assert (found["n_readings"], found["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
+    assert (found["receivers"], found["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
+    status, out, _ = call(["data", "info", folder], capsys)
+    assert status == 0
+    assert "carrier:          1100000000 Hz in 10 rows, 5100000000 Hz in 20 rows\n" in out
+    assert "readings per row: 1 to 5, median 3\nnoise:            1 to 3 dB, median 2 dB\n" in out
+    status, _, err = call(["data", "info", tmp_path / "nothing"], capsys)
+    assert (status, err.count("\n")) == (2, 1)
+
+
+def test_the_command_shows_what_channels_are_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_nerf2_csi(tmp_path / "stations", channels())
+    status, out, _ = call(["data", "info", folder], capsys)
+    assert status == 0
+    assert "carrier:          2400000000 to 2403000000 Hz, 4 subcarriers\n" in out
+    assert "known:            positions, uplink\n" in out

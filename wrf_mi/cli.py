@@ -72,6 +72,18 @@ def _data_fetch(a: Arguments) -> int:
     return 0
 
 
+def _data_info(a: Arguments) -> int:
+    from .report.data_info import data_info, render
+    from .trace import load_record
+
+    found = data_info(load_record(a.dataset, progress=True))
+    if a.json:
+        print_json(found)
+    else:
+        print(render(found))
+    return 0
+
+
 def _mesh(a: Arguments) -> int:
     from .scene.make import make_scene
     from .scene.register import read_pairs, register_pairs
@@ -178,12 +190,14 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("doctor", _doctor, "which backend, LLVM, GPU and data were found, and the remedy for what is missing")
     sub.add_argument("--install-llvm", action="store_true", help="install LLVM with the system's package manager first")
 
-    data = commands.add_parser("data", help="known data sets: list, fetch").add_subparsers(
+    data = commands.add_parser("data", help="data sets: list, fetch, info").add_subparsers(
         required=True, metavar="COMMAND"
     )
     command("list", _data_list, "known data sets and where they lie", where=data)
     sub = command("fetch", _data_fetch, "download a data set, checked by SHA-256", json_output=False, where=data)
     sub.add_argument("name", metavar="NAME")
+    sub = command("info", _data_info, "read and check a data set, and say what it holds", where=data)
+    sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
 
     sub = command("mesh", _mesh, "make a scene for both tracers from a LiDAR scan, a plan or a mesh")
     sub.add_argument(

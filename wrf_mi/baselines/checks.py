@@ -66,13 +66,22 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
         raise InputError(
             f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         )
-    task_of(record).check(record)
-    _check_carriers(record)
+    check_parts(record)
     if record.carriers_hz is not None and not method.several_carriers:
         able = [one.name for one in others if one.several_carriers and one.serves(record.task)]
         named = f" ({', '.join(able)})" if able else ""
         text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
         raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
+
+
+def check_parts(record: Record) -> None:
+    """Refuse a record whose parts do not fit together.
+
+    Raises:
+        InputError: as `check_record`, whatever the method.
+    """
+    task_of(record).check(record)
+    _check_carriers(record)
     _check_noise(record)
 
 
