@@ -25,7 +25,8 @@ from wrf_mi.report.runs import open_run, plan_run, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import TASKS, instrument_of
 from wrf_mi.trace import TraceOptions, load_trace
-from wrf_mi.trace.result import join_traces
+from wrf_mi.trace.polarization import cross_polarized
+from wrf_mi.trace.result import join_traces, recompute
 from wrf_mi.trace.tracer import RayTracer
 
 LOW, HIGH = 1.1e9, 5.1e9
@@ -201,6 +202,17 @@ def test_reflections_are_those_of_a_trace_at_the_rows_carrier(
         own = carriers == carrier
         np.testing.assert_allclose(found[:, own], alone[:, own], atol=GREY if record.task == "spectrum" else FLOAT32_DB)
         assert not np.allclose(found[:, ~own], alone[:, ~own], atol=0.05)
+
+
+def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -> None:
+    tracer = RayTracer(room, instrument_of(flat.at_carrier(LOW)), TraceOptions(max_depth=2, rays=20000))
+    traced = tracer.trace(flat.tx_pos_m, carriers_hz=np.full(len(flat), 100 * LOW))
+    here = recompute(traced, tracer.scene)
+    assert here.carriers_hz is None
+    direct = here.paths.bounces == 0
+    np.testing.assert_allclose(np.abs(here.paths.gain / traced.paths.gain)[direct], 100, rtol=1e-4)
+    # The turned antenna brings at LOW about what the stated one, which nothing is wrong with, brings at 100 LOW.
+    assert cross_polarized(traced, tracer.scene) == {}
 
 
 def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path) -> None:

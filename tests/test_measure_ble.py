@@ -342,7 +342,7 @@ def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
         ({"official": None}, "it needs signal strengths with an official split"),
         ({"official": (np.arange(4), np.arange(4))}, "each row must be in one part of the official split"),
         ({"frequencies_hz": None}, r"its carrier is not known; set Record\.frequencies_hz"),
-        ({"folds": np.zeros(5, int)}, "it does not state folds"),
+        ({"folds": np.zeros(5, int)}, "has folds, which this layout does not state; set Record.folds to None"),
         ({"tx_pos_m": np.full((5, 3), np.nan)}, "a position, heading or signal strength is not finite"),
         ({"name of a receiver": "anchor03"}, r"receiver 'anchor03' would be read as another; rename it"),
         ({"name of a receiver": "a/b"}, r"receiver 'a/b' cannot name a file; rename it"),

@@ -430,6 +430,6 @@ def test_wrong_carriers_of_rows_are_refused(folder: Path, row: str, message: str
 def test_what_the_layout_does_not_state_is_not_written(tmp_path: Path, change: dict[str, str]):
     record = make_record(4)
     ((name, other),) = change.items()
-    with pytest.raises(InputError, match=f"states no {name}; set Record.{name} to None"):
+    with pytest.raises(InputError, match=f"has {name}, which this layout does not state; set Record.{name} to"):
         write_spectrum_folder(tmp_path / "a", replace(record, **{name: getattr(record, other)}))
     assert not (tmp_path / "a").exists()

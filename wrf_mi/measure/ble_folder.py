@@ -38,7 +38,7 @@ from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line
 from ..core.types import IntArray
 from .csv_table import CsvTable, read_csv
-from .folder_files import TX_ANTENNA_WORDS, carriers_of, read_antenna, shown
+from .folder_files import TX_ANTENNA_WORDS, carriers_of, read_antenna, refuse_unstated, shown
 
 logger = logging.getLogger(__name__)
 
@@ -165,9 +165,7 @@ def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArra
         raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
     if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
-    for name in ("folds", "truth", "uplink"):
-        if getattr(record, name) is not None:
-            raise InputError(f"{text}: it does not state {name}; set Record.{name} to None")
+    refuse_unstated(path, record, "folds", "truth", "uplink")
     numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
     if not all(np.isfinite(one).all() for one in numbers) or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")

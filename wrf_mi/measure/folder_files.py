@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..core import Antenna, InputError
+from ..core import Antenna, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
@@ -241,6 +241,18 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
     if not seen:
         raise InputError(f"{path}: no rows in it; give one row number per line")
     return np.array(list(seen), np.int64) - first
+
+
+def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
+    """Refuse to write a record with parts of these names, which a layout does not state.
+
+    Raises:
+        InputError: naming the first that the record has.
+    """
+    for name in names:
+        if getattr(record, name) is not None:
+            remedy = f"set Record.{name} to None, or use another layout"
+            raise InputError(f"{path}: {record.name} has {name}, which this layout does not state; {remedy}")
 
 
 def write_lines(path: Path, lines: list[str]) -> None:

@@ -45,6 +45,7 @@ from .folder_files import (
     read_official,
     read_positions_and_carriers,
     read_yaml,
+    refuse_unstated,
     shown,
     unit_quaternion,
     whole_number,
@@ -136,11 +137,7 @@ def write_spectrum_folder(
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
         text = f"{record.name} has {len(record.frequencies_hz)} carriers for all rows, and {GATEWAYS} states one"
         raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
-    for name in ("truth", "tx_heading_rad"):
-        if getattr(record, name) is not None:
-            raise InputError(
-                f"{path}: {record.name}: the layout of spectra states no {name}; set Record.{name} to None"
-            )
+    refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
     grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
     with atomic_folder(Path(path), replace) as part:
         several = len(record.receivers) > 1

@@ -122,7 +122,8 @@ def recompute(
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
         gain = path_gains(scene, surfaces, traced.legs(surfaces), traced.ends(), traced.rays)
-    return replace(traced, paths=replace(traced.paths, gain=gain), frequency_hz=float(scene.frequency[0]))
+    paths, hz = replace(traced.paths, gain=gain), float(scene.frequency[0])
+    return replace(traced, paths=paths, frequency_hz=hz, carriers_hz=None)
 
 
 def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
