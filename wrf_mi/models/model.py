@@ -194,10 +194,10 @@ class Model:
         scene: whether it takes a scene.
         uses_antennas: whether patterns and polarisations of antennas count in that scene.
         scene_alone: whether a scene predicts without training rows.
+        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from how the transmitter is turned.
         complete: whether it needs every receiver's observation of every training row.
-        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         given: those of the arguments ``model``, ``seed``, ``deterministic`` and ``receiver`` of `wrf_mi.train` that
             are settings of its own.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
@@ -217,10 +217,10 @@ class Model:
     scene: Literal["none", "optional", "required"] = "none"
     uses_antennas: bool = True
     scene_alone: bool = False
+    several_carriers: bool = False
     uplink: Literal["none", "optional", "required"] = "none"
     headings: bool = False
     complete: bool = False
-    several_carriers: bool = False
     given: tuple[str, ...] = ()
     defaults: tuple[str, ...] = ()
     presets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
