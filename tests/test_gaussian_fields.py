@@ -12,7 +12,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from wrf_mi.backend.device import to_tensor  # noqa: E402
+from wrf_mi.backend.device import to_float, to_tensor  # noqa: E402
 from wrf_mi.baselines import nerf2  # noqa: E402
 from wrf_mi.baselines.method import inputs_of  # noqa: E402
 from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
@@ -26,12 +26,13 @@ from wrf_mi.fit.checkpoint import read_checkpoint, write_checkpoint  # noqa: E40
 from wrf_mi.fit.config import TrainConfig, default_config  # noqa: E402
 from wrf_mi.fit.predictor import TOGETHER, Predictor  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
-from wrf_mi.fit.step import device_pose  # noqa: E402
+from wrf_mi.fit.step import TrainingData, device_pose  # noqa: E402
 from wrf_mi.fit.targets import targets_of  # noqa: E402
 from wrf_mi.fit.trainer import Trainer  # noqa: E402
 from wrf_mi.receive.operator import SectorOperator  # noqa: E402
 from wrf_mi.report.runs import train  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
+from wrf_mi.tasks import TASKS  # noqa: E402
 
 MODELS = tuple(FIELDS)
 SMALL = (
@@ -310,6 +311,61 @@ def test_rows_that_were_not_received_are_learned_from_at_no_receiver() -> None:
     np.testing.assert_array_equal(targets.received(1, np.arange(40)), np.arange(40))
     trainer = Trainer(record, halves(record), config(record))
     assert not set(trainer.schedule.rows[trainer.schedule.receiver == 0].ravel()) & {0, 1, 2}
+
+
+def test_differences_are_divided_by_the_stated_noise() -> None:
+    record, rows = strengths(rows=20), np.arange(4, 20)
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 4, record.observation.shape)
+    targets = targets_of(replace(record, std=std), rows)
+    weight, received = targets.weight, np.isfinite(record.observation[:, rows])
+    assert weight is not None
+    np.testing.assert_allclose((weight * std)[:, rows], (weight * std)[0, 4])
+    np.testing.assert_allclose(weight[:, rows][received].mean(), 1)
+    readings = rng.integers(1, 9, record.observation.shape)
+    of_means = targets_of(replace(record, n_readings=readings), rows).weight
+    assert of_means is not None
+    np.testing.assert_allclose((of_means / np.sqrt(readings))[:, rows], of_means[0, 4] / np.sqrt(readings[0, 4]))
+    assert targets_of(record, rows).weight is None
+    np.testing.assert_array_equal(targets_of(replace(record, std=np.full_like(std, 3)), rows).weight, 1)
+    batch, scale = rng.permutation(rows)[:6], 1 / targets.unit
+    data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(scale), to_float(weight))
+    for r in (0, 1):
+        number = mi.UInt32(batch.tolist())
+        truth, factor = data.select(number, r, 1)[1], data.factor(number, r, 1)
+        found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), structural_weight=0.0)
+        # Everything is 2 dB too high; the sum of two numbers near -50 in single precision.
+        np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
+
+
+def test_rows_of_much_stated_noise_are_learned_from_less() -> None:
+    record = strengths(1)
+    record = replace(record, observation=np.nan_to_num(record.observation, nan=-50))
+    split, wrong = halves(record), np.zeros(record.observation.shape, bool)
+    wrong[0, split.all_train[::2]] = True
+    louder = replace(record, observation=np.where(wrong, record.observation + 20, record.observation))
+
+    def error(own: Record) -> float:
+        trainer = Trainer(own, split, config(own, "steps=300"))
+        assert trainer.run()
+        found = trainer.predictor().of_rows(record, split.test, 0)
+        return float(np.median(np.abs(found - record.observation[0, split.test])))
+
+    assert error(replace(louder, std=np.where(wrong, 40.0, 1.0))) < 0.5 * error(louder)
+
+
+def test_readings_and_noise_that_do_not_fit_are_refused(tmp_path) -> None:
+    record = strengths()
+    std = np.ones(record.observation.shape)
+    for change, message in (
+        ({"std": std[:1]}, r"std \[1, 60\] beside observations \[2, 60\]"),
+        ({"std": 0 * std}, "receiver rx0, row 3: std is 0; give a number above 0"),
+        ({"n_readings": np.zeros(std.shape, int)}, "receiver rx0, row 3: n_readings is 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            train(replace(record, **change), tmp_path / "run", "idw", split=halves(record))
+    with pytest.raises(InputError, match="std belongs to signal strengths, not to csi"):
+        train(replace(channels(), std=std), tmp_path / "run", "idw", split=halves(record))
 
 
 def test_what_cannot_be_learned_from_is_refused() -> None:

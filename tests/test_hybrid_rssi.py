@@ -109,6 +109,25 @@ def test_rows_of_one_stop_are_joined() -> None:
     np.testing.assert_allclose(np.cos(stops.places.heading_rad), np.cos([np.pi, 0, 2, 2]), atol=1e-3)
 
 
+def test_precise_rows_of_a_stop_weigh_more() -> None:
+    places = Places(np.zeros((4, 3)), None)
+    value, precision = np.array([[1.0, 2.0, np.nan, 9.0], [1.0, 2.0, 3.0, 4.0]]), np.array([[1, 1, 7, 3], [1, 1, 1, 3]])
+    stops = stops_of(places, value, np.arange(4), 0.2, 0.5, 20, precision=precision.astype(float))
+    np.testing.assert_array_equal(stops.count, [[5], [6]])
+    # The median of 1, 2, 9, 9, 9, and that of 1, 2, 3, 4, 4, 4.
+    np.testing.assert_array_equal(stops.value_dbm, [[9.0], [3.5]])
+
+
+def test_stated_noise_lowers_the_error() -> None:
+    record, rng = made(300, noise_db=0.5), np.random.default_rng(1)
+    std = rng.choice([0.5, 9.0], record.observation.shape)
+    noisy = replace(record, observation=(record.observation + std * rng.normal(size=std.shape)).astype(np.float32))
+    train, test = np.arange(200), np.arange(200, 300)
+    blind, told = (fit_rssi(one, train, None, FAST) for one in (noisy, replace(noisy, std=std)))
+    # Half of the rows are of little use: what is known of the rest is to count.
+    assert np.median(np.abs(errors(told, record, test))) < 0.75 * np.median(np.abs(errors(blind, record, test)))
+
+
 def test_learns_offsets_exponent_and_pattern() -> None:
     record = made(300, noise_db=1.0, body_db=4.0)
     train, test = np.arange(200), np.arange(200, 300)

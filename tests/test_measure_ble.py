@@ -3,14 +3,15 @@
 import logging
 import os
 import re
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_flat import write_flat
 
-from wrf_mi.core import Antenna, InputError
-from wrf_mi.measure import load, make_splits, read_ble_folder
+from wrf_mi.core import Antenna, InputError, Record
+from wrf_mi.measure import load, make_splits, read_ble_folder, write_ble_folder
 
 DATA = os.environ.get("WRF_MI_DATA")
 needs_data = pytest.mark.skipif(
@@ -262,3 +263,114 @@ def test_antennas_are_read(tmp_path: Path):
 def test_wrong_antennas_are_refused(tmp_path: Path, columns: dict[str, list[str]], message: str):
     with pytest.raises(InputError, match=rf"anchors\.csv: {message}"):
         read_ble_folder(with_columns(write_flat(tmp_path / "flat"), **columns))
+
+
+def with_noise(folder: Path) -> Path:
+    """State readings and noise of all that the anchors of ``folder`` received."""
+    counts = {TRAIN_FILE: ["4,2", ",1", "0,", "9,nan"], TEST_FILE: ["3,16"]}
+    stds = {TRAIN_FILE: ["0.5,1.5", ",2", ",", "0.25,"], TEST_FILE: ["1,1"]}
+    for name in counts:
+        header, *rows = (folder / name).read_text().splitlines()
+        rows = [",".join(parts) for parts in zip(rows, counts[name], stds[name], strict=True)]
+        (folder / name).write_text("\n".join([f"{header},count_1,count_3,std_1,std_3", *rows]) + "\n")
+    return folder
+
+
+def test_readings_and_noise_are_read_where_something_was_received(folder: Path):
+    plain = read_ble_folder(folder)
+    assert (plain.n_readings, plain.std, plain.precision(np.arange(5))) == (None, None, None)
+    record = read_ble_folder(with_noise(folder))
+    np.testing.assert_array_equal(record.n_readings, [[2, 1, 0, 0, 16], [4, 0, 0, 9, 3]])
+    np.testing.assert_array_equal(record.std, [[1.5, 2, np.nan, np.nan, 1], [0.5, np.nan, np.nan, 0.25, 1]])
+    np.testing.assert_array_equal(record.observation, plain.observation)
+
+
+def test_precision_is_the_inverse_of_the_variance(folder: Path):
+    record = read_ble_folder(with_noise(folder))
+    # The median of 1.5, 2, 0.5 and 0.25 is 1; rows that were not received, and the test row, do not count.
+    expected = [[1.5**-2, 2**-2, 1, 1], [0.5**-2, 1, 1, 0.25**-2]]
+    np.testing.assert_allclose(record.precision(np.arange(4)), expected)
+    of_means = replace(record, std=None)
+    np.testing.assert_array_equal(of_means.precision(np.arange(4)), [[2, 1, 1, 1], [4, 1, 1, 9]])
+
+
+WRONG_NOISE = {
+    "readings of one anchor": ("count_3", "number", TRAIN_FILE, r"line 1: no column count_3; give one for every anch"),
+    "half a reading": ("4,2,0.5", "4,2.5,0.5", TRAIN_FILE, r"row 1: count_3 is '2\.5', .*number of readings, 1 or mo"),
+    "negative": ("4,2,0.5", "4,-2,0.5", TRAIN_FILE, "row 1: count_3 is '-2', where rssi_3 is known"),
+    "no reading": ("4,2,0.5", "4,0,0.5", TRAIN_FILE, "row 1: count_3 is '0', where rssi_3 is known"),
+    "no noise": ("4,2,0.5", "4,2,0", TRAIN_FILE, r"row 1: std_1 is '0', where rssi_1 is known; give the noise in dB"),
+    "unknown noise": ("4,2,0.5", "4,2,", TRAIN_FILE, "row 1: std_1 is '', where rssi_1 is known"),
+    "readings of nothing": ("0,,,", "5,,,", TRAIN_FILE, "row 3: count_1 is '5', but rssi_1 is empty; leave it empty"),
+    "noise of words": ("3,16,1,1", "3,16,much,1", TEST_FILE, "row 1: std_1 is 'much'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_NOISE)
+def test_wrong_readings_and_noise_are_refused(folder: Path, case: str):
+    old, new, name, message = WRONG_NOISE[case]
+    text(name, old, new)(with_noise(folder))
+    with pytest.raises(InputError, match=message) as error:
+        read_ble_folder(folder)
+    assert str(folder / name) in str(error.value)
+
+
+def test_readings_stated_in_one_file_are_refused(folder: Path):
+    with_noise(folder)
+    (folder / TEST_FILE).write_text(TEST)
+    with pytest.raises(InputError, match=rf"{TEST_FILE}: line 1: no column count_3; .* in both files, or none"):
+        read_ble_folder(folder)
+
+
+def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
+    own = read_ble_folder(with_noise(with_columns(folder, pattern=["", "dipole"], tx_polarization=["H", "H"])))
+    named = tuple(
+        replace(one, name=name) for one, name in zip(own.receivers, ("hall, upper", "anchorage"), strict=True)
+    )
+    for record in (own, replace(own, receivers=named, n_readings=None, tx_heading_rad=None)):
+        again = read_ble_folder(write_ble_folder(tmp_path / record.receivers[0].name, record), own.name)
+        for one in fields(Record):
+            if one.name not in ("receivers", "source"):
+                np.testing.assert_equal(getattr(again, one.name), getattr(record, one.name), one.name)
+        for one, other in zip(again.receivers, record.receivers, strict=True):
+            np.testing.assert_equal(vars(one), vars(other))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"official": None}, "it needs signal strengths with an official split"),
+        ({"official": (np.arange(4), np.arange(4))}, "each row must be in one part of the official split"),
+        ({"frequencies_hz": None}, r"its carrier is not known; set Record\.frequencies_hz"),
+        ({"folds": np.zeros(5, int)}, "has folds, which this layout does not state; set Record.folds to None"),
+        ({"tx_pos_m": np.full((5, 3), np.nan)}, "a position, heading or signal strength is not finite"),
+        ({"name of a receiver": "anchor03"}, r"receiver 'anchor03' would be read as another; rename it"),
+        ({"name of a receiver": "a/b"}, r"receiver 'a/b' cannot name a file; rename it"),
+        ({"array_m": np.zeros((1, 3))}, "receiver anchor3: it states no array"),
+    ],
+)
+def test_what_the_layout_does_not_state_is_not_written(folder: Path, change: dict, message: str, tmp_path: Path):
+    record = read_ble_folder(folder)
+    first = record.receivers[0]
+    if "name of a receiver" in change:
+        change = {"receivers": (replace(first, name=change["name of a receiver"]), record.receivers[1])}
+    if "array_m" in change:
+        change = {"receivers": (replace(first, **change), record.receivers[1])}
+    with pytest.raises(InputError, match=message):
+        write_ble_folder(tmp_path / "new", replace(record, **change))
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_carrier_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
+    record, carriers = read_ble_folder(folder), np.array([2.402e9, 2.426e9, 2.48e9, 2.402e9, 2.48e9])
+    for own in (record.at_carriers(carriers), record.at_carrier(868e6), record):
+        again = read_ble_folder(write_ble_folder(tmp_path / "again", own, replace=True))
+        np.testing.assert_equal(again.carriers_hz, own.carriers_hz)
+        np.testing.assert_equal(again.frequencies_hz, own.frequencies_hz)
+    text(TEST_FILE, "ts", "frequency_hz")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: line 1: no column frequency_hz, but {TEST_FILE} has one"):
+        read_ble_folder(folder)
+    text(TRAIN_FILE, ",ts", ",frequency_hz")(folder)
+    text(TRAIN_FILE, "^1,1.6e18", "1,0")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: row 2: frequency_hz is 0; give the carrier"):
+        read_ble_folder(folder)

@@ -353,7 +353,9 @@ def test_frame_of_a_transmitters_antenna_is_refused(folder: Path):
 def test_several_carriers_are_refused(folder: Path, text: str):
     with (folder / "gateway_info.yml").open("a") as file:
         file.write(f"{text}\n")
-    with pytest.raises(InputError, match=r"gateway_info.yml: .*several carriers.*make a folder for each"):
+    with pytest.raises(
+        InputError, match=r"gateway_info.yml: .*several carriers.*column frequency_hz, or make a folder for each"
+    ):
         read_spectrum_folder(folder)
 
 
@@ -374,7 +376,9 @@ def test_several_carriers_of_receivers_are_refused_and_equal_ones_are_one(tmp_pa
 
 def test_several_carriers_are_not_written(tmp_path: Path):
     record = replace(make_record(4), frequencies_hz=np.array([915e6, 2.4e9]))
-    with pytest.raises(InputError, match=r"2 carriers, and gateway_info\.yml states one; write a folder for each"):
+    with pytest.raises(
+        InputError, match=r"2 carriers for all rows, and gateway_info\.yml states one; give that of each row"
+    ):
         write_spectrum_folder(tmp_path / "a", record)
     assert not (tmp_path / "a").exists()
 
@@ -385,4 +389,47 @@ def test_names_that_mean_something_else_are_not_written(tmp_path: Path, name: st
     named = replace(record, receivers=(replace(record.receivers[0], name=name),))
     with pytest.raises(InputError, match=f"a receiver is named '{name}'"):
         write_spectrum_folder(tmp_path / "a", named)
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_carrier_of_each_row_is_kept(tmp_path: Path):
+    carriers = np.array([915e6, 2.44e9, 915e6, 5.1e9])
+    folder = write_spectrum_folder(tmp_path / "a", make_record(4).at_carriers(carriers))
+    again = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(again.carriers_hz, carriers)
+    assert again.frequencies_hz is None
+    assert_same(again, make_record(4))
+    (folder / "tx_pos.csv").write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
+    one = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(one.frequencies_hz, [868e6])
+    assert one.carriers_hz is None
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write("frequency_hz: 868e6\n")
+    with pytest.raises(InputError, match=r"tx_pos.csv: line 1: column frequency_hz, but gateway_info.yml states a car"):
+        read_spectrum_folder(folder)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("1,2,3,0", r"row 2: frequency_hz is 0; give the carrier in Hz"),
+        ("1,2,3,-1", r"row 2: frequency_hz is -1"),
+        ("1,2,3,nan", r"row 2: '1,2,3,nan' is not finite"),
+        ("1,2,3", "row 2: '1,2,3'; give 4 numbers x,y,z,frequency_hz"),
+        ("1,2,3,many", "row 2: '1,2,3,many'; give 4 numbers x,y,z,frequency_hz"),
+    ],
+)
+def test_wrong_carriers_of_rows_are_refused(folder: Path, row: str, message: str):
+    rows = ["1,2,3,9e8", row, *["1,2,3,9e8"] * 10]
+    (folder / "tx_pos.csv").write_text("\n".join(["x,y,z,frequency_hz", *rows]) + "\n")
+    with pytest.raises(InputError, match=message):
+        read_spectrum_folder(folder)
+
+
+@pytest.mark.parametrize("change", [{"truth": "observation"}, {"tx_heading_rad": "folds"}])
+def test_what_the_layout_does_not_state_is_not_written(tmp_path: Path, change: dict[str, str]):
+    record = make_record(4)
+    ((name, other),) = change.items()
+    with pytest.raises(InputError, match=f"has {name}, which this layout does not state; set Record.{name} to"):
+        write_spectrum_folder(tmp_path / "a", replace(record, **{name: getattr(record, other)}))
     assert not (tmp_path / "a").exists()

@@ -72,6 +72,18 @@ def _data_fetch(a: Arguments) -> int:
     return 0
 
 
+def _data_info(a: Arguments) -> int:
+    from .report.data_info import data_info, render
+    from .trace import load_record
+
+    found = data_info(load_record(a.dataset, progress=True))
+    if a.json:
+        print_json(found)
+    else:
+        print(render(found))
+    return 0
+
+
 def _mesh(a: Arguments) -> int:
     from .scene.make import make_scene
     from .scene.register import read_pairs, register_pairs
@@ -116,7 +128,7 @@ def _predict(a: Arguments) -> int:
     with open_scheduler(a.scheduler) as scheduler:
         given = scheduler if a.scheduler else None
         asked = (a.run, inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
-        shapes = predict_to_file(*asked, given, not a.no_operator, inputs.uplink)
+        shapes = predict_to_file(*asked, given, not a.no_operator, inputs.uplink, inputs.carriers_hz)
     if a.json:
         print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:
@@ -178,12 +190,14 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("doctor", _doctor, "which backend, LLVM, GPU and data were found, and the remedy for what is missing")
     sub.add_argument("--install-llvm", action="store_true", help="install LLVM with the system's package manager first")
 
-    data = commands.add_parser("data", help="known data sets: list, fetch").add_subparsers(
+    data = commands.add_parser("data", help="data sets: list, fetch, info").add_subparsers(
         required=True, metavar="COMMAND"
     )
     command("list", _data_list, "known data sets and where they lie", where=data)
     sub = command("fetch", _data_fetch, "download a data set, checked by SHA-256", json_output=False, where=data)
     sub.add_argument("name", metavar="NAME")
+    sub = command("info", _data_info, "read and check a data set, and say what it holds", where=data)
+    sub.add_argument("dataset", metavar="DATASET", help="name of a data set or a folder")
 
     sub = command("mesh", _mesh, "make a scene for both tracers from a LiDAR scan, a plan or a mesh")
     sub.add_argument(
@@ -238,8 +252,10 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("predict", _predict, "what a run predicts at new transmitter positions")
     sub.add_argument("run", metavar="RUN")
     given = sub.add_mutually_exclusive_group(required=True)
-    text = "array tx_pos [m, 3] in metres (and heading_rad [m]), or uplink [m, antennas, subcarriers]"
-    given.add_argument("--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad), with a header")
+    text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
+    given.add_argument(
+        "--tx", metavar="FILE.csv", help="positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
+    )
     given.add_argument("--input", metavar="FILE.npz", help=text)
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
     sub.add_argument("--out", required=True, metavar="FILE", help=text)

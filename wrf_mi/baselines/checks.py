@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..core import InputError, Record
+from ..core.carriers import carriers_text
 from ..measure.observations import count_not_finite, place_of
 from ..tasks import task_of
 from .method import Inputs
@@ -24,6 +25,11 @@ class Served(Protocol):
     @property
     def tasks(self) -> tuple[str, ...] | None:
         """Tasks that it serves; None: all."""
+        ...
+
+    @property
+    def several_carriers(self) -> bool:
+        """Whether it serves rows of several carriers."""
         ...
 
     @property
@@ -45,8 +51,9 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
         others: methods to be named where it does not serve.
 
     Raises:
-        InputError: another task; no uplink for a method that needs one; numbers of rows, antennas, subcarriers and
-            frequencies that differ.
+        InputError: another task; no uplink for a method that needs one; rows of several carriers for a method that
+            serves one; numbers of rows, antennas, subcarriers and frequencies that differ; carriers, numbers of
+            readings or standard deviations that do not fit the observations.
     """
     if not method.serves(record.task):
         *most, last = method.tasks or ("nothing",)
@@ -59,7 +66,54 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
         raise InputError(
             f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         )
+    check_parts(record)
+    if record.carriers_hz is not None and not method.several_carriers:
+        able = [one.name for one in others if one.several_carriers and one.serves(record.task)]
+        named = f" ({', '.join(able)})" if able else ""
+        text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
+        raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
+
+
+def check_parts(record: Record) -> None:
+    """Refuse a record whose parts do not fit together.
+
+    Raises:
+        InputError: as `check_record`, whatever the method.
+    """
     task_of(record).check(record)
+    _check_carriers(record)
+    _check_noise(record)
+
+
+def _check_carriers(record: Record) -> None:
+    """Refuse carriers of rows that do not fit the rest of a record."""
+    carriers, place = record.carriers_hz, place_of(record)
+    if carriers is None:
+        return
+    if record.frequencies_hz is not None or task_of(record).is_complex:
+        text = "carriers_hz belongs to spectra and signal strengths without frequencies_hz"
+        raise InputError(f"{place}: {text}; set one of the two to None, or make a record for each carrier")
+    if carriers.shape != (len(record),) or not (np.isfinite(carriers) & (carriers > 0)).all():
+        raise InputError(f"{place}: carriers_hz {list(carriers.shape)}; give {len(record)} positive frequencies in Hz")
+
+
+def _check_noise(record: Record) -> None:
+    """Refuse numbers of readings and standard deviations that do not fit the observations."""
+    stated = {"n_readings": record.n_readings, "std": record.std}
+    for name, values in stated.items():
+        if values is None:
+            continue
+        if not task_of(record).in_decibel:
+            text = f"{name} belongs to signal strengths, not to {record.task}"
+            raise InputError(f"{place_of(record)}: {text}; set Record.{name} to None")
+        if values.shape != record.observation.shape:
+            text = f"{name} {list(values.shape)} beside observations {list(record.observation.shape)}"
+            raise InputError(f"{place_of(record)}: {text}; give one for each receiver and row")
+        wrong = np.argwhere(np.isfinite(record.observation) & ~((values > 0) & np.isfinite(values)))
+        if len(wrong):
+            receiver, row = wrong[0]
+            where = f"{place_of(record)}, receiver {record.receivers[receiver].name}, row {row}"
+            raise InputError(f"{where}: {name} is {values[receiver, row]:g}; give a number above 0 where it received")
 
 
 def check_inputs(inputs: Inputs, record: Record, method: Served) -> None:

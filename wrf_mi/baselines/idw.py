@@ -143,4 +143,5 @@ METHOD = Method(
     fit,
     load,
     "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
+    several_carriers=True,
 )

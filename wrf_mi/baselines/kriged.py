@@ -118,4 +118,5 @@ METHOD = Method(
     fit,
     load,
     "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
+    several_carriers=True,
 )

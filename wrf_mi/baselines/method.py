@@ -25,12 +25,14 @@ class Inputs:
         tx_heading_rad: how the transmitter is turned [m], or None.
         uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
         first_row: number of the first row, for messages.
+        carriers_hz: carrier of each row [m], Hz, or None where the data have one.
     """
 
     tx_pos_m: FloatArray
     tx_heading_rad: FloatArray | None = None
     uplink: NDArray[Any] | None = None
     first_row: int = 0
+    carriers_hz: FloatArray | None = None
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -38,20 +40,24 @@ class Inputs:
 
     def rows(self, chosen: slice) -> Inputs:
         """Some of them."""
-        heading, uplink = self.tx_heading_rad, self.uplink
+        heading, uplink, carriers = self.tx_heading_rad, self.uplink, self.carriers_hz
         return Inputs(
             self.tx_pos_m[chosen],
             None if heading is None else heading[chosen],
             None if uplink is None else uplink[chosen],
             self.first_row + (chosen.start or 0),
+            None if carriers is None else carriers[chosen],
         )
 
 
 def inputs_of(record: Record, rows: IntArray) -> Inputs:
     """The inputs of some rows of a record."""
-    heading, uplink = record.tx_heading_rad, record.uplink
+    heading, uplink, carriers = record.tx_heading_rad, record.uplink, record.carriers_hz
     return Inputs(
-        record.tx_pos_m[rows], None if heading is None else heading[rows], None if uplink is None else uplink[rows]
+        record.tx_pos_m[rows],
+        None if heading is None else heading[rows],
+        None if uplink is None else uplink[rows],
+        carriers_hz=None if carriers is None else carriers[rows],
     )
 
 
@@ -81,6 +87,7 @@ class Method:
             frequencies and shapes only.
         source: where the method is from.
         needs_uplink: whether it predicts from the uplink alone.
+        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
     """
 
     name: str
@@ -90,6 +97,7 @@ class Method:
     load: Callable[[dict[str, NDArray[Any]], Record], Fitted]
     source: str
     needs_uplink: bool = False
+    several_carriers: bool = False
 
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""

@@ -103,4 +103,5 @@ METHOD = Method(
     fit,
     load,
     "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss",
+    several_carriers=True,
 )

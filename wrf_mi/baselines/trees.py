@@ -221,4 +221,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
     return load_each(NAME, arrays, record, lambda receiver, kept: GrownTrees.from_arrays(kept))
 
 
-METHOD = Method(NAME, ("rssi",), TreesSettings, fit, load, "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'")
+SOURCE = "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'"
+METHOD = Method(NAME, ("rssi",), TreesSettings, fit, load, SOURCE, several_carriers=True)

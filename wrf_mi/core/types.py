@@ -55,7 +55,7 @@ class Record:
         official: training and test rows (from 0) that came with the data, or None.
         folds: the spatial block of each row, shape [n], or None.
         frequencies_hz: of the carrier, shape [1], or of each subcarrier of ``observation``; None where the data do not
-            tell.
+            tell, and with ``carriers_hz``.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         tx_antenna: antenna of the transmitter.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which those in
@@ -63,6 +63,13 @@ class Record:
         uplink_hz: frequency of each subcarrier of ``uplink``, or None.
         truth: ``observation`` without its noise, where it is synthetic, or None. For scores alone (see `scored`): a
             method may not look at it.
+        n_readings: number of readings of which each signal strength is the mean, [n_rx, n], 0 where nothing was
+            received; None where the data do not tell.
+        std: standard deviation of the noise of each signal strength in dB, [n_rx, n], NaN where nothing was received;
+            of the mean itself (the readings' divided by the root of their number) where it is one of several readings.
+            None where the data do not tell.
+        carriers_hz: carrier of each row in Hz, [n], of spectra and signal strengths that were measured at several;
+            None where all rows have one.
         source: where it was read from.
     """
 
@@ -79,6 +86,9 @@ class Record:
     uplink: NDArray[np.complex64] | None = None
     uplink_hz: FloatArray | None = None
     truth: NDArray[np.float32] | NDArray[np.complex64] | None = None
+    n_readings: IntArray | None = None
+    std: FloatArray | None = None
+    carriers_hz: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:
@@ -93,6 +103,35 @@ class Record:
     def with_array(self, array_m: FloatArray | None) -> Record:
         """The same measurements by receivers that all have one array, elements [m, 3] in metres, or None."""
         return replace(self, receivers=tuple(replace(one, array_m=array_m) for one in self.receivers))
+
+    def at_carrier(self, carrier_hz: float) -> Record:
+        """The same record with one carrier in Hz for every row."""
+        return replace(self, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
+
+    def at_carriers(self, carriers_hz: FloatArray) -> Record:
+        """The same record with the carrier in Hz of each row, [n]; where all are equal, with one carrier."""
+        if len(np.unique(carriers_hz)) == 1:
+            return self.at_carrier(carriers_hz[0])
+        return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
+
+    def precision(self, rows: IntArray) -> FloatArray | None:
+        """Inverse variance of the noise of some rows' observations, relative to that of a usual reading.
+
+        It is (median of ``std`` / ``std``)^2 where the data state ``std``, the median over what was received in these
+        rows, and else ``n_readings``: the noise of a mean of n independent readings has an n-th of their variance.
+
+        Args:
+            rows: numbers of rows [m].
+
+        Returns:
+            Shape [n_rx, m], 1 where nothing was received; None where the data state neither.
+        """
+        if self.std is None:
+            return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)
+        std = self.std[:, rows]
+        known = np.isfinite(std)
+        relative = std / (np.median(std[known]) if known.any() else 1.0)
+        return np.where(known, relative, 1.0) ** -2
 
     @property
     def has_positions(self) -> bool:

@@ -69,11 +69,13 @@ class TrainingData:
         condition: of all rows, tensor [3, c] in metres or [features, c].
         truth: observations of all receivers and conditions, one after the other.
         scale: one over each receiver's unit, [n_rx].
+        weight: factors of the observations' differences in the loss, in the order of ``truth``; None: 1 throughout.
     """
 
     condition: Any
     truth: Any
     scale: Any
+    weight: Any = None
 
     def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any]:
         """Conditions [3 or features, batch] and observations [batch * values] of some conditions at one receiver."""
@@ -84,6 +86,15 @@ class TrainingData:
         slot = dr.arange(index_type, batch * values)
         one = dr.gather(index_type, rows, slot // values) + receiver * n
         return tx, dr.gather(type(self.truth), self.truth, one * values + slot % values)
+
+    def factor(self, rows: Any, receiver: Any, values: int) -> Any:
+        """What differences are multiplied by in the loss: of one value, or [batch * values] with ``weight``."""
+        scale = dr.gather(type(self.truth), self.scale, receiver)
+        if self.weight is None:
+            return scale
+        slot = dr.arange(type(rows), dr.width(rows) * values)
+        one = dr.gather(type(rows), rows, slot // values) + receiver * self.condition.shape[1]
+        return scale * dr.gather(type(self.truth), self.weight, one)
 
 
 @dataclass
@@ -140,7 +151,7 @@ def make_step(
         condition, truth = data.select(rows, receiver, values)
         batch = dr.width(rows)
         prediction = report(params, Batch(condition, slots, receiver, pose, plane))
-        scale = dr.gather(type(truth), data.scale, receiver)
+        scale = data.factor(rows, receiver, values)
         loss = loss_of(prediction * scale, truth * scale, batch, *shape)
         mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
         urge = mi.Float(0)

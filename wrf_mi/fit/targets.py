@@ -30,12 +30,14 @@ class Targets:
         truth: float32 [n_rx, c, *shape of a report], NaN where nothing was received.
         unit: of each receiver, by which differences are divided in the loss, [n_rx].
         per_row: conditions of a row; they stand one after the other.
+        weight: factor of each observation's difference in the loss [n_rx, c]; None: 1 throughout.
     """
 
     condition: FloatArray
     truth: NDArray[np.float32]
     unit: FloatArray
     per_row: int = 1
+    weight: FloatArray | None = None
 
     def conditions(self, rows: IntArray) -> IntArray:
         """Numbers of the conditions of rows."""
@@ -62,13 +64,29 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
             row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
             raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
         units = np.array([task.unit(own[rows]) for own in seen])
-        return Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units)
+        weight = _weights(record, rows)
+        return Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
     outputs = outputs_of(record)
     features, divisor = normalised_uplink(record.uplink)
     channels = seen[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
     truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
     known = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
     return Targets(np.asarray(features.T, float), truth, np.array([_rms(truth[0, known])]), outputs.antennas)
+
+
+def _weights(record: Record, rows: IntArray) -> FloatArray | None:
+    """One over the noise's standard deviation, with a mean of 1 over what training rows received; 1 in other rows.
+
+    Divided by it differences are standardised residuals: an absolute error is then weighted by 1 / std, the weight of
+    least variance for medians, and a squared one by 1 / variance, that for means.
+    """
+    precision = record.precision(rows)
+    if precision is None:
+        return None
+    weight = np.ones(record.observation.shape[:2])
+    inverse = np.sqrt(precision)
+    weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
+    return weight
 
 
 def _rms(values: NDArray[np.float32]) -> float:

@@ -134,7 +134,10 @@ class Trainer(TrainingLoop):
         self._poses = [device_pose(r) for r in receivers]
         self._plane = perception_plane(*form.size, mi.Float)
         self._data = TrainingData(
-            to_tensor(self.targets.condition), to_float(self.targets.truth), to_float(1 / self.targets.unit)
+            to_tensor(self.targets.condition),
+            to_float(self.targets.truth),
+            to_float(1 / self.targets.unit),
+            None if self.targets.weight is None else to_float(self.targets.weight),
         )
         if state is None:
             self.graph.check_polarization(record.tx_pos_m[known])

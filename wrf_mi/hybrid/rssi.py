@@ -303,7 +303,8 @@ def fit_rssi(
     receivers_m = np.stack([one.position_m for one in record.receivers]).astype(float)
     base = Base(receivers_m, settings.transmit_dbm, float(np.mean(record.frequencies_hz)), traced)
     heading = None if record.tx_heading_rad is None else np.asarray(record.tx_heading_rad, float)[rows]
-    measured = Measured(Places(np.asarray(record.tx_pos_m, float)[rows], heading), values, rows)
+    places = Places(np.asarray(record.tx_pos_m, float)[rows], heading)
+    measured = Measured(places, values, rows, record.precision(rows))
     priors, knobs = settings.priors(traced is not None), settings.knobs
     join = stopper(settings.stop_m, settings.stop_rad, settings.stop_rows)
     ratio, shift, widen, facts = (

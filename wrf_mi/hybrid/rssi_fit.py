@@ -152,15 +152,18 @@ class Measured:
         places: of the rows.
         value_dbm: [n_rx, n], NaN where nothing was received.
         rows: numbers in the record, ascending.
+        precision: relative to a single report [n_rx, n], see `wrf_mi.core.Record.precision`; None: 1.
     """
 
     places: Places
     value_dbm: FloatArray
     rows: IntArray
+    precision: FloatArray | None = None
 
     def take(self, which: IntArray) -> Measured:
         """Some of them."""
-        return Measured(self.places.take(which), self.value_dbm[:, which], self.rows[which])
+        precision = None if self.precision is None else self.precision[:, which]
+        return Measured(self.places.take(which), self.value_dbm[:, which], self.rows[which], precision)
 
     def folds(self) -> Iterator[tuple[IntArray, IntArray]]:
         """Rows that train and rows that are held out, as numbers into these.
@@ -195,7 +198,7 @@ Stopper = Callable[[Measured], Stops]
 
 def stopper(reach_m: float, turn_rad: float, most: int) -> Stopper:
     """Joins rows into stops; see `wrf_mi.hybrid.rssi_terms.stops_of`."""
-    return lambda measured: stops_of(measured.places, measured.value_dbm, measured.rows, reach_m, turn_rad, most)
+    return lambda own: stops_of(own.places, own.value_dbm, own.rows, reach_m, turn_rad, most, precision=own.precision)
 
 
 class Fit:

@@ -167,14 +167,15 @@ class Stops:
 
     Attributes:
         places: mean positions and headings.
-        value_dbm: median of what each receiver reported, [n_rx, s]; NaN where it received nothing.
-        count: how many reports that is, [n_rx, s].
+        value_dbm: median of what each receiver reported, weighted by precision, [n_rx, s]; NaN where it received
+            nothing.
+        count: precision of that in those of a single report: without stated noise the number of reports, [n_rx, s].
         row: the middle row, as a number in the record's order, [s].
     """
 
     places: Places
     value_dbm: FloatArray
-    count: IntArray
+    count: FloatArray
     row: FloatArray
 
     def take(self, which: NDArray[np.bool_] | IntArray) -> Stops:
@@ -183,7 +184,14 @@ class Stops:
 
 
 def stops_of(
-    places: Places, value_dbm: FloatArray, rows: IntArray, reach_m: float, turn_rad: float, most: int, gap: int = 5
+    places: Places,
+    value_dbm: FloatArray,
+    rows: IntArray,
+    reach_m: float,
+    turn_rad: float,
+    most: int,
+    gap: int = 5,
+    precision: FloatArray | None = None,
 ) -> Stops:
     """Join rows that follow each other at one place.
 
@@ -198,7 +206,9 @@ def stops_of(
         turn_rad: or has turned by so much.
         most: rows of a stop at most.
         gap: or where so many rows of the record are not among these.
+        precision: of each report relative to a single one [n_rx, n], see `wrf_mi.core.Record.precision`; None: 1.
     """
+    weight = np.ones(value_dbm.shape) if precision is None else precision
     number = np.zeros(len(rows), np.int64)
     first = 0
     for k in range(1, len(rows)):
@@ -221,14 +231,23 @@ def stops_of(
         heading = np.arctan2(mean(np.sin(places.heading_rad)), mean(np.cos(places.heading_rad)))
     begins = np.searchsorted(number, np.arange(count + 1))
     value = np.full((len(value_dbm), count), np.nan)
-    heard = np.zeros((len(value_dbm), count), np.int64)
+    heard = np.zeros((len(value_dbm), count))
     for stop in range(count):
-        own = value_dbm[:, begins[stop] : begins[stop + 1]]
-        known = np.isfinite(own)
-        heard[:, stop] = known.sum(axis=1)
-        some = heard[:, stop] > 0
-        value[some, stop] = np.nanmedian(own[some], axis=1)
+        for receiver, own in enumerate(value_dbm[:, begins[stop] : begins[stop + 1]]):
+            known = np.isfinite(own)
+            if known.any():
+                share = weight[receiver, begins[stop] : begins[stop + 1]][known]
+                value[receiver, stop], heard[receiver, stop] = _median(own[known], share), share.sum()
     return Stops(Places(position, heading), value, heard, mean(rows.astype(float)))
+
+
+def _median(values: FloatArray, weight: FloatArray) -> float:
+    """Weighted median [n] -> 1: half of the weight lies below; the middle of two values where it does so between."""
+    order = np.argsort(values)
+    ordered, below = values[order], np.cumsum(weight[order])
+    half = below[-1] / 2
+    first, last = np.searchsorted(below, half, side="left"), np.searchsorted(below, half, side="right")
+    return float((ordered[first] + ordered[min(last, len(ordered) - 1)]) / 2)
 
 
 def _wrapped(angle_rad: float) -> float:

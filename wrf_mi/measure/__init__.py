@@ -1,7 +1,7 @@
 """Measurements: records, their files, their public originals and their splits."""
 
 from .argos import read_argos
-from .ble_folder import read_ble_folder
+from .ble_folder import read_ble_folder, write_ble_folder
 from .fetch import fetch
 from .nerf2_ble import read_nerf2_ble
 from .nerf2_csi import read_nerf2_csi, write_nerf2_csi
@@ -28,6 +28,7 @@ __all__ = [
     "read_spectrum_folder",
     "save_split",
     "user_cache",
+    "write_ble_folder",
     "write_nerf2_csi",
     "write_spectrum_folder",
 ]

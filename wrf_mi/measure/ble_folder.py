@@ -9,10 +9,11 @@ learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.54575
   RT's terms (see `wrf_mi.core.Antenna`); an empty field is the default, isotropic and vertical.
 - ``calibration_df.csv``: one row per measurement: ``x``, ``y`` of the transmitter in metres, ``rssi_<id>`` at each
   receiver in dBm, empty where nothing was received. These rows train.
-  Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Other columns
-  (``ts``, the time) are not used.
-- ``test_robot_df.csv``: the same for another run; these rows test. A column ``z`` or ``heading`` is in both files or in
-  neither.
+  Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Optional and
+  ours, of every receiver or of none: ``count_<id>``, the number of readings of which ``rssi_<id>`` is the mean (0 or
+  empty where nothing was received), and ``std_<id>``, the standard deviation of that mean's noise in dB (empty where
+  nothing was received); and ``frequency_hz``, the carrier of the row. Other columns (``ts``, the time) are not used.
+- ``test_robot_df.csv``: the same for another run; these rows test. An optional column is in both files or in neither.
 
 Without a column ``z`` the height is that of the published data, whose transmitter stood on a pole 1.3 m above the
 floor. Nothing is known of the receivers' antennas but that each has two, perpendicular to each other, whose powers are
@@ -21,18 +22,23 @@ averaged: their orientation is the identity.
 
 from __future__ import annotations
 
+import csv
 import logging
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Antenna, InputError, Receiver, Record
 from ..core.angles import FloatArray
-from ..core.files import one_line
+from ..core.antenna import ANTENNA, UPRIGHT
+from ..core.carriers import FREQUENCY
+from ..core.files import atomic_folder, one_line
+from ..core.types import IntArray
 from .csv_table import CsvTable, read_csv
-from .folder_files import TX_ANTENNA_WORDS, read_antenna, shown
+from .folder_files import TX_ANTENNA_WORDS, carriers_of, read_antenna, refuse_unstated, shown
 
 logger = logging.getLogger(__name__)
 
@@ -40,9 +46,9 @@ ANCHORS, TRAINING, TEST = "anchors.csv", "calibration_df.csv", "test_robot_df.cs
 TAG_HEIGHT_M = 1.3
 """Height of the transmitter above the floor where the files have no column ``z`` (the data set's description)."""
 CARRIER_HZ = 2.44e9
-"""The data are means over BLE's three advertising channels, 2402, 2426 and 2480 MHz (Bluetooth Core Specification,
-volume 6, part A): the middle of that band."""
-RSSI, TX = "rssi_", "tx_"
+"""Where the files have no column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402, 2426
+and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
+RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
 COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
 """Of ``anchors.csv``."""
 WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
@@ -76,13 +82,21 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(n_train + n_test, TAG_HEIGHT_M)
+    for table in tables:
+        if FREQUENCY in table.header:
+            carriers_of(table.path, table.numbers(FREQUENCY))
+    carriers = _in_both(FREQUENCY, tables)
     x, y = (np.concatenate([table.numbers(axis) for table in tables]) for axis in "xy")
-    strength = np.concatenate([_signal_strength(table, ids) for table in tables], axis=1)
+    strengths = [_signal_strength(table, ids) for table in tables]
+    strength, counts, std = (
+        np.concatenate(strengths, axis=1),
+        *(_of_anchors(kind, tables, ids, strengths) for kind in (COUNT, STD)),
+    )
     deaf = np.flatnonzero(np.isnan(strength).all(axis=1))
     if len(deaf):
         text = f"{RSSI}{ids[deaf[0]]} is empty in every row, in {TEST} too"
         raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
-    return Record(
+    record = Record(
         name=name or folder.resolve().name,
         task="rssi",
         tx_pos_m=np.stack([x, y, height], axis=-1),
@@ -95,8 +109,86 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=_in_both("heading", tables),
         tx_antenna=_tx_antenna(anchors),
+        n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
+        std=std,
         source=str(folder),
     )
+    return record if carriers is None else record.at_carriers(carriers)
+
+
+def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
+    """Write signal strengths in the layout of the BLE data; the folder appears complete or not at all.
+
+    Args:
+        path: the folder to make.
+        record: of ``task="rssi"``. Its official split tells which rows lie in which file, so that they are read in
+            the order of that split.
+        replace: take the place of an existing folder.
+
+    Raises:
+        InputError: the folder exists or cannot be written, or the record lacks what the layout holds, or has what it
+            cannot state.
+    """
+    official, ids = _writable(path, record)
+    carriers, hz = record.carriers_hz, record.frequencies_hz
+    if hz is not None and hz[0] != CARRIER_HZ:
+        carriers = np.full(len(record), hz[0])
+    with atomic_folder(Path(path), replace) as part:
+        antennas = {TX: [record.tx_antenna] * len(ids), "": [receiver.antenna for receiver in record.receivers]}
+        stated = {
+            prefix + word: [getattr(one, word) for one in own]
+            for prefix, own in antennas.items()
+            for word in TX_ANTENNA_WORDS
+            if any(one != ANTENNA for one in own)
+        }
+        places = zip("xyz", np.stack([one.position_m for one in record.receivers]).T.tolist(), strict=True)
+        _write_csv(part / ANCHORS, {"id": ids, **dict(places), **stated})
+        for file, rows in zip((TRAINING, TEST), official, strict=True):
+            columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
+            if record.tx_heading_rad is not None:
+                columns["heading"] = record.tx_heading_rad[rows].tolist()
+            if carriers is not None:
+                columns[FREQUENCY] = carriers[rows].tolist()
+            for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
+                if values is not None:
+                    columns |= {prefix + anchor: own[rows] for anchor, own in zip(ids, values, strict=True)}
+            _write_csv(part / file, columns)
+    return Path(path)
+
+
+def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArray], list[str]]:
+    """The official split of a record that the layout can state, and the receivers' ids."""
+    text, rows = f"{path}: {record.name} cannot be written in the layout of {ANCHORS}", np.arange(len(record))
+    if record.task != "rssi" or record.official is None:
+        raise InputError(f"{text}: it needs signal strengths with an official split; set Record.official")
+    if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
+        raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
+    if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
+        raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
+    refuse_unstated(path, record, "folds", "truth", "uplink")
+    numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
+    if not all(np.isfinite(one).all() for one in numbers) or np.isinf(record.observation).any():
+        raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
+    ids: list[str] = []
+    for one in record.receivers:
+        if one.array_m is not None or one.orientation_xyzw.tolist() != list(UPRIGHT) or one.antenna.frame != "world":
+            what = "it states no array, orientation or frame of an antenna"
+            raise InputError(f"{text}: receiver {one.name}: {what}; set those of the world")
+        anchor = number if _name(number := one.name.removeprefix("anchor")) == one.name else one.name
+        wrong = _wrong_id(anchor, ids) or ("" if _name(_id(anchor)) == one.name else "would be read as another")
+        if wrong:
+            raise InputError(f"{text}: the name of receiver {shown(one.name)} {wrong}; rename it")
+        ids.append(anchor)
+    return record.official, ids
+
+
+def _write_csv(path: Path, columns: dict[str, Any]) -> None:
+    """Columns of texts or numbers, to the last digit of their type; NaN, and a count of zero, are empty fields."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            out.writerow(["" if (isinstance(one, np.integer) and not one) or one != one else one for one in row])
 
 
 def _read_anchors(table: CsvTable) -> tuple[list[str], FloatArray]:
@@ -176,6 +268,43 @@ def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
             text = f"line 1: no column {column}, but {having[0].path.name} has one"
             raise InputError(f"{table.path}: {text}; give it in both files or in neither")
     return np.concatenate([table.numbers(column) for table in tables])
+
+
+def _of_anchors(
+    prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
+) -> FloatArray | None:
+    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated.
+
+    Raises:
+        InputError: a column that is missing in some of the files, or a value that does not fit the signal strength.
+    """
+    found = [
+        {_id(column.removeprefix(prefix)): column for column in table.header if column.startswith(prefix)}
+        for table in tables
+    ]
+    if not any(anchor in columns for columns in found for anchor in ids):
+        return None
+    counts, parts = prefix == COUNT, []
+    for table, columns, strength in zip(tables, found, strengths, strict=True):
+        if lacking := [anchor for anchor in ids if anchor not in columns]:
+            text = f"line 1: no column {prefix}{lacking[0]}"
+            raise InputError(f"{table.path}: {text}; give one for every anchor in both files, or none")
+        values = np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids])
+        if counts:
+            values[values == 0] = np.nan
+        good = values > 0 if not counts else (values > 0) & (values == np.floor(values))
+        wrong = np.argwhere(np.where(np.isnan(strength), ~np.isnan(values), ~good).T)
+        if len(wrong):
+            row, anchor = wrong[0]
+            what = f"{columns[ids[anchor]]} is {shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
+            if np.isnan(strength[anchor, row]):
+                remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
+            else:
+                remedy = "give the number of readings, 1 or more" if counts else "give the noise in dB, above 0"
+                remedy = f"where {RSSI}{ids[anchor]} is known; {remedy}"
+            raise InputError(f"{table.path}: row {row + 1}: {what}, {remedy}")
+        parts.append(values)
+    return np.concatenate(parts, axis=1)
 
 
 def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:

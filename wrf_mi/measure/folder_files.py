@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..core import Antenna, InputError
+from ..core import Antenna, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA
+from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines
 from ..core.types import IntArray
 
 POSITIONS = "tx_pos.csv"
+AXES = ("x", "y", "z")
+"""Columns of positions, metres."""
 INDEX_FILES = ("train_index.txt", "test_index.txt")
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
@@ -136,22 +139,55 @@ def read_positions(path: Path) -> FloatArray:
     Raises:
         InputError: another header, no rows, or a row that is not three finite numbers.
     """
-    header, *rows = text_lines(path) or [""]
-    if [column.strip().lower() for column in header.split(",")] != ["x", "y", "z"]:
-        raise InputError(f"{path}: line 1: header is {header[:40]!r}; it must be x,y,z")
+    return _read_columns(path, (AXES,))
+
+
+def read_positions_and_carriers(path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z,frequency_hz``.
+
+    Returns:
+        Carriers are None where the header is ``x,y,z``.
+
+    Raises:
+        InputError: another header, no rows, a row that is not of finite numbers, or a carrier that is not positive.
+    """
+    values = _read_columns(path, (AXES, (*AXES, FREQUENCY)))
+    return values[:, :3], carriers_of(path, values[:, 3]) if values.shape[1] > 3 else None
+
+
+def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
+    """Carriers [n] of a file's column `FREQUENCY`, checked.
+
+    Raises:
+        InputError: one that is not positive.
+    """
+    if len(bad := np.flatnonzero(~(carriers_hz > 0))):
+        text = f"row {bad[0] + 1}: {FREQUENCY} is {carriers_hz[bad[0]]:g}"
+        raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
+    return carriers_hz
+
+
+def _read_columns(path: Path, headers: tuple[tuple[str, ...], ...]) -> FloatArray:
+    """Finite numbers [n, columns] of a CSV file with one of some headers."""
+    first, *rows = text_lines(path) or [""]
+    header = tuple(column.strip().lower() for column in first.split(","))
+    if header not in headers:
+        known = " or ".join(",".join(one) for one in headers)
+        raise InputError(f"{path}: line 1: header is {first[:40]!r}; it must be {known}")
     if not rows:
         raise InputError(f"{path}: no positions in it; give one row x,y,z in metres per sample")
-    positions = np.empty((len(rows), 3))
+    values, count = np.empty((len(rows), len(header))), len(header)
     for row, text in enumerate(rows, start=1):
         try:
-            positions[row - 1] = [float(value) for value in text.split(",", 3)]
+            values[row - 1] = [float(value) for value in text.split(",", count)]
         except ValueError:
-            raise InputError(f"{path}: row {row}: {text[:60]!r}; give three numbers x,y,z in metres") from None
-    bad = np.flatnonzero(~(np.abs(positions) <= SINGLE_MAX).all(axis=1))
+            numbers = "three numbers x,y,z in metres" if count == 3 else f"{count} numbers {','.join(header)}"
+            raise InputError(f"{path}: row {row}: {text[:60]!r}; give {numbers}") from None
+    bad = np.flatnonzero(~(np.abs(values) <= SINGLE_MAX).all(axis=1))
     if len(bad):
-        what = "is not finite" if not np.isfinite(positions[bad[0]]).all() else "is too large for single precision"
+        what = "is not finite" if not np.isfinite(values[bad[0]]).all() else "is too large for single precision"
         raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]][:60]!r} {what}; correct or remove the row")
-    return positions
+    return values
 
 
 def whole_number(path: Path, line: int, text: str) -> int:
@@ -207,11 +243,27 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
     return np.array(list(seen), np.int64) - first
 
 
+def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
+    """Refuse to write a record with parts of these names, which a layout does not state.
+
+    Raises:
+        InputError: naming the first that the record has.
+    """
+    for name in names:
+        if getattr(record, name) is not None:
+            remedy = f"set Record.{name} to None, or use another layout"
+            raise InputError(f"{path}: {record.name} has {name}, which this layout does not state; {remedy}")
+
+
 def write_lines(path: Path, lines: list[str]) -> None:
     """Write lines of text, each ended."""
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
-def write_positions(path: Path, positions_m: FloatArray) -> None:
-    """Write positions [n, 3] as `read_positions` reads them, to the last digit."""
-    write_lines(path, ["x,y,z", *(",".join(repr(float(v)) for v in position) for position in positions_m)])
+def write_positions(path: Path, positions_m: FloatArray, carriers_hz: FloatArray | None = None) -> None:
+    """Write positions [n, 3] and carriers [n] as `read_positions_and_carriers` reads them, to the last digit."""
+    header: tuple[str, ...] = AXES
+    values = positions_m
+    if carriers_hz is not None:
+        header, values = (*AXES, FREQUENCY), np.column_stack([positions_m, carriers_hz])
+    write_lines(path, [",".join(header), *(",".join(repr(float(v)) for v in row) for row in values)])

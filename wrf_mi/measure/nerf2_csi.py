@@ -43,6 +43,7 @@ from .folder_files import (
     read_official,
     read_positions,
     read_yaml,
+    refuse_unstated,
     shown,
     unit_quaternion,
     write_lines,
@@ -122,6 +123,7 @@ def write_nerf2_csi(
     if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
         need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
         raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
+    refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz")
     receiver = record.receivers[0]
     info: dict[str, Any] = {
         "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),

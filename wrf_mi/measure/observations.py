@@ -23,8 +23,8 @@ def check_observations(record: Record, split: Split, complete: bool = False) -> 
         complete: refuse these too, for a model that is trained at every receiver on every row.
 
     Raises:
-        InputError: a receiver without any training row; an observation of a training row that is not finite; an uplink
-            of any row that is not finite, or all zero.
+        InputError: a receiver without any training row, also at one of several carriers; an observation of a training
+            row that is not finite; an uplink of any row that is not finite, or all zero.
     """
     known = split.all_train
     states = [_states(observed, known) for observed in record.observation]
@@ -35,6 +35,14 @@ def check_observations(record: Record, split: Split, complete: bool = False) -> 
                     f"{place_of(record)}, receiver {receiver.name}: received none of {len(known)} training rows; "
                     "leave it out or use another split"
                 )
+    if record.carriers_hz is not None:
+        for carrier in np.unique(record.carriers_hz[np.concatenate([known, split.test])]):
+            own = record.carriers_hz[known] == carrier
+            for receiver, (missing, _) in zip(record.receivers, states, strict=True):
+                if missing[own].all():
+                    text = f"received none of {own.sum()} training rows at {carrier:.10g} Hz"
+                    remedy = "leave that carrier out or use another split"
+                    raise InputError(f"{place_of(record)}, receiver {receiver.name}: {text}; {remedy}")
     for receiver, observed, (missing, broken) in zip(record.receivers, record.observation, states, strict=True):
         bad = np.flatnonzero(missing | broken if complete else broken)
         if len(bad):

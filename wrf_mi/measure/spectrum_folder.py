@@ -9,7 +9,8 @@ Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
   and ``tx_antenna`` beside these, with ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with
   ``frame`` too; see `wrf_mi.core.Antenna`; the default is isotropic and vertical in the world). ``dataset_name`` and
   other plain values beside them are not used.
-- ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row.
+- ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row. Optional and ours: a fourth column
+  ``frequency_hz``, the carrier of the row, in place of that in ``gateway_info.yml``.
 - ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
   row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
   lie in ``spectrum/<receiver's name>/``.
@@ -42,8 +43,9 @@ from .folder_files import (
     finite_numbers,
     read_antenna,
     read_official,
-    read_positions,
+    read_positions_and_carriers,
     read_yaml,
+    refuse_unstated,
     shown,
     unit_quaternion,
     whole_number,
@@ -80,10 +82,14 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     gateways = folder / GATEWAYS
     info = read_yaml(gateways)
     receivers = _receivers(gateways, info, _array(gateways, info, "array"))
-    positions = read_positions(folder / POSITIONS)
+    positions, carriers = read_positions_and_carriers(folder / POSITIONS)
+    stated = _frequency(gateways, info)
+    if stated is not None and carriers is not None:
+        text = f"line 1: column frequency_hz, but {GATEWAYS} states a carrier too"
+        raise InputError(f"{folder / POSITIONS}: {text}; remove one of them")
     images = folder / "spectrum"
     places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
-    return Record(
+    record = Record(
         name=name or folder.resolve().name,
         task="spectrum",
         tx_pos_m=positions,
@@ -91,10 +97,11 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         observation=_read_images(places, len(positions)),
         official=read_official(folder, len(positions), first=1),
         folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
-        frequencies_hz=_frequency(gateways, info),
+        frequencies_hz=stated,
         tx_antenna=read_antenna(gateways, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS),
         source=str(folder),
     )
+    return record if carriers is None else record.at_carriers(carriers)
 
 
 def write_spectrum_folder(
@@ -114,7 +121,8 @@ def write_spectrum_folder(
         extra: further files to put into the folder, by their place in it.
 
     Raises:
-        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1 or several carriers.
+        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1, or what the layout
+            does not state: truth, headings, or frequencies of subcarriers.
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
@@ -127,8 +135,9 @@ def write_spectrum_folder(
     for name in (receiver.name for receiver in record.receivers if receiver.name in RESERVED):
         raise InputError(f"{path}: a receiver is named {name!r}, which means something else in {GATEWAYS}; rename it")
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
-        text = f"{record.name} has {len(record.frequencies_hz)} carriers, and {GATEWAYS} states one"
-        raise InputError(f"{path}: {text}; write a folder for each")
+        text = f"{record.name} has {len(record.frequencies_hz)} carriers for all rows, and {GATEWAYS} states one"
+        raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
+    refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
     grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
     with atomic_folder(Path(path), replace) as part:
         several = len(record.receivers) > 1
@@ -141,7 +150,7 @@ def write_spectrum_folder(
         content = {"dataset_name": record.name, **entries, **_instrument(record)}
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        write_positions(part / POSITIONS, record.tx_pos_m)
+        write_positions(part / POSITIONS, record.tx_pos_m, record.carriers_hz)
         if record.official is not None:
             for file, index in zip(INDEX_FILES, record.official, strict=True):
                 write_lines(part / file, [f"{row + 1:05d}" for row in index])
@@ -188,7 +197,7 @@ def _instrument(record: Record) -> dict[str, Any]:
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
-    """The one carrier, wherever the file states it: for all receivers, or in the entries of these."""
+    """The one carrier of all rows, wherever the file states it: for all receivers, or in the entries of these."""
     stated = {key: info[key] for key in CARRIER_KEYS if key in info}
     for name, entry in info.items():
         if isinstance(entry, dict):
@@ -206,8 +215,10 @@ def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
             carriers[frequency_hz] = where
     if len(carriers) > 1:
         (a, first), (b, second) = list(carriers.items())[:2]
-        text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this layout has one"
-        raise InputError(f"{path}: {text}; make a folder for each")
+        text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
+        raise InputError(
+            f"{path}: {text}; give those of rows in {POSITIONS}, column frequency_hz, or make a folder for each"
+        )
     return np.array(list(carriers)) if carriers else None
 
 

@@ -194,6 +194,7 @@ class Model:
         scene: whether it takes a scene.
         uses_antennas: whether patterns and polarisations of antennas count in that scene.
         scene_alone: whether a scene predicts without training rows.
+        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from how the transmitter is turned.
         complete: whether it needs every receiver's observation of every training row.
@@ -216,6 +217,7 @@ class Model:
     scene: Literal["none", "optional", "required"] = "none"
     uses_antennas: bool = True
     scene_alone: bool = False
+    several_carriers: bool = False
     uplink: Literal["none", "optional", "required"] = "none"
     headings: bool = False
     complete: bool = False
@@ -267,4 +269,5 @@ def model_of(method: Method) -> Model:
 
     needed: Any = "required" if method.needs_uplink else "optional"
     ends = fit, load, method.source
-    return Model(method.name, method.tasks, method.settings, *ends, uplink=needed, headings=True)
+    kept: dict[str, Any] = {"uplink": needed, "several_carriers": method.several_carriers}
+    return Model(method.name, method.tasks, method.settings, *ends, **kept, headings=True)

@@ -23,14 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..baselines.method import Inputs
-from ..core import InputError, Prediction, Split
+from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
+from ..core.carriers import carriers_text
 from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
 from ..fit.config import calibration_config
 from ..hybrid.corrected import check_materials, write_corrected_scene
+from ..measure.observations import place_of
 from ..parallel import Scheduler, row_parts
+from ..receive.instruments import Instrument
 from ..tasks import instrument_of, task_of
 from ..trace import TraceOptions, TraceResult, load_trace, save_trace
 from ..trace.offsets import Offsets, fit_offsets
@@ -114,10 +117,10 @@ class FittedTracing(Fitted):
         problem = self._problem
         assert problem.scene is not None
         options = replace(problem.settings.options, rays=int(self._arrays["rays"]))
-        return RayTracer(problem.scene, instrument_of(problem.record), options, problem.material)
+        return RayTracer(problem.scene, _instrument(problem.record), options, problem.material)
 
     def _reported(self, traced: TraceResult) -> NDArray[Any]:
-        observed = self._tracer.instrument.observe(traced.paths)
+        observed = self._tracer.observe(traced)
         return observed if self._offsets is None else self._offsets(observed)
 
     @cached_property
@@ -136,7 +139,8 @@ class FittedTracing(Fitted):
         """
         # One receiver after the other is asked for; the same one again means anew, as where predictions are timed.
         if self._last is None or receiver in self._last[2] or not _same(self._last[0], inputs):
-            traced = self._tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row)
+            ends = inputs.first_row, inputs.carriers_hz
+            traced = self._tracer.trace(inputs.tx_pos_m, False, *ends)
             self._last = inputs, self._reported(traced), set()
         self._last[2].add(receiver)
         return Prediction(self._last[1][receiver])
@@ -152,8 +156,14 @@ class FittedTracing(Fitted):
 
 
 def _same(one: Inputs, other: Inputs) -> bool:
-    pairs = (one.tx_pos_m, other.tx_pos_m), (one.tx_heading_rad, other.tx_heading_rad)
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("tx_pos_m", "tx_heading_rad", "carriers_hz")]
     return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+
+
+def _instrument(record: Record) -> Instrument:
+    """The instrument behind a record, where rows have several carriers at the first row's."""
+    carriers = record.carriers_hz
+    return instrument_of(record if carriers is None else record.at_carrier(carriers[0]))
 
 
 class FittedCalibration(FittedField):
@@ -205,7 +215,7 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     record, path, start = problem.record, session.run / PATHS, time.perf_counter()
     assert problem.scene is not None
     settings: TracingSettings = problem.settings
-    tracer = RayTracer(problem.scene, instrument_of(record), settings.options, problem.material)
+    tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
     if path.exists():
         traced = load_trace(path)
     else:
@@ -219,7 +229,7 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     arrays = {name: np.asarray(value) for name, value in facts.items()}
     known = split.all_train
     if task_of(record).in_decibel:
-        offsets = fit_offsets(tracer.instrument.observe(traced.paths)[:, known], record.observation[:, known])
+        offsets = fit_offsets(tracer.observe(traced)[:, known], record.observation[:, known])
         arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
     fitted = FittedTracing(problem, arrays, path)
     fitted.train_seconds = 0.0
@@ -237,15 +247,15 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
 
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
     """Paths of all positions; each part with the number of rays that all of them settle on."""
-    tx_pos_m, scheduler = problem.record.tx_pos_m, session.scheduler
+    tx_pos_m, carriers, scheduler = problem.record.tx_pos_m, problem.record.carriers_hz, session.scheduler
     if scheduler is None:
-        return tracer.trace(tx_pos_m, session.progress)
+        return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
     assert problem.scene is not None
     rays = tracer.rays(tx_pos_m)
     parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_AT_ONCE)
     ends = tracer.instrument, replace(tracer.options, rays=rays), problem.material
-    given = [(tx_pos_m[part], part.start) for part in parts]
-    sizes = [len(positions) for positions, _ in given]
+    given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
+    sizes = [len(positions) for positions, *_ in given]
     opener = partial(RayTracer, problem.scene, *ends)
     found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
     return replace(join_traces(found), options=tracer.options)
@@ -257,8 +267,8 @@ def _least(tracer: RayTracer, tx_pos_m: FloatArray, scheduler: Scheduler) -> int
     return max(TRACED_AT_LEAST, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
 
 
-def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int]) -> TraceResult:
-    return tracer.trace(part[0], first_row=part[1])
+def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None]) -> TraceResult:
+    return tracer.trace(part[0], first_row=part[1], carriers_hz=part[2])
 
 
 def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
@@ -279,7 +289,15 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse a scene that cannot be opened, and what cannot be calibrated."""
+    """Refuse a scene that cannot be opened at every carrier, and what cannot be calibrated or chosen."""
+    settings, carriers = problem.settings, problem.record.carriers_hz
+    if carriers is not None:
+        if settings.calibration is not None or settings.target_error_db is not None:
+            text = "calibration and target_error_db serve one carrier; leave them away"
+            raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
+        for carrier_hz in np.unique(carriers):
+            problem.open_scene(float(carrier_hz))
+        return
     if problem.settings.calibration is not None:
         check_field(_graph_problem(problem), splits)
         if _moves_planes(problem):
@@ -295,6 +313,7 @@ MODEL = Model(
     load,
     "Hoydis et al., 'Sionna RT' (2023)",
     scene="required",
+    several_carriers=True,
     check=check,
     prepare=prepare,
 )

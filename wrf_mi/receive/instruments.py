@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ..core import Antenna, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
+from ..core.carriers import by_carrier
+from ..core.types import IntArray
 from .array import bartlett_spectrum, minmax_scale
 from .channel import antenna_csi, csi, element_signals, rssi_dbm
 
@@ -38,6 +40,18 @@ class Instrument(ABC):
     @abstractmethod
     def observe(self, paths: Paths) -> NDArray[Any]:
         """What the receivers report of traced paths, [n_rx, n_tx, ...] as in a record of the task."""
+
+    def observe_rows(self, paths: Paths, carriers_hz: FloatArray | None) -> NDArray[Any]:
+        """`observe` where each transmitter has the carrier in Hz of ``carriers_hz`` [n_tx]; None: the instrument's."""
+        if carriers_hz is None:
+            return self.observe(paths)
+
+        def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
+            own = paths.select(np.isin(paths.tx, rows))
+            own = replace(own, tx=np.searchsorted(rows, own.tx), n_tx=len(rows))
+            return replace(self, frequencies_hz=np.array([carrier_hz])).observe(own)
+
+        return by_carrier(carriers_hz, of_carrier, axis=1)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
+from ..core.carriers import FREQUENCY
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
 from ..measure.observations import scorable
@@ -77,6 +78,7 @@ def evaluate(
         "prediction": np.stack([predict(rows, r) for r in range(len(truth))]).astype(truth.dtype),
         "truth": truth,
         "tx_pos": record.tx_pos_m[rows],
+        **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
         **{reference_key(key): values for key, values in reference_predictions(record, known, rows).items()},
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
@@ -124,7 +126,8 @@ def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, 
     """
     blocks, every = zip(*parts, strict=True)
     task = blocks[0]["task"]
-    arrays = {key: np.concatenate([a[key] for a in every]) for key in ("row", "tx_pos")}
+    shared = [key for key in ("row", "tx_pos", FREQUENCY) if key in every[0]]
+    arrays = {key: np.concatenate([a[key] for a in every]) for key in shared}
     known = ("prediction", "truth", "std", *(reference_key(key) for key in _stored(TASKS[task], every[0])))
     for key in (key for key in known if key in every[0]):
         arrays[key] = np.concatenate([a[key] for a in every], axis=1)
@@ -146,7 +149,8 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
 def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     """Write predictions as ``.npz``, observations without their first axis where there is one receiver.
 
-    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``receiver_name`` [n_rx]. ``prediction`` and, where they are
+    ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
+    ``receiver_name`` [n_rx]. ``prediction`` and, where they are
     known, ``truth`` and ``reference_<name>``: grey in 0..1 [m, H, W] or [n_rx, m, H, W] float32, power in dBm [m] or
     [n_rx, m] float32 (NaN: not received), channel coefficients [m, k], or of several antennas [m, antennas, k],
     complex64, in either case with a first axis where there are several receivers. ``std``, where a method states it,
@@ -156,7 +160,7 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
         The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
-    shared = ("row", "tx_pos", "receiver_name")
+    shared = ("row", "tx_pos", FREQUENCY, "receiver_name")
     written = {k: v[0] if single and k not in shared else v for k, v in arrays.items()}
     write_arrays(path, written, compressed=True)
     return written

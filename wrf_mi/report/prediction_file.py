@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.carriers import FREQUENCY
 from ..core.files import write_atomically
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
@@ -48,11 +49,11 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
 
     Args:
         out: ``.npz``: as `wrf_mi.report.evaluate.write_predictions`. ``.csv``: one row for each position with columns
-            ``x``, ``y``, ``z`` in metres, ``heading_rad`` where headings were given, ``<receiver>_dbm`` for each
-            receiver and, where they are stated, standard deviations ``<receiver>_std_db``; a field is empty where
-            nothing is received.
-        arrays: ``row``, ``tx_pos``, ``receiver_name``, ``prediction`` and perhaps ``std``, with a first axis of the
-            receivers.
+            ``x``, ``y``, ``z`` in metres, ``heading_rad`` where headings were given, ``frequency_hz`` where carriers
+            were, ``<receiver>_dbm`` for each receiver and, where they are stated, standard deviations
+            ``<receiver>_std_db``; a field is empty where nothing is received.
+        arrays: ``row``, ``tx_pos``, ``receiver_name`` and perhaps ``frequency_hz``; ``prediction`` and perhaps
+            ``std``, with a first axis of the receivers.
         tx_heading_rad: yaw of each transmitter, [m], or None.
 
     Returns:
@@ -64,6 +65,8 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
     header, columns = ["x", "y", "z"], list(np.asarray(arrays["tx_pos"], float).T)
     if tx_heading_rad is not None:
         header, columns = [*header, HEADING], [*columns, np.asarray(tx_heading_rad, float)]
+    if FREQUENCY in arrays:
+        header, columns = [*header, FREQUENCY], [*columns, arrays[FREQUENCY]]
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in arrays:
             header, columns = [*header, *(f"{name}_{suffix}" for name in names)], [*columns, *arrays[key]]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..baselines.idw import InverseDistance
 from ..core import InputError, Record
+from ..core.carriers import by_carrier
 from ..core.types import IntArray
 from ..tasks import TASKS, UPLINK, Task
 from .results import Observations
@@ -63,6 +64,14 @@ def copied_uplink(record: Record, rows: IntArray) -> NDArray[np.complex64]:
 
 
 def _blend(task: Task, record: Record, known: IntArray, rows: IntArray) -> Observations:
+    carriers = record.carriers_hz
+    if carriers is not None:  # neighbours are rows of the same carrier
+
+        def of_carrier(carrier_hz: float, which: IntArray) -> Observations:
+            own = record.at_carrier(carrier_hz)
+            return _blend(task, own, known[carriers[known] == carrier_hz], rows[which])
+
+        return by_carrier(carriers[rows], of_carrier, axis=1)
     blends = []
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
         blend = InverseDistance(task.neighbours, softening_m=task.softening_m)

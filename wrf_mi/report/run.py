@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..baselines.checks import check_inputs
 from ..core import InputError, Prediction, Receiver, Record
+from ..core.angles import FloatArray
+from ..core.carriers import FREQUENCY, carriers_text
 from ..core.files import readable
 from ..core.receivers import receiver_index
 from ..fit.predictor import Predictor
@@ -116,6 +118,7 @@ class Run:
         receiver: int | str = 0,
         tx_heading_rad: ArrayLike | None = None,
         uplink: ArrayLike | None = None,
+        carriers_hz: ArrayLike | None = None,
     ) -> Prediction:
         """What a receiver observes.
 
@@ -124,6 +127,7 @@ class Run:
             receiver: name, or number from 0.
             tx_heading_rad: how the transmitter is turned, [m]; None: unknown.
             uplink: uplink channels [m, antennas, subcarriers]; None: unknown.
+            carriers_hz: carrier of each position [m], Hz, where the data have several; else None.
 
         Returns:
             Observations [m, ...] as in `wrf_mi.core.Record` and, where the model states them, standard deviations.
@@ -137,7 +141,8 @@ class Run:
         unknown = np.full((0 if up is None else len(up), 3), np.nan)
         positions = unknown if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
         heading = None if tx_heading_rad is None else np.atleast_1d(np.asarray(tx_heading_rad, float))
-        return self.predict_inputs(Inputs(positions, heading, up), index)
+        carriers = None if carriers_hz is None else np.atleast_1d(np.asarray(carriers_hz, float))
+        return self.predict_inputs(Inputs(positions, heading, up, carriers_hz=carriers), index)
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
         """What the receiver of that index observes, see `predict`."""
@@ -157,11 +162,23 @@ class Run:
             if heading.shape != (len(inputs),) or not np.isfinite(heading).all():
                 text = f"{len(inputs)} positions and headings {heading.shape}; give one finite heading for each"
                 raise InputError(f"{self.folder}: {text}")
+        if model.several_carriers or inputs.carriers_hz is not None:
+            self._check_carriers(inputs)
         if model.uplink == "none":
             if inputs.uplink is not None:
                 raise InputError(f"{self.folder}: {UNUSED_UPLINK}")
         elif inputs.uplink is not None or model.needs_uplink:
             check_inputs(inputs, self.problem.record, model)
+
+    def _check_carriers(self, inputs: Inputs) -> None:
+        known, asked = self.problem.record.carriers_hz, inputs.carriers_hz
+        if known is None and asked is not None:
+            raise InputError(f"{self.folder}: its data have one carrier; leave {FREQUENCY} away")
+        if known is not None and asked is None:
+            raise InputError(f"{self.folder}: its data have {carriers_text(known)}; give {FREQUENCY} for each position")
+        if asked is not None and not (asked.shape == (len(inputs),) and (np.isfinite(asked) & (asked > 0)).all()):
+            text = f"{len(inputs)} positions and carriers {asked.shape}; give one positive {FREQUENCY} for each"
+            raise InputError(f"{self.folder}: {text}")
 
 
 def load_part(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
@@ -199,6 +216,7 @@ def predict_to_file(
     scheduler: Scheduler | None = None,
     operator: bool = True,
     uplink: NDArray[Any] | None = None,
+    carriers_hz: FloatArray | None = None,
 ) -> dict[str, tuple[int, ...]]:
     """What a run's model predicts at new transmitter positions, as an ``.npz`` or ``.csv`` file.
 
@@ -214,6 +232,7 @@ def predict_to_file(
             set and scene under the same names.
         operator: learned fields predict by operator where they can.
         uplink: uplink channels [m, antennas, subcarriers], for models that predict from them.
+        carriers_hz: carrier of each position [m], Hz, where the data have several; also in the file, ``frequency_hz``.
 
     Returns:
         Shape of each array that ``.npz`` has.
@@ -223,7 +242,8 @@ def predict_to_file(
             without, no headings for a model that needs them, or a file name with another suffix or of a form that
             does not hold what the run predicts.
     """
-    path, asked = Path(folder), Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink)
+    path = Path(folder)
+    asked = Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink, carriers_hz=carriers_hz)
     run = open_run(path, operator=operator)
     check_prediction_file(Path(out), path)
     run.check_inputs(asked)
@@ -240,6 +260,8 @@ def predict_to_file(
         "tx_pos": asked.tx_pos_m,
         "receiver_name": np.asarray(names[0]),
     }
+    if carriers_hz is not None:
+        arrays[FREQUENCY] = carriers_hz
     if stds[0] is not None:
         arrays["std"] = np.concatenate(stds, axis=1).astype(np.float32)
     written = write_prediction_file(Path(out), arrays, tx_heading_rad)

@@ -10,6 +10,7 @@ import numpy as np
 from ..baselines.method import Inputs
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines
 
 HEADING = "heading_rad"
@@ -22,9 +23,9 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
     """Positions [m, 3] in metres and what else the file tells; without positions they are NaN.
 
     Args:
-        csv_file: with columns x, y, z and perhaps heading_rad; or
-        npz_file: with arrays ``tx_pos`` [m, 3] and perhaps ``heading_rad`` [m], or with ``uplink`` [m, antennas,
-            subcarriers] and perhaps these.
+        csv_file: with columns x, y, z and perhaps heading_rad and frequency_hz; or
+        npz_file: with arrays ``tx_pos`` [m, 3] and perhaps ``heading_rad`` [m] and ``frequency_hz`` [m], or with
+            ``uplink`` [m, antennas, subcarriers] and perhaps these.
 
     Raises:
         InputError: the file is missing, or a row is not made of finite numbers.
@@ -52,6 +53,11 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
         raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
     if heading is not None and (heading.shape != (len(positions),) or not np.isfinite(heading).all()):
         raise InputError(f"{path}: {HEADING} must be one finite number (rad) for each position; correct it")
+    carriers = inputs.carriers_hz
+    if carriers is not None and not (
+        carriers.shape == (len(positions),) and ((carriers > 0) & np.isfinite(carriers)).all()
+    ):
+        raise InputError(f"{path}: {FREQUENCY} must be one positive number (Hz) for each position; correct it")
     return inputs
 
 
@@ -63,16 +69,17 @@ def _from_csv(path: Path) -> Inputs:
     header = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "z"} <= set(header):
         raise InputError(f"{path}: header {','.join(header)[:40]!r} lacks x, y, z; make it the first line")
-    turned = HEADING in header
-    columns, values = [header.index(name) for name in ("x", "y", "z", *([HEADING] if turned else []))], []
+    more = [name for name in (HEADING, FREQUENCY) if name in header]
+    columns, values = [header.index(name) for name in ("x", "y", "z", *more)], []
     for number, row in enumerate(rows[1:], start=1):
         try:
             values.append([float(row[c]) for c in columns])
         except (ValueError, IndexError):
-            wanted = f"{len(columns)} numbers" if turned else "three numbers"
+            wanted = f"{len(columns)} numbers" if more else "three numbers"
             raise InputError(f"{path}, row {number}: {','.join(row)[:60]!r} is not {wanted}; correct it") from None
     table = np.asarray(values, float).reshape(-1, len(columns))
-    return Inputs(table[:, :3], table[:, 3] if turned else None)
+    own = dict(zip(more, table[:, 3:].T, strict=True))
+    return Inputs(table[:, :3], own.get(HEADING), carriers_hz=own.get(FREQUENCY))
 
 
 def _from_npz(path: Path) -> Inputs:
@@ -84,11 +91,13 @@ def _from_npz(path: Path) -> Inputs:
                 positions = np.full((len(uplink), 3), np.nan)
             else:
                 positions = np.asarray(arrays[POSITIONS], float)
-            heading = np.asarray(arrays[HEADING], float) if HEADING in arrays else None
+            heading, carriers = (
+                np.asarray(arrays[name], float) if name in arrays else None for name in (HEADING, FREQUENCY)
+            )
     except KeyError:
         raise InputError(f"{path}: no array tx_pos; store positions [m, 3] under that name") from None
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not readable as .npz ({one_line(error)}); write it with numpy.savez") from None
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise InputError(f"{path}: tx_pos has shape {list(positions.shape)}, expected [m, 3]; store x, y, z in metres")
-    return Inputs(positions, heading, uplink)
+    return Inputs(positions, heading, uplink, carriers_hz=carriers)

@@ -38,6 +38,8 @@ def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
     count = len(traced.tx_pos_m)
     chosen = np.unique(np.linspace(0, count - 1, min(SAMPLE, count)).round().astype(int))
     sample = traced.select(np.isin(traced.paths.tx, chosen))
+    if sample.carriers_hz is not None:  # both at the scene's carrier
+        sample = recompute(sample, scene)
     stated = _median_power(sample)
     turned = _median_power(recompute(sample, scene, rx_antennas=[one.antenna.turned for one in traced.receivers]))
     tiny = np.finfo(np.float32).tiny

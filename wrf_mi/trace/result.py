@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,9 @@ class TraceResult:
         options: as asked for.
         rays: that searched from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: the search went from receivers to transmitters.
-        frequency_hz: of the carrier.
+        frequency_hz: of the carrier at which they were searched for.
         tx_antenna: antenna of the transmitters.
+        carriers_hz: carrier of each transmitter [n_tx], of which the gains are; None: ``frequency_hz``.
     """
 
     paths: Paths
@@ -50,6 +51,7 @@ class TraceResult:
     from_receivers: bool
     frequency_hz: float
     tx_antenna: Antenna = ANTENNA
+    carriers_hz: FloatArray | None = None
 
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -120,7 +122,8 @@ def recompute(
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
         gain = path_gains(scene, surfaces, traced.legs(surfaces), traced.ends(), traced.rays)
-    return replace(traced, paths=replace(traced.paths, gain=gain), frequency_hz=float(scene.frequency[0]))
+    paths, hz = replace(traced.paths, gain=gain), float(scene.frequency[0])
+    return replace(traced, paths=paths, frequency_hz=hz, carriers_hz=None)
 
 
 def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
@@ -143,6 +146,7 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
         for p in parts
     ]
     joined = join(legs, first.primitives.shape[1]).select(order)
+    carriers = None if first.carriers_hz is None else np.concatenate([cast(FloatArray, p.carriers_hz) for p in parts])
     names = ("rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(part.paths, name) for part in parts])[order] for name in names
@@ -155,6 +159,7 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
         primitives=joined.face.astype(np.int32),
         probability=joined.probability,
         wedge=joined.wedge,
+        carriers_hz=carriers,
     )
 
 
@@ -170,6 +175,7 @@ def save_trace(file: str | Path, traced: TraceResult) -> Path:
         "from_receivers": traced.from_receivers,
         "frequency_hz": traced.frequency_hz,
         "tx_antenna": np.array(astuple(traced.tx_antenna)),
+        **({} if traced.carriers_hz is None else {"carriers_hz": traced.carriers_hz}),
     }
     return save_paths(file, traced.paths, extra | {f"wedge/{name}": values for name, values in traced.wedge.items()})
 
@@ -194,6 +200,7 @@ def load_trace(file: str | Path) -> TraceResult:
             bool(extra["from_receivers"]),
             float(extra["frequency_hz"]),
             Antenna(*map(str, extra["tx_antenna"])),
+            extra.get("carriers_hz"),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None

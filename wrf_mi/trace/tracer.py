@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.angles import FloatArray
+from ..core.carriers import by_carrier
+from ..core.types import IntArray
 from ..receive.instruments import Instrument
 from .options import DEFAULTS, TraceOptions
-from .result import TraceResult
+from .result import TraceResult, recompute
 from .scenes import open_scene
 from .solve import Prepared, keeps_direction, trace_paths
 
@@ -40,13 +45,45 @@ class RayTracer:
         """
         self.instrument = instrument
         self.options = options
-        self.scene = open_scene(scene, instrument.carrier_hz, material=material)
+        self._at = cache(partial(open_scene, scene, material=material))
+        self.scene = self._at(instrument.carrier_hz)
         self._prepared = Prepared(self.scene)
 
-    def trace(self, tx_pos_m: ArrayLike, progress: bool = False, first_row: int = 0) -> TraceResult:
-        """Paths from transmitter positions [n, 3] (metres), ``first_row`` and following, to all receivers."""
+    def trace(
+        self,
+        tx_pos_m: ArrayLike,
+        progress: bool = False,
+        first_row: int = 0,
+        carriers_hz: FloatArray | None = None,
+    ) -> TraceResult:
+        """Paths from transmitter positions to all receivers.
+
+        Args:
+            tx_pos_m: positions [n, 3], metres.
+            progress: show a bar on standard error.
+            first_row: what errors call the first position.
+            carriers_hz: carrier of each position [n], Hz, at which the scene's materials and the paths' gains are
+                taken; the paths are searched for once. None: the instrument's for all.
+
+        Raises:
+            InputError: a position inside a solid object, or a material that is not known at one of the carriers.
+        """
         ends = self.instrument.receivers, self.options, progress, self._prepared, first_row
-        return trace_paths(self.scene, tx_pos_m, *ends, self.instrument.tx_antenna)
+        traced = trace_paths(self.scene, tx_pos_m, *ends, self.instrument.tx_antenna)
+        if carriers_hz is None:
+            return traced
+
+        def gains(carrier_hz: float, which: IntArray) -> NDArray[Any]:
+            return recompute(traced.select(which), self._at(carrier_hz)).paths.gain
+
+        paths = traced.paths
+        if len(paths):
+            paths = replace(paths, gain=by_carrier(carriers_hz[paths.tx], gains))
+        return replace(traced, paths=paths, carriers_hz=carriers_hz)
+
+    def observe(self, traced: TraceResult) -> NDArray[Any]:
+        """What every receiver reports of traced paths, [n_rx, n, ...], each row at its carrier."""
+        return self.instrument.observe_rows(traced.paths, traced.carriers_hz)
 
     def rays(self, tx_pos_m: ArrayLike) -> int:
         """How many rays search if these positions [n, 3] (metres) are the first: ``"auto"`` is settled on them."""
@@ -56,4 +93,4 @@ class RayTracer:
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
         """What every receiver reports for transmitter positions [n, 3] (metres), [n_rx, n, ...]."""
-        return self.instrument.observe(self.trace(tx_pos_m).paths)
+        return self.observe(self.trace(tx_pos_m))

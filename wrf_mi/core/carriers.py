@@ -1,0 +1,40 @@
+"""Rows that were measured at several carriers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .angles import FloatArray
+from .types import IntArray
+
+FREQUENCY = "frequency_hz"
+"""Column of a file, or array, with the carrier of each row in Hz."""
+MOST_NAMED = 4
+
+
+def by_carrier(
+    carriers_hz: FloatArray, of_carrier: Callable[[float, IntArray], NDArray[Any]], axis: int = 0
+) -> NDArray[Any]:
+    """What is computed for the rows of each carrier in turn, put together in the order of the rows.
+
+    Args:
+        carriers_hz: of each row [m], Hz.
+        of_carrier: ``of_carrier(carrier_hz, rows)``: values of the rows of these numbers.
+        axis: of the values that counts rows.
+    """
+    every = [(carrier, np.flatnonzero(carriers_hz == carrier)) for carrier in np.unique(carriers_hz)]
+    found = np.concatenate([of_carrier(float(carrier), rows) for carrier, rows in every], axis=axis)
+    return np.take(found, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
+
+
+def carriers_text(carriers_hz: FloatArray) -> str:
+    """Which carriers rows have, in words, such as ``rows at 2 carriers, 920000000, 2440000000 Hz``."""
+    known = [f"{one:.10g}" for one in np.unique(carriers_hz)]
+    if len(known) == 1:
+        return f"rows at {known[0]} Hz"
+    named = ", ".join(known) if len(known) <= MOST_NAMED else f"{known[0]} to {known[-1]}"
+    return f"rows at {len(known)} carriers, {named} Hz"
