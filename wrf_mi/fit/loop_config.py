@@ -67,6 +67,24 @@ class LoopConfig:
         checked(self, RANGES)
 
 
+@dataclass(frozen=True)
+class LoopOptions:
+    """Settings of the loop (`LoopConfig`) of a model that may be trained; null: those that it begins with."""
+
+    steps: int | None = None
+    batch: int | None = None
+    hold_out: float | None = None
+    patience: int | None = None
+    checkpoint_every: int | None = None
+    log_every: int | None = None
+    validate_every: int | None = None
+
+    def chosen(self) -> list[str]:
+        """Those that are not null, as ``--set`` takes them."""
+        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(LoopOptions)}
+        return [f"{name}={value}" for name, value in values.items() if value is not None]
+
+
 Range = tuple[Callable[[float], bool], str]
 COUNT: Range = (lambda x: x >= 1, "1 or more")
 POSITIVE: Range = (lambda x: x > 0, "more than 0")
