@@ -28,10 +28,9 @@ import drjit as dr
 import numpy as np
 
 from ..backend.device import to_float, to_tensor
-from ..core import InputError
 from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear, relu
-from ..fit.loop_config import AdamConfig
+from ..fit.loop_config import COUNT, POSITIVE, AdamConfig, at_least
 from .conv import Grid, coarser, convolve, finer, instance_norm, resized
 from .coordinates import feature_count
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
@@ -74,23 +73,11 @@ class DcganSettings(NetworkSettings):
     scale_m: float = 1.0
     l1: float = 100.0
 
-    def __post_init__(self) -> None:
-        """Refuse what is no network.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        super().__post_init__()
-        if min(self.noise, self.hidden) < 1 or self.channels < 2**LEVELS or self.octaves < 0:
-            raise InputError(
-                f"dcgan: noise {self.noise}, hidden {self.hidden}, channels {self.channels}, octaves {self.octaves}; "
-                f"choose 1 or more (channels: {2**LEVELS} or more, octaves: 0 or more)"
-            )
-        if not (self.scale_m > 0 and self.l1 >= 0 and self.adversary_rate > 0):
-            raise InputError(
-                f"dcgan: scale_m {self.scale_m}, l1 {self.l1}, adversary_rate {self.adversary_rate}; "
-                "choose positive numbers"
-            )
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("noise", "hidden"), COUNT),
+        **dict.fromkeys(("scale_m", "adversary_rate"), POSITIVE),
+        "channels": at_least(2**LEVELS),
+    }
 
 
 def coarse_grid(shape: tuple[int, int], batch: int) -> Grid:

@@ -25,7 +25,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import drjit as dr
 import numpy as np
@@ -36,6 +36,7 @@ from ..core import InputError, Record, Split
 from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear
+from ..fit.loop_config import COUNT
 from ..fit.session import FitSession
 from .cross_band import bands_arrays, bands_from
 from .csi_bands import Bands, bands_of, relative_error, training_rows, uplink_of
@@ -76,6 +77,8 @@ class FireSettings(NetworkSettings):
     beta: float = 1e-4
     spacing_hz: float = 312.5e3
 
+    ranges = NetworkSettings.ranges | dict.fromkeys(("latent", "width", "row_batch"), COUNT)
+
     def __post_init__(self) -> None:
         """Refuse what is no network.
 
@@ -83,13 +86,8 @@ class FireSettings(NetworkSettings):
             InputError: naming the setting.
         """
         super().__post_init__()
-        if min(self.latent, self.width, self.row_batch) < 1 or not self.beta >= 0:
-            raise InputError(
-                f"fire: latent {self.latent}, width {self.width}, row_batch {self.row_batch}, beta {self.beta}; choose "
-                "1 or more, beta 0 or more"
-            )
-        if self.sample not in ("antenna", "row", "auto"):
-            raise InputError(f"fire: sample {self.sample!r}; choose antenna, row or auto")
+        if self.sample not in get_args(Sample):
+            raise InputError(f"setting sample: {self.sample!r}; choose from {', '.join(get_args(Sample))}")
 
 
 def samples_of(h: NDArray[Any], sample: str) -> NDArray[np.complex128]:

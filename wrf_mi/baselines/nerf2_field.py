@@ -18,7 +18,7 @@ from ..backend.device import to_tensor
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
-from ..fit.loop_config import AdamConfig
+from ..fit.loop_config import COUNT, AdamConfig
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
 from ..tasks import Task, task_of
@@ -71,6 +71,8 @@ class Nerf2Settings(NetworkSettings):
     tx_octaves: int = 4
     shared: bool = True
 
+    ranges = NetworkSettings.ranges | dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples"), COUNT)
+
     def __post_init__(self) -> None:
         """Refuse what is no march.
 
@@ -78,15 +80,8 @@ class Nerf2Settings(NetworkSettings):
             InputError: naming the setting.
         """
         super().__post_init__()
-        if min(self.rays, self.sphere_rays, self.sphere_batch, self.samples) < 1 or self.tx_octaves < 0:
-            raise InputError(
-                f"nerf2: {self.rays} rays, {self.sphere_rays} over the sphere, sphere_batch {self.sphere_batch}, "
-                f"{self.samples} samples, tx_octaves {self.tx_octaves}; choose 1 or more (octaves: 0 or more)"
-            )
-        if self.near_m < 0 or (self.far_m and self.far_m <= self.near_m):
-            raise InputError(
-                f"nerf2: rays from {self.near_m} m to {self.far_m} m; choose a far end behind the near one"
-            )
+        if self.far_m and self.far_m <= self.near_m:
+            raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..core.settings import settings_from
 from ..field.network import Weights
-from ..fit.loop_config import AdamConfig
+from ..fit.loop_config import COUNT, AdamConfig, at_least
 from ..fit.session import FitSession
 from .cross_band import PathSettings, bands_arrays, bands_from, choose, downlink
 from .csi_bands import Bands, uplink_of
@@ -64,6 +64,11 @@ class OptMLSettings(PathSettings, NetworkSettings):
     between: int = 3
     final: int = 5
 
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("rounds", "at_once", "width", "simulation.paths"), COUNT),
+        "simulation.channels": at_least(2),  # to learn from and to validate
+    }
+
     def __post_init__(self) -> None:
         """Refuse what is no search.
 
@@ -72,13 +77,6 @@ class OptMLSettings(PathSettings, NetworkSettings):
         """
         PathSettings.__post_init__(self)
         NetworkSettings.__post_init__(self)
-        if min(self.rounds, self.at_once, self.width, self.simulation.channels, self.simulation.paths) < 1:
-            raise InputError(
-                f"optml: {self.rounds} rounds of {self.at_once} paths, width {self.width}, "
-                f"{self.simulation.channels} channels of {self.simulation.paths} paths; choose 1 or more"
-            )
-        if self.simulation.channels < 2:
-            raise InputError("optml: 1 simulated channel; give two at least, to learn from and to validate")
 
 
 class OptML:

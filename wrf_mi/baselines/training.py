@@ -25,7 +25,7 @@ from ..field.recorded import Recorded
 from ..fit.adam import NonFiniteReport, Params, guarded_step, rated_params
 from ..fit.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ..fit.loop import Progress, TrainingLoop
-from ..fit.loop_config import AdamConfig, LoopConfig
+from ..fit.loop_config import POSITIVE, AdamConfig, LoopConfig
 from ..fit.schedule import plan
 from ..fit.session import FitSession
 from ..fit.state import FitState
@@ -48,6 +48,7 @@ class NetworkSettings(LoopConfig):
     hold_out: float = HOLD_OUT
     patience: int = 8
     optimiser: AdamConfig = field(default_factory=network_adam)
+    ranges = LoopConfig.ranges | {"optimiser.network": POSITIVE}
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
-from ..core import InputError
 from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear, relu
+from ..fit.loop_config import COUNT, POSITIVE, SHARE
 from .coordinates import feature_count
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
@@ -67,23 +67,11 @@ class VaeSettings(NetworkSettings):
     beta: float = 3e-2
     prior_share: float = 0.8
 
-    def __post_init__(self) -> None:
-        """Refuse what is no network.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        super().__post_init__()
-        if min(self.latent, self.width, self.last, self.pool) < 1 or self.octaves < 0:
-            raise InputError(
-                f"vae: latent {self.latent}, width {self.width}, last {self.last}, pool {self.pool}, "
-                f"octaves {self.octaves}; choose 1 or more (octaves: 0 or more)"
-            )
-        if not (self.noise > 0 and self.scale_m > 0 and self.beta >= 0 and 0 <= self.prior_share <= 1):
-            raise InputError(
-                f"vae: noise {self.noise}, scale_m {self.scale_m}, beta {self.beta}, prior_share {self.prior_share}; "
-                "choose positive numbers and a share up to 1"
-            )
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("latent", "width", "last", "pool"), COUNT),
+        **dict.fromkeys(("scale_m", "noise"), POSITIVE),
+        "prior_share": SHARE,
+    }
 
 
 def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
