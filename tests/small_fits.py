@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from wrf_mi.core import Record, Split
 from wrf_mi.core.settings import with_settings
@@ -23,6 +24,12 @@ QUICK = (
 
 def settings(*own: str, model: str = "wrf-gs+") -> TrainConfig:
     return with_settings(TrainConfig(model=model), [*QUICK, *own])
+
+
+def network_settings(kind: Any, steps: int, batch: int, rate: float = 1e-3, every: int = 0, **own: Any) -> Any:
+    """Settings of a network that is trained for few steps; its last fifth sees the validation rows."""
+    ends = (f"steps={steps}", f"batch={batch}", f"optimiser.network={rate}", f"validate_every={every or steps}")
+    return with_settings(kind(**own), [*ends, "optimiser.warm_up=20", "optimiser.averaging=0.98"])
 
 
 def official(record: Record) -> Split:

@@ -14,8 +14,9 @@ from calling import refused, stored
 from made_channels import ANTENNAS, SUBCARRIERS, channels
 
 from wrf_mi import models
-from wrf_mi.baselines.method import Inputs, Listen, Method
+from wrf_mi.baselines.method import Inputs, Method
 from wrf_mi.core import InputError, Record, Split
+from wrf_mi.fit.session import FitSession
 from wrf_mi.measure import load, write_nerf2_csi
 from wrf_mi.report.compare import compare
 from wrf_mi.report.results import read_run
@@ -55,7 +56,7 @@ class Turned:
         return {"angle": np.asarray(self.angle)}
 
 
-def fit_turned(record: Record, split: Split, settings: Any, seed: int, listen: Listen) -> Turned:
+def fit_turned(record: Record, split: Split, settings: Any, seed: int, session: FitSession) -> Turned:
     assert record.uplink is not None
     rows = split.all_train
     return Turned(float(np.angle((record.observation[0, rows] * record.uplink[rows].conj()).sum())))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
+from small_fits import network_settings
 
 from wrf_mi.backend import init
 
@@ -22,11 +23,12 @@ from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
 from wrf_mi.baselines.optml import OptMLSettings  # noqa: E402
 from wrf_mi.baselines.path_network import Simulation  # noqa: E402
 from wrf_mi.baselines.r2f2 import R2F2Settings  # noqa: E402
-from wrf_mi.baselines.training import Training  # noqa: E402
+from wrf_mi.baselines.training import network_adam  # noqa: E402
 from wrf_mi.baselines.uplink_paths import find_paths  # noqa: E402
 from wrf_mi.baselines.uplink_waves import waves_of  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.core.arrays import planar_array  # noqa: E402
+from wrf_mi.fit.session import FitSession  # noqa: E402
 from wrf_mi.tasks.scores import cea_db  # noqa: E402
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.4e9, 312.5e3, 26
@@ -39,20 +41,20 @@ some; a wrong path, or one of them missing, gives less than 30."""
 METHODS = {"linear": linear.METHOD, "fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
 """That need the uplink alone."""
 FIELDS = {"nerf2": nerf2.METHOD}
-QUICK = Training(steps=10, batch=8, rounds=2)
 SMALL = {
     "linear": LinearSettings(),
-    "fire": FireSettings(Training(steps=40, batch=32, rounds=2), sample="antenna", width=16, latent=4),
+    "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
     "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
     "optml": OptMLSettings(
-        training=Training(steps=4, batch=4, rounds=1),
+        steps=5,
+        batch=4,
         simulation=Simulation(channels=12, paths=2),
         width=4,
         rounds=1,
         wavefront="plane",
         max_distance_m=30.0,
     ),
-    "nerf2": Nerf2Settings(QUICK, Networks(layers=2, width=8), sphere_rays=8, samples=2),
+    "nerf2": Nerf2Settings(12, 8, networks=Networks(layers=2, width=8), sphere_rays=8, samples=2),
 }
 
 
@@ -123,9 +125,7 @@ def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
     h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.METHOD.fit(
-        record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, lambda what, share: None
-    )
+    fitted = r2f2.METHOD.fit(record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, FitSession())
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
     cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0), h[:, :, HALF:])
     assert cea.min() > EXACT_DB
@@ -136,7 +136,7 @@ def test_r2f2_without_elements_is_exact_where_delays_are_apart():
     delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
-    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, lambda what, share: None)
+    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, FitSession())
     record = record_of(h)
     cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0), h[:, :, HALF:])
     assert fitted.kind == "free"
@@ -148,7 +148,7 @@ def test_r2f2_finds_which_subcarriers_are_left_out():
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
     record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
-    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, lambda what, share: None)
+    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, FitSession())
     assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
 
 
@@ -188,8 +188,8 @@ def test_step_of_least_squares_goes_down_the_gradient(kind, elements):
 def test_fire_beats_copying_the_uplink(walk):
     truth, record = walk
     split = split_of(80, 16)
-    settings = FireSettings(Training(steps=300, batch=128, rate=2e-3, rounds=3), sample="antenna", width=64, latent=16)
-    fitted = fire.METHOD.fit(record, split, settings, 0, lambda what, share: None)
+    settings = network_settings(FireSettings, 375, 128, 2e-3, 100, sample="antenna", width=64, latent=16)
+    fitted = fire.METHOD.fit(record, split, settings, 0, FitSession())
     inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
     mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
     assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
@@ -197,13 +197,13 @@ def test_fire_beats_copying_the_uplink(walk):
 
 def test_a_row_without_downlink_leaves_fire_as_it_is(walk):
     truth, record = walk
-    split, settings = split_of(80, 16), FireSettings(Training(steps=60, batch=128, rounds=1), sample="row", width=32)
+    split, settings = split_of(80, 16), FireSettings(steps=75, sample="row", width=32)
     inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
     observation = record.observation.copy()
     observation[0, :2] = 0
     lost = replace(record, observation=observation)
     first, second = (
-        np.median(cea_db(fire.METHOD.fit(one, split, settings, 0, lambda what, share: None).predict(inputs, 0), down))
+        np.median(cea_db(fire.METHOD.fit(one, split, settings, 0, FitSession()).predict(inputs, 0), down))
         for one in (record, lost)
     )
     assert second > first - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
@@ -212,7 +212,7 @@ def test_a_row_without_downlink_leaves_fire_as_it_is(walk):
 def test_a_linear_map_beats_copying_the_uplink(walk):
     truth, record = walk
     split = split_of(80, 16)
-    fitted = linear.METHOD.fit(record, split, LinearSettings(), 0, lambda what, share: None)
+    fitted = linear.METHOD.fit(record, split, LinearSettings(), 0, FitSession())
     inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
     mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
     assert mine > copied + 10, "its phase alone, put right, gives 2 dB"
@@ -235,7 +235,7 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
     settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
     method, split = (METHODS | FIELDS)[name], split_of(30, 5)
-    fitted = method.fit(record, split, settings, 0, lambda what, share: None)
+    fitted = method.fit(record, split, settings, 0, FitSession())
     inputs = inputs_of(record, split.test)
     found = fitted.predict(inputs, 0)
     assert found.shape == (5, 6, HALF)
@@ -251,14 +251,16 @@ def test_optml_starts_close_enough_with_few_steps(elements):
     h = channels(*sparse(20, 3, rng), elements, spherical=False)
     record, split = record_of(noisy(h, 25, rng), elements), split_of(20, 8)
     settings = OptMLSettings(
-        training=Training(steps=100, batch=8, rate=5e-3, rounds=1),
+        steps=125,
+        batch=8,
+        optimiser=network_adam(5e-3),
         simulation=Simulation(channels=150, paths=4),
         width=16,
         wavefront="plane",
         rounds=2,
         max_distance_m=60.0,
     )
-    fitted = optml.METHOD.fit(record, split, settings, 0, lambda what, share: None)
+    fitted = optml.METHOD.fit(record, split, settings, 0, FitSession())
     cea = cea_db(fitted.predict(inputs_of(record, split.test), 0), h[split.test][:, :, HALF:])
     assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
 
@@ -267,7 +269,7 @@ def test_optml_starts_close_enough_with_few_steps(elements):
 def test_loaded_predicts_the_same(name, walk, tmp_path):
     _, record = walk
     split = split_of(80, 16)
-    fitted = METHODS[name].fit(record, split, SMALL[name], 0, lambda what, share: None)
+    fitted = METHODS[name].fit(record, split, SMALL[name], 0, FitSession())
     arrays = fitted.arrays()
     assert not any(key.startswith("run/") for key in arrays)
     np.savez(tmp_path / "a.npz", **arrays)
@@ -319,7 +321,7 @@ BAD = {
 )
 def test_bad_records_are_named(name, case, text, walk):
     with pytest.raises(InputError, match=text):
-        METHODS[name].fit(broken(walk[1], case), split_of(80), SMALL[name], 0, lambda what, share: None)
+        METHODS[name].fit(broken(walk[1], case), split_of(80), SMALL[name], 0, FitSession())
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -327,11 +329,11 @@ def test_one_row_is_too_few(name, walk):
     nothing = np.zeros(0, np.int64)
     split = Split("made", 0, np.array([0]), nothing, nothing)
     with pytest.raises(InputError, match="1 training row"):
-        METHODS[name].fit(walk[1], split, SMALL[name], 0, lambda what, share: None)
+        METHODS[name].fit(walk[1], split, SMALL[name], 0, FitSession())
 
 
 def test_bad_inputs_to_a_prediction_are_named(walk):
-    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, lambda what, share: None)
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
     where = np.full((2, 3), np.nan)
     with pytest.raises(InputError, match="without uplink"):
         fitted.predict(Inputs(where), 0)
@@ -342,5 +344,5 @@ def test_bad_inputs_to_a_prediction_are_named(walk):
 
 
 def test_a_dead_row_is_predicted_as_silence(walk):
-    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, lambda what, share: None)
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
     assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()

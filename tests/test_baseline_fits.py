@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
+from small_fits import network_settings
 
 from wrf_mi.backend import init
 
@@ -25,10 +26,10 @@ from wrf_mi.baselines.dcgan import DcganSettings  # noqa: E402
 from wrf_mi.baselines.method import Method, inputs_of  # noqa: E402
 from wrf_mi.baselines.nerf2 import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
-from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.baselines.vae import VaeSettings  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.core.arrays import planar_array  # noqa: E402
+from wrf_mi.fit.session import FitSession  # noqa: E402
 from wrf_mi.measure import load, make_splits  # noqa: E402
 from wrf_mi.receive.array import array_response, bartlett_spectrum, minmax_scale  # noqa: E402
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim  # noqa: E402
@@ -49,21 +50,21 @@ def needs(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(not (DATA / name).is_dir(), reason=f"WRF_MI_DATA names no folder with {name}/")
 
 
-def quiet(what: str, share: float) -> None:
-    assert 0 <= share <= 1
-
-
-def steps(count: int, batch: int = 8, rate: float = 3e-3) -> Training:
-    return Training(steps=count, batch=batch, rate=rate, warm_up=20, averaging=0.98, rounds=3)
-
-
 SMALL: dict[str, tuple[Method, Any]] = {
-    "vae": (vae.METHOD, VaeSettings(steps(400), latent=4, width=32, last=16, octaves=2)),
-    "dcgan": (dcgan.METHOD, DcganSettings(steps(250), noise=2, hidden=24, channels=16, octaves=2)),
+    "vae": (vae.METHOD, network_settings(VaeSettings, 500, 8, 3e-3, latent=4, width=32, last=16, octaves=2)),
+    "dcgan": (dcgan.METHOD, network_settings(DcganSettings, 310, 8, 3e-3, noise=2, hidden=24, channels=16, octaves=2)),
     "nerf2": (
         nerf2.METHOD,
-        Nerf2Settings(
-            steps(400, rate=5e-3), Networks(3, 48, 0, 2, 2), rays=200, sphere_rays=24, samples=2, tx_octaves=2
+        network_settings(
+            Nerf2Settings,
+            500,
+            8,
+            5e-3,
+            networks=Networks(3, 48, 0, 2, 2),
+            rays=200,
+            sphere_rays=24,
+            samples=2,
+            tx_octaves=2,
         ),
     ),
 }
@@ -95,7 +96,7 @@ def first_rows(record: Record, count: int) -> Split:
 def test_eight_spectra_are_fitted_and_kept(name: str):
     method, settings = SMALL[name]
     record = array_spectra()
-    fitted = method.fit(record, first_rows(record, 8), settings, 0, quiet)
+    fitted = method.fit(record, first_rows(record, 8), settings, 0, FitSession())
     asked = inputs_of(record, np.arange(8))
     found = fitted.predict(asked, 0)
     truth = record.observation[0, :8]
@@ -113,7 +114,7 @@ def test_eight_spectra_are_fitted_and_kept(name: str):
 def test_rows_outside_the_split_are_not_seen(name: str, two_gateways: Record):
     """Other spectra in held-out rows, and a row that one receiver did not receive, change nothing and break nothing."""
     method, settings = SMALL[name]
-    settings = replace(settings, training=replace(settings.training, steps=6))
+    settings = replace(settings, steps=8)
     train = np.arange(10)
     split = Split("some", 0, train[:8], train[8:], np.arange(10, 24))
     seen = two_gateways.observation.copy()
@@ -122,8 +123,8 @@ def test_rows_outside_the_split_are_not_seen(name: str, two_gateways: Record):
     other[:, 10:] = 1 - other[:, 10:]
     asked = inputs_of(two_gateways, np.arange(3))
     both = [
-        [method.fit(replace(two_gateways, observation=o), split, settings, 0, quiet).predict(asked, r) for r in (0, 1)]
-        for o in (seen, other)
+        [method.fit(one, split, settings, 0, FitSession()).predict(asked, r) for r in (0, 1)]
+        for one in (replace(two_gateways, observation=o) for o in (seen, other))
     ]
     np.testing.assert_allclose(both[0], both[1], atol=1e-3)
     assert np.isfinite(both[0]).all()
@@ -135,12 +136,12 @@ def test_what_cannot_be_learned_from_is_refused(name: str, one_gateway: Record):
     method, settings = SMALL[name]
     nowhere = replace(one_gateway, tx_pos_m=np.full_like(one_gateway.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="no position in row 0"):
-        method.fit(nowhere, first_rows(nowhere, 8), settings, 0, quiet)
+        method.fit(nowhere, first_rows(nowhere, 8), settings, 0, FitSession())
     nothing = replace(one_gateway, observation=np.full_like(one_gateway.observation, np.nan))
     with pytest.raises(InputError, match="gateway1 received no training row"):
-        method.fit(nothing, first_rows(nothing, 8), settings, 0, quiet)
+        method.fit(nothing, first_rows(nothing, 8), settings, 0, FitSession())
     with pytest.raises(InputError, match="one training row"):
-        method.fit(one_gateway, first_rows(one_gateway, 1), settings, 0, quiet)
+        method.fit(one_gateway, first_rows(one_gateway, 1), settings, 0, FitSession())
 
 
 @pytest.mark.parametrize(
@@ -172,9 +173,7 @@ def test_signal_strengths_of_two_receivers_beat_their_means():
     record = Record("made", "rssi", tx, receivers, power, frequencies_hz=np.array([2.4e9]))
     split = Split("some", 0, np.arange(50), np.arange(50, 60), np.arange(60, 80))
     method, settings = SMALL["nerf2"]
-    fitted = method.fit(
-        record, split, replace(settings, training=steps(300, rate=3e-3), sphere_batch=16, tx_octaves=1), 0, quiet
-    )
+    fitted = method.fit(record, split, replace(settings, steps=375, sphere_batch=16, tx_octaves=1), 0, FitSession())
     errors, of_means = [], []
     for r in (0, 1):
         truth = power[r, split.test]
@@ -221,8 +220,8 @@ def test_downlink_from_uplink_beats_the_uplink():
     rows = np.arange(len(record))
     split = Split("some", 0, rows[:200], rows[200:230], rows[230:])
     method, settings = SMALL["nerf2"]
-    chosen = replace(settings, training=steps(500), sphere_batch=64, sphere_rays=8)
-    fitted = method.fit(record, split, chosen, 0, quiet)
+    chosen = replace(settings, steps=625, sphere_batch=64, sphere_rays=8)
+    fitted = method.fit(record, split, chosen, 0, FitSession())
     asked, truth = inputs_of(record, split.test), record.observation[0, split.test]
     found = fitted.predict(asked, 0)
     assert found.shape == truth.shape
@@ -236,24 +235,24 @@ def test_downlink_from_uplink_beats_the_uplink():
         fitted.predict(replace(asked, uplink=None), 0)
     assert record.uplink is not None
     with pytest.raises(InputError, match="uplink of 1 antennas and a downlink of 2"):
-        method.fit(replace(record, uplink=record.uplink[:, :1]), split, chosen, 0, quiet)
+        method.fit(replace(record, uplink=record.uplink[:, :1]), split, chosen, 0, FitSession())
 
 
 def test_channels_by_position_keep_their_shape():
     record = replace(sparse_paths(12), uplink=None, uplink_hz=None)
-    settings = replace(SMALL["nerf2"][1], training=steps(4))
+    settings = replace(SMALL["nerf2"][1], steps=5)
     split = first_rows(record, 12)
-    fitted = nerf2.fit(record, split, settings, 0, quiet)
+    fitted = nerf2.fit(record, split, settings, 0, FitSession())
     found = fitted.predict(inputs_of(record, split.test), 0)
     assert found.shape == record.observation[0].shape
     assert found.dtype == np.complex64
     one = replace(record, observation=record.observation[:, :, 0])
-    assert nerf2.fit(one, split, settings, 0, quiet).predict(inputs_of(one, split.test), 0).shape == (12, 6)
+    assert nerf2.fit(one, split, settings, 0, FitSession()).predict(inputs_of(one, split.test), 0).shape == (12, 6)
 
 
 def test_networks_of_their_own_for_each_receiver(two_gateways: Record):
-    settings = replace(SMALL["nerf2"][1], training=steps(4), shared=False)
-    fitted = nerf2.fit(two_gateways, first_rows(two_gateways, 8), settings, 0, quiet)
+    settings = replace(SMALL["nerf2"][1], steps=5, shared=False)
+    fitted = nerf2.fit(two_gateways, first_rows(two_gateways, 8), settings, 0, FitSession())
     arrays = fitted.arrays()
     assert any(key.startswith("group1/") for key in arrays)
     asked = inputs_of(two_gateways, np.arange(2))
@@ -267,16 +266,16 @@ def test_networks_of_their_own_for_each_receiver(two_gateways: Record):
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
-        (vae.METHOD, VaeSettings(Training(steps=600, batch=8))),
-        (dcgan.METHOD, DcganSettings(Training(steps=600, batch=8, rate=2e-3))),
-        (nerf2.METHOD, Nerf2Settings(Training(steps=800, batch=8, rate=2e-3), rays=512)),
+        (vae.METHOD, VaeSettings(steps=750, batch=8)),
+        (dcgan.METHOD, DcganSettings(steps=750)),
+        (nerf2.METHOD, Nerf2Settings(steps=1000, batch=8, rays=512)),
     ],
     ids=["vae", "dcgan", "nerf2"],
 )
 def test_eight_measured_spectra_are_fitted(method: Method, settings: Any):
     record = load("rfid-lab")
     rows = make_splits(record, "official")[0].train[::18][:8]
-    fitted = method.fit(record, Split("few", 0, rows, rows[:0], rows), settings, 0, quiet)
+    fitted = method.fit(record, Split("few", 0, rows, rows[:0], rows), settings, 0, FitSession())
     assert np.median(ssim(fitted.predict(inputs_of(record, rows), 0), record.observation[0, rows])) > FITTED
 
 
@@ -286,7 +285,7 @@ def test_eight_measured_spectra_are_fitted(method: Method, settings: Any):
 def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
     record = load("rfid-lab")
     split = make_splits(record, "official")[0]
-    fitted = method.fit(record, split, method.settings(), 0, quiet)
+    fitted = method.fit(record, split, method.settings(), 0, FitSession())
     found = fitted.predict(inputs_of(record, split.test), 0)
     assert np.median(ssim(found, record.observation[0, split.test])) > MEAN_SPECTRUM
 
@@ -296,7 +295,7 @@ def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
 def test_measured_signal_strengths_are_as_near_as_those_of_a_log_distance_fit():
     record = load("flat-ble")
     split = make_splits(record, "official")[0]
-    fitted = nerf2.fit(record, split, Nerf2Settings(), 0, quiet)
+    fitted = nerf2.fit(record, split, Nerf2Settings(), 0, FitSession())
     errors = [
         abs_error_db(fitted.predict(inputs_of(record, split.test), r), record.observation[r, split.test])
         for r in range(len(record.receivers))

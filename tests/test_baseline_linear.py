@@ -11,6 +11,7 @@ from wrf_mi.baselines.csi_bands import relative_error
 from wrf_mi.baselines.linear import METHOD, PENALTIES, LinearMap, LinearSettings, choose
 from wrf_mi.baselines.method import Inputs, inputs_of
 from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.fit.session import FitSession
 from wrf_mi.tasks.conditions import normalised_uplink
 
 ROWS, ANTENNAS, UP, DOWN = 40, 3, 6, 5
@@ -47,7 +48,7 @@ def split_of(train: int = 24, validation: int = 6) -> Split:
 
 
 def fit(record: Record, split: Split, **settings: float) -> LinearMap:
-    fitted = METHOD.fit(record, split, LinearSettings(**settings), 0, lambda what, share: None)
+    fitted = METHOD.fit(record, split, LinearSettings(**settings), 0, FitSession())
     assert isinstance(fitted, LinearMap)
     return fitted
 
@@ -68,7 +69,8 @@ def test_the_penalty_of_the_validation_rows_and_all_training_rows() -> None:
     record, _ = linear_record(noise=1.5)
     split = split_of(8, 12)
     heard: list[float] = []
-    fitted = METHOD.fit(record, split, LinearSettings(), 0, lambda what, share: heard.append(share))
+    session = FitSession(listen=lambda stage, share, progress: heard.append(share))
+    fitted = METHOD.fit(record, split, LinearSettings(), 0, session)
     assert isinstance(fitted, LinearMap)
     assert heard[-1] == 1
     assert heard == sorted(heard)

@@ -15,7 +15,7 @@ init()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from wrf_mi.backend.device import to_tensor  # noqa: E402
+from wrf_mi.backend.device import to_float, to_tensor  # noqa: E402
 from wrf_mi.baselines.conv import (  # noqa: E402
     NORM_FLOOR,
     Grid,
@@ -30,9 +30,10 @@ from wrf_mi.baselines.coordinates import Coordinates  # noqa: E402
 from wrf_mi.baselines.dcgan import softplus  # noqa: E402
 from wrf_mi.baselines.nerf2_march import LEAK, Networks, Rays, constant_parts, look, march  # noqa: E402
 from wrf_mi.baselines.tensors import columns  # noqa: E402
-from wrf_mi.baselines.training import Descent, Training, epochs, fit_network  # noqa: E402
+from wrf_mi.baselines.training import Network, NetworkSettings, NetworkTrainer  # noqa: E402
 from wrf_mi.baselines.vae import elbo_loss, pooled  # noqa: E402
 from wrf_mi.core import InputError  # noqa: E402
+from wrf_mi.core.settings import with_settings  # noqa: E402
 from wrf_mi.fit.adam import NumericsError  # noqa: E402
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink  # noqa: E402
 
@@ -302,54 +303,59 @@ def test_softplus_at_both_ends():
 
 
 def quadratic(params: Any, data: Any, given: Any) -> Any:
-    """Squared distance from the mean of the drawn numbers, with a pole that ``given`` may ask for."""
+    """Squared distance from some numbers, with a pole that ``given`` may ask for."""
     return dr.sum(dr.square(params["x.bias"].array - data)) + given
 
 
-def test_a_step_that_is_not_finite_changes_nothing_and_is_told():
-    descent = Descent({"x.bias": np.ones(2, np.float32)}, quadratic, 0.5)
-    goal = mi.Float(3, -2)
-    for _ in range(200):
-        descent.step(goal, dr.opaque(mi.Float, 0), 0.1)
-    descent.require_finite()
-    np.testing.assert_allclose(descent.arrays()["x.bias"], [3, -2], atol=0.05)
-    before = descent.arrays()["x.bias"]
-    descent.step(goal, dr.opaque(mi.Float, np.nan), 0.1)
-    descent.step(mi.Float(9, 9), dr.opaque(mi.Float, 0), 0.1)
-    np.testing.assert_array_equal(descent.arrays()["x.bias"], before)
-    with pytest.raises(NumericsError, match="not finite"):
-        descent.require_finite()
+def trainer_of(goal: list[float], draw: Any, score: Any = None, *settings: str) -> NetworkTrainer:
+    """Numbers that start at 0 and are to reach ``goal``; of samples 0 to 9 the last two validate."""
+    rows = [np.arange(8)], [np.arange(10)]
+    start = {"x.bias": np.zeros(len(goal), np.float32)}
+    network = Network("x", start, quadratic, to_float(goal), draw, *rows, score, "distance")
+    own = ("optimiser.warm_up=1", "optimiser.averaging=0", "log_every=1000", *settings)
+    return NetworkTrainer(network, with_settings(NetworkSettings(), own), (0,))
+
+
+def test_a_step_that_is_not_finite_changes_nothing_and_is_named():
+    """It is the hundredth."""
+
+    def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
+        return dr.opaque(mi.Float, np.nan if trainer.state.step == 99 else 0.0)
+
+    trainer = trainer_of([3, -2], draw, None, "steps=200", "optimiser.network=0.1")
+    trainer.run(stop=lambda: trainer.state.step == 99)
+    before = trainer.state.params()["x.bias"], trainer.state.mean_params()["x.bias"]
+    np.testing.assert_allclose(before[1], [3, -2], atol=0.1)
+    with pytest.raises(NumericsError, match=r"^step 100: not finite: loss"):
+        trainer.run()
+    np.testing.assert_array_equal(trainer.state.params()["x.bias"], before[0])
+    np.testing.assert_array_equal(trainer.state.mean_params()["x.bias"], before[1])
 
 
 def test_steps_are_chosen_on_validation_and_all_rows_end_it():
-    """The validation score is best half-way; what is drawn from all rows comes last and pulls elsewhere."""
+    """The validation score is best after a quarter; what is drawn from all rows comes last and pulls elsewhere."""
     drawn = []
 
-    def draw(everything: bool) -> Any:
-        while True:
-            drawn.append(everything)
-            yield dr.opaque(mi.Float, 0)
+    def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
+        drawn.append(int(rows.max()))
+        return dr.opaque(mi.Float, 0)
 
     def score(params: Any) -> float:
         return abs(float(params["x.bias"].numpy()[0]) - 1.0)
 
-    descent = Descent({"x.bias": np.zeros(1, np.float32)}, quadratic, 0.0)
-    training = Training(steps=80, batch=1, rate=0.05, warm_up=1, averaging=0.0, rounds=4, refit=0.5)
-    weights, chosen = fit_network(descent, mi.Float(4), draw, score, training, lambda what, share: None)
+    own = ("steps=120", "batch=8", "optimiser.network=0.05", f"hold_out={80 / 120}", "validate_every=20")
+    trainer = trainer_of([4], draw, score, *own)
+    assert trainer.run()
     # Adam moves by about its rate a step: 1 after 20 steps.
-    assert chosen == 20
-    assert drawn == [False] * 80 + [True] * 10
-    assert 1.1 < weights["x.bias"][0] < 1.6
+    assert trainer.state.chosen == 20
+    assert trainer.state.best_score == pytest.approx(0, abs=0.1)
+    assert drawn[:80] == [7] * 80
+    assert len(drawn) == 80 + 10, "as many more as led there, in proportion"
+    assert max(drawn[80:]) == 9
+    assert 1.1 < trainer.state.mean_params()["x.bias"][0] < 1.6
 
 
-def test_batches_visit_every_row_equally():
-    batches = epochs(np.arange(5), 2, np.random.default_rng(0))
-    drawn = np.concatenate([next(batches) for _ in range(10)])
-    np.testing.assert_array_equal(np.bincount(drawn), [4] * 5)
-    assert len(next(epochs(np.arange(3), 8, np.random.default_rng(0)))) == 8
-
-
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"rate": 0.0}, {"averaging": 1.0}, {"refit": 0.0}, {"rounds": 0}])
-def test_training_that_is_none_is_refused(wrong: dict[str, Any]):
-    with pytest.raises(InputError, match="training"):
-        Training(**wrong)
+@pytest.mark.parametrize("wrong", ["steps=0", "optimiser.averaging=1", "hold_out=1.5", "validate_every=0", "batch=0"])
+def test_loops_that_are_none_are_refused(wrong: str):
+    with pytest.raises(InputError, match=r"^setting .* is out of range, choose"):
+        with_settings(NetworkSettings(), [wrong])

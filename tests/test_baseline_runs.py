@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ import yaml
 from calling import call, contents, copied, damaged_models_refused, refused, scored_again_as_before, stored
 from made_channels import channels
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Record
+from wrf_mi.fit.checkpoint import read_checkpoint
+from wrf_mi.fit.loop import Progress
 from wrf_mi.measure import load, make_splits, write_nerf2_csi
 from wrf_mi.report.compare import compare
 from wrf_mi.report.results import read_run
@@ -135,6 +138,61 @@ def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: P
         )
     assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
     assert sorted(read_run(resume(out).folder).row) == list(range(24))
+
+
+SHORT = ("steps=20", "checkpoint_every=8", "log_every=4", "validate_every=4", "optimiser.warm_up=2", "batch=6")
+TRAINED: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "vae": ("spectra", ("width=8", "last=8"), ("vae gateway1", "vae gateway2")),
+    "dcgan": ("spectra", ("hidden=4", "channels=8", "noise=2"), ("dcgan gateway1", "dcgan gateway2")),
+    "nerf2": ("spectra", ("rays=16", "samples=2", "networks.width=8", "networks.layers=2"), ("nerf2",)),
+    "fire": ("channels", ("sample=antenna", "width=8", "latent=2"), ("fire antenna",)),
+    "optml": ("channels", ("simulation.channels=30", "width=4", "rounds=1", "wavefront=plane"), ("paths",)),
+}
+"""Data, settings of a small version, and the networks that are trained in turn."""
+
+
+@pytest.mark.parametrize("name", list(TRAINED))
+def test_a_stopped_network_goes_on_to_the_same_bits(name: str, two_gateways: Record, tmp_path: Path) -> None:
+    """Stopped between two checkpoints of its last network, when the first of several has ended."""
+    data, own, networks = TRAINED[name]
+    record = two_gateways if data == "spectra" else channels()
+    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+    whole = train(record, tmp_path / "whole", name, **ends).folder
+    told: list[tuple[str, int]] = []
+
+    def listen(stage: str, share: float, progress: Progress | None) -> None:
+        if progress is not None:
+            told.append((stage, progress.step))
+
+    out = tmp_path / "run"
+    with pytest.raises(Interrupted, match=rf"stopped after step 12 of 20 of {networks[-1]}; .* --resume {out}"):
+        train(record, out, name, **ends, listen=listen, stop=lambda: told[-1:] == [(networks[-1], 12)])
+    assert (out / "checkpoint.npz").exists()
+    del told[:]
+    resume(out, record=record, listen=listen)
+    assert min(step for _, step in told) > 12, "no step is taken again"
+    assert {stage for stage, _ in told} == {networks[-1]}
+    assert not (out / "checkpoint.npz").exists()
+    with np.load(whole / "model.npz") as one, np.load(out / "model.npz") as other:
+        assert set(one) == set(other)
+        for key in set(one) - {"run/train_seconds"}:
+            np.testing.assert_array_equal(other[key], one[key], err_msg=key)
+
+
+def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record, tmp_path: Path) -> None:
+    _, own, networks = TRAINED["vae"]
+    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+
+    def kill(stage: str, share: float, progress: Progress | None) -> None:
+        if progress is not None and stage == networks[0] and progress.step == 16:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(two_gateways, tmp_path / "killed", "vae", **ends, listen=kill)
+    assert int(read_checkpoint(tmp_path / "killed")["step"]) == 8
+    resume(tmp_path / "killed", record=two_gateways)
+    train(two_gateways, tmp_path / "whole", "vae", **ends)
+    np.testing.assert_array_equal(stored(tmp_path / "killed")["prediction"], stored(tmp_path / "whole")["prediction"])
 
 
 def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

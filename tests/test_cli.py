@@ -277,11 +277,13 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
         watch.listen("training", 0.5, progress(step=20, validation_score=0.5))
         watch.listen("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
         watch.listen("fold2", 0.5, progress(step=20, validation_score=float("nan")))
+        watch.listen("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
         "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
         "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
+        "vae 20/40  loss 0.2500  SSIM 0.500 (validation rows)  1:01 left",
     ]
 
 

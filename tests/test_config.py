@@ -37,6 +37,7 @@ LARGEST = {
     "hold_out": 1.0,
     "structural_weight": 1.0,
     "initial.size_deg": 89.0,
+    "optimiser.cosine_start": 1.0,
     "optimiser.final": 1.0,
     "optimiser.averaging": 0.9999,
     "density.start": 1.0,
@@ -229,7 +230,7 @@ def test_ends_of_ranges_are_accepted(setting: str, value: float) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"stepz": 1}, "config.yaml, setting stepz: unknown; known here: model, steps,"),
+        ({"stepz": 1}, "config.yaml, setting stepz: unknown; known here: steps, batch,"),
         ({"density": {"evry": 1}}, "config.yaml, setting density.evry: unknown; known here: density.every,"),
         ({"density": 3}, "config.yaml, setting density: expected a mapping, got 3"),
         (None, "config.yaml, setting top: expected a mapping, got None"),

@@ -140,7 +140,7 @@ def test_a_deterministic_run_goes_on_on_the_cpu(tmp_path: Path, monkeypatch: pyt
 
 def test_a_deterministic_baseline_remembers_it(one_gateway: Record, tmp_path: Path) -> None:
     """Stopped before it was fitted, and resumed by a process with more threads."""
-    settings = ("training.steps=4", "training.rounds=1", "width=8", "last=8")
+    settings = ("steps=5", "width=8", "last=8")
     run = train(one_gateway, tmp_path / "run", "vae", settings=settings, deterministic=True).folder
     assert "deterministic: true" in (run / "config.yaml").read_text()
     fitted = np.load(run / "predictions.npz")["prediction"]

@@ -17,7 +17,6 @@ from wrf_mi.baselines import nerf2  # noqa: E402
 from wrf_mi.baselines.method import inputs_of  # noqa: E402
 from wrf_mi.baselines.nerf2_field import Nerf2Settings  # noqa: E402
 from wrf_mi.baselines.nerf2_march import Networks  # noqa: E402
-from wrf_mi.baselines.training import Training  # noqa: E402
 from wrf_mi.core import InputError, Receiver, Record, Split  # noqa: E402
 from wrf_mi.core.settings import with_settings  # noqa: E402
 from wrf_mi.field import FIELDS  # noqa: E402
@@ -25,6 +24,7 @@ from wrf_mi.field.gaussians import by_component  # noqa: E402
 from wrf_mi.fit.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from wrf_mi.fit.config import TrainConfig, default_config  # noqa: E402
 from wrf_mi.fit.predictor import TOGETHER, Predictor  # noqa: E402
+from wrf_mi.fit.session import FitSession  # noqa: E402
 from wrf_mi.fit.state import FitState  # noqa: E402
 from wrf_mi.fit.step import TrainingData, device_pose  # noqa: E402
 from wrf_mi.fit.targets import targets_of  # noqa: E402
@@ -240,12 +240,11 @@ def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
     record, weak = two_stations(), 2.0**-7
     fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
     split = halves(record)
-    quick = Training(steps=10, batch=8, rounds=1)
-    small = Nerf2Settings(training=quick, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
+    small = Nerf2Settings(steps=12, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
 
     def predicted(one: Record):
         if model == "nerf2":
-            kept = nerf2.METHOD.fit(one, split, small, 0, lambda what, share: None)
+            kept = nerf2.METHOD.fit(one, split, small, 0, FitSession())
             return kept.predict(inputs_of(one, split.test), 1)
         return fitted(one, split, f"model={model}", "view.components=2", "steps=10")(one.tx_pos_m[split.test], 1)
 
@@ -384,11 +383,11 @@ def test_receivers_without_a_pose_are_refused_where_positions_tell(model: str, l
     record = strengths()
     unknown = replace(record.receivers[1], **{lost: np.full(3 if lost == "position_m" else 4, np.nan)})
     record = replace(record, receivers=(record.receivers[0], unknown))
-    quick = Nerf2Settings(Training(steps=2, batch=4, rounds=1))
+    quick = Nerf2Settings(steps=3, batch=4)
 
     def fit():
         if model == "nerf2":
-            return nerf2.METHOD.fit(record, halves(record), quick, 0, lambda what, share: None)
+            return nerf2.METHOD.fit(record, halves(record), quick, 0, FitSession())
         return Trainer(record, halves(record), config(record, f"model={model}"))
 
     with pytest.raises(InputError, match=r"made: the pose of receiver rx1 is not known.*give its position") as error:

@@ -102,7 +102,7 @@ def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, mo
     asked = []
     monkeypatch.setattr(tables, "measure", lambda runs, row: asked.append(row.name) or made_row(row, 6.0))
     path = tmp_path / "tables" / f"{short_plan[0].name}.json"
-    path.write_text(path.read_text().replace("--model fire", "--model fire --set training.steps=1"))
+    path.write_text(path.read_text().replace("--model fire", "--model fire --set steps=1"))
     tables.tables(tmp_path, tmp_path / "runs")
     assert asked == [short_plan[0].name]
 

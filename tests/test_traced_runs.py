@@ -170,6 +170,11 @@ def test_calibration_is_kept_and_scores_again(
     assert not np.allclose(read.prediction, read_run(run).prediction, atol=0.1)
     assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
     assert evaluate_run(out, "random")["split"] == "random (rows unseen by official)"
+    for setting in ("steps=5", "patience=2"):
+        with pytest.raises(InputError, match=f"^setting {setting}: of a training, and nothing is calibrated"):
+            train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=[setting])
+    with pytest.raises(InputError, match=r"setting hold_out: 2\.0 is out of range, choose 0 to 1"):
+        train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=gain", "hold_out=2"])
     with pytest.raises(InputError, match="calibration everything: choose of gain, materials, planes, patterns, pose"):
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 
@@ -248,7 +253,7 @@ def test_train_and_trace_are_one_for_the_ray_tracer(
     named[-2] = tmp_path / "other"
     for wrong, message in (
         (named, "ray-tracing needs a scene; give --scene SCENE"),
-        ([*named, "--scene", room, "--set", "batch=1"], "unknown setting batch"),
+        ([*named, "--scene", room, "--set", "beta=1"], "unknown setting beta"),
         (["train", flat_folder, "--depth", "1", "--out", tmp_path / "other"], "belong to --model ray-tracing"),
     ):
         refused(wrong, message, capsys)

@@ -20,22 +20,22 @@ predicts spectra from positions, and has not released it. Chosen here:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from ..backend.device import to_float, to_tensor
-from ..core import InputError
+from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear, relu
+from ..fit.loop_config import COUNT, POSITIVE, AdamConfig, at_least
 from .conv import Grid, coarser, convolve, finer, instance_norm, resized
 from .coordinates import feature_count
-from .method import Listen
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
-from .training import Descent, Training, fit_network, opaque_rows
+from .training import Network, NetworkSettings, network_adam, opaque_rows
 
 LEVELS = 3
 """Convolutions of stride two in either network."""
@@ -48,11 +48,10 @@ AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class DcganSettings:
-    """Settings of the adversarial network.
+class DcganSettings(NetworkSettings):
+    """Settings of the adversarial network, beside those of the loop.
 
     Attributes:
-        training: how the generator learns.
         adversary_rate: the discriminator's learning rate.
         noise: numbers drawn from -1 to 1.
         hidden: neurons before the coarse grid.
@@ -62,7 +61,10 @@ class DcganSettings:
         l1: weight of the mean absolute difference against the adversarial term.
     """
 
-    training: Training = field(default_factory=lambda: Training(steps=1500, batch=8, rate=2e-3))
+    steps: int = 1875
+    batch: int = 8
+    validate_every: int = 188
+    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     adversary_rate: float = 2e-4
     noise: int = 8
     hidden: int = 64
@@ -71,22 +73,11 @@ class DcganSettings:
     scale_m: float = 1.0
     l1: float = 100.0
 
-    def __post_init__(self) -> None:
-        """Refuse what is no network.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        if min(self.noise, self.hidden) < 1 or self.channels < 2**LEVELS or self.octaves < 0:
-            raise InputError(
-                f"dcgan: noise {self.noise}, hidden {self.hidden}, channels {self.channels}, octaves {self.octaves}; "
-                f"choose 1 or more (channels: {2**LEVELS} or more, octaves: 0 or more)"
-            )
-        if not (self.scale_m > 0 and self.l1 >= 0 and self.adversary_rate > 0):
-            raise InputError(
-                f"dcgan: scale_m {self.scale_m}, l1 {self.l1}, adversary_rate {self.adversary_rate}; "
-                "choose positive numbers"
-            )
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("noise", "hidden"), COUNT),
+        **dict.fromkeys(("scale_m", "adversary_rate"), POSITIVE),
+        "channels": at_least(2**LEVELS),
+    }
 
 
 def coarse_grid(shape: tuple[int, int], batch: int) -> Grid:
@@ -170,109 +161,60 @@ def softplus(x: Any) -> Any:
     return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
 
 
-class Duel:
-    """Generator and discriminator that learn in turns; what is kept and predicts is the generator.
-
-    Args:
-        settings: of both.
-        shape: height and width of a spectrum.
-        rng: draws starting weights.
-        start: logit of each pixel that the generator starts near, [1]; a bias of its last layer.
-    """
-
-    def __init__(self, settings: DcganSettings, shape: tuple[int, int], rng: np.random.Generator, start: float) -> None:
-        s = self._settings = settings
-
-        def real_and_where(data: Any, given: Any) -> tuple[Any, Any]:
-            chosen = given["rows"]
-            pixels = shape[0] * shape[1]
-            slot = dr.arange(type(chosen), dr.width(chosen) * pixels)
-            index = dr.gather(type(chosen), chosen, slot // pixels) * pixels + slot % pixels
-            flat = data["truth"]
-            real = type(data["where"])(dr.gather(type(flat), flat, index), (1, dr.width(slot)))
-            return real, columns(data["where"], chosen)
-
-        def made(params: Mapping[str, Any], given: Any, where: Any) -> Any:
-            return generate(params, given["noise"], where, shape, s.channels)
-
-        def adversary_loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
-            real, where = real_and_where(data, given)
-            fake = dr.detach(made(given["other"], given, where))
-            right = dr.mean(softplus(-judge(params, real, where, shape)), axis=None)
-            return (right + dr.mean(softplus(judge(params, fake, where, shape)), axis=None)).array
-
-        def generator_loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
-            real, where = real_and_where(data, given)
-            fake = made(params, given, where)
-            fooled = dr.mean(softplus(-judge(given["other"], fake, where, shape)), axis=None)
-            return (fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
-
-        weights = generator_weights(s, shape, rng)
-        weights[f"g.{LEVELS - 1}.bias"] += np.float32(start)
-        averaging = s.training.averaging
-        self._generator = Descent(weights, generator_loss, averaging, MOMENTUM)
-        self._adversary = Descent(adversary_weights(s, rng), adversary_loss, averaging, MOMENTUM)
-
-    @property
-    def taken(self) -> int:
-        """Steps taken."""
-        return self._generator.taken
-
-    @property
-    def mean(self) -> dict[str, Any]:
-        """The generator's running mean."""
-        return self._generator.mean
-
-    def step(self, data: Any, given: Any, rate: float) -> Any:
-        """One step of each; the generator's loss."""
-        against = rate * self._settings.adversary_rate / self._settings.training.rate
-        self._adversary.step(data, given | {"other": self._generator.params}, against)
-        return self._generator.step(data, given | {"other": self._adversary.params}, rate)
-
-    def require_finite(self) -> None:
-        """Raise `NumericsError` where either was not finite."""
-        self._generator.require_finite()
-        self._adversary.require_finite()
-
-    def arrays(self) -> Weights:
-        """The generator's running mean, as NumPy arrays."""
-        return self._generator.arrays()
-
-    def state(self) -> Any:
-        """Of both, to go back to."""
-        return self._generator.state(), self._adversary.state()
-
-    def restore(self, state: Any) -> None:
-        """Go back."""
-        self._generator.restore(state[0])
-        self._adversary.restore(state[1])
-
-
 def generate_silent(params: Mapping[str, Any], s: DcganSettings, where: Any, shape: tuple[int, int]) -> Any:
     """Spectra without noise, a flat array."""
     return generate(params, dr.zeros(type(where), (s.noise, where.shape[1])), where, shape, s.channels).array
 
 
-def fit_receiver(own: ReceiverRows, s: DcganSettings, rng: np.random.Generator, listen: Listen) -> Weights:
-    """Weights of a receiver's generator."""
+def duel_loss(params: Mapping[str, Any], data: Any, given: Any, s: DcganSettings, shape: tuple[int, int]) -> Any:
+    """Loss of generator (``g``) plus that of discriminator (``d``), each of which differentiates its own alone.
+
+    Args:
+        params: weights of both.
+        data: ``truth``, spectra one after the other, and ``where`` [features, n].
+        given: ``rows`` [batch] and ``noise`` [k, batch] of the step.
+        s: settings.
+        shape: height and width of a spectrum.
+    """
+    chosen, flat, pixels = given["rows"], data["truth"], shape[0] * shape[1]
+    slot = dr.arange(type(chosen), dr.width(chosen) * pixels)
+    index = dr.gather(type(chosen), chosen, slot // pixels) * pixels + slot % pixels
+    real = type(data["where"])(dr.gather(type(flat), flat, index), (1, dr.width(slot)))
+    where = columns(data["where"], chosen)
+    fake = generate(params, given["noise"], where, shape, s.channels)
+    right = dr.mean(softplus(-judge(params, real, where, shape)), axis=None)
+    right += dr.mean(softplus(judge(params, dr.detach(fake), where, shape)), axis=None)
+    held = {name: dr.detach(values) for name, values in params.items()}
+    fooled = dr.mean(softplus(-judge(held, fake, where, shape)), axis=None)
+    return (right + fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
+
+
+def network(own: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> Network:
+    """A receiver's generator and discriminator, to be trained together."""
     data = {"where": own.where, "truth": to_float(own.spectra)}
     dr.make_opaque(data)
+    weights = generator_weights(s, own.shape, rng)
+    # The generator starts near the mean grey of the rows that it may learn from.
     grey = float(np.clip(own.spectra[: own.train].mean(dtype=np.float64), 0.01, 0.99))
-    duel = Duel(s, own.shape, rng, float(np.log(grey / (1 - grey))))
+    weights[f"g.{LEVELS - 1}.bias"] += np.float32(np.log(grey / (1 - grey)))
+    adversary = adversary_weights(s, rng)
 
-    def draw(everything: bool) -> Iterator[Any]:
-        for picked in own.draw(everything, s.training.batch, rng):
-            yield {"rows": opaque_rows(picked), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, s.training.batch)))}
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        return {"rows": opaque_rows(rows), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, len(rows))))}
 
-    score = own.score(generate_silent, s)
-    return fit_network(duel, data, draw, score, s.training, listen, f"dcgan {own.receiver}")[0]
+    def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
+        return duel_loss(params, data, given, s, own.shape)
+
+    both = own.network("dcgan", weights | adversary, loss, data, draw, own.score(generate_silent, s))
+    return replace(both, rates=dict.fromkeys(adversary, s.adversary_rate), momentum=MOMENTUM)
 
 
 METHOD = SpectrumNetwork(
     "dcgan",
     DcganSettings,
-    fit_receiver,
+    network,
     generate_silent,
+    "g.",
     AT_ONCE,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
 ).method()

@@ -23,9 +23,9 @@ Chosen here, as no code of theirs was found:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
 
 import drjit as dr
 import numpy as np
@@ -33,13 +33,16 @@ from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
+from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear
+from ..fit.loop_config import COUNT
+from ..fit.session import FitSession
 from .cross_band import bands_arrays, bands_from
 from .csi_bands import Bands, bands_of, relative_error, training_rows, uplink_of
-from .method import Inputs, Listen, Method
+from .method import Inputs, Method
 from .tensors import columns
-from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, under
+from .training import Network, NetworkSettings, keyed, opaque_rows, train_network, under
 
 Sample = Literal["antenna", "row", "auto"]
 AT_ONCE = 4096
@@ -51,20 +54,22 @@ WEAK = 0.3
 
 
 @dataclass(frozen=True)
-class FireSettings:
-    """Settings of FIRE.
+class FireSettings(NetworkSettings):
+    """Settings of FIRE, beside those of the loop.
 
     Attributes:
-        training: how it learns.
+        batch: antennas of a step, at most, where a sample is an antenna.
         sample: what the network sees: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows.
-        row_batch: rows of a step where a sample is a row; else ``training.batch`` antennas.
+        row_batch: rows of a step, at most, where a sample is a row.
         latent: latent numbers.
         width: neurons of the hidden layers.
         beta: weight of the Kullback-Leibler divergence against the mean squared error of a sample.
         spacing_hz: see `wrf_mi.baselines.r2f2.R2F2Settings`.
     """
 
-    training: Training = field(default_factory=lambda: Training(steps=4000, batch=256, rate=1e-3, rounds=8))
+    steps: int = 5000
+    batch: int = 256
+    validate_every: int = 500
     sample: Sample = "auto"
     row_batch: int = 64
     latent: int = 32
@@ -72,19 +77,17 @@ class FireSettings:
     beta: float = 1e-4
     spacing_hz: float = 312.5e3
 
+    ranges = NetworkSettings.ranges | dict.fromkeys(("latent", "width", "row_batch"), COUNT)
+
     def __post_init__(self) -> None:
         """Refuse what is no network.
 
         Raises:
             InputError: naming the setting.
         """
-        if min(self.latent, self.width, self.row_batch) < 1 or not self.beta >= 0:
-            raise InputError(
-                f"fire: latent {self.latent}, width {self.width}, row_batch {self.row_batch}, beta {self.beta}; choose "
-                "1 or more, beta 0 or more"
-            )
-        if self.sample not in ("antenna", "row", "auto"):
-            raise InputError(f"fire: sample {self.sample!r}; choose antenna, row or auto")
+        super().__post_init__()
+        if self.sample not in get_args(Sample):
+            raise InputError(f"setting sample: {self.sample!r}; choose from {', '.join(get_args(Sample))}")
 
 
 def samples_of(h: NDArray[Any], sample: str) -> NDArray[np.complex128]:
@@ -207,7 +210,7 @@ def predict_samples(
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
 
 
-def fit(record: Record, split: Split, settings: FireSettings, seed: int, listen: Listen) -> FittedFire:
+def fit(record: Record, split: Split, settings: FireSettings, seed: int, session: FitSession) -> FittedFire:
     """Fit one network, or two of which the better stays.
 
     Raises:
@@ -216,17 +219,12 @@ def fit(record: Record, split: Split, settings: FireSettings, seed: int, listen:
     train, validation = training_rows(METHOD, record, split)
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
-    few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz) or not len(validation)
-    if settings.sample == "auto" and (few or bands.antennas == 1):
+    few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
+    unscored = not len(validation) or not settings.patience
+    if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
         kinds = ("antenna",)
-    fits = []
-    for number, kind in enumerate(kinds):
-
-        def part(what: str, share: float, done: int = number) -> None:
-            listen(what, (done + share) / len(kinds))
-
-        fits.append((*_fit(record, train, validation, settings, seed, part, kind), kind))
-    _, weights, kind = min(fits, key=lambda one: one[0])
+    fits = [(*_fit(record, train, validation, settings, seed, session, kind), kind) for kind in kinds]
+    weights, _, kind = max(fits, key=lambda one: one[1])
     return FittedFire(kind, weights, bands, settings)
 
 
@@ -236,10 +234,10 @@ def _fit(
     validation: IntArray,
     s: FireSettings,
     seed: int,
-    listen: Listen,
+    session: FitSession,
     sample: str,
-) -> tuple[float, Weights]:
-    """Best validation score, infinite where none is needed, and weights."""
+) -> tuple[Weights, float]:
+    """Weights and the best validation score, see `train_network`."""
     assert record.uplink is not None
     known = np.concatenate([train, validation])
     uplink, downlink = samples_of(record.uplink[known], sample), samples_of(record.observation[0, known], sample)
@@ -255,33 +253,25 @@ def _fit(
     dr.make_opaque(data)
     rng = np.random.default_rng([seed, int(sample == "row")])
     weights = initial_weights(s, len(x), len(y), rng)
-    batch = s.training.batch if sample == "antenna" else s.row_batch
 
-    def draw(everything: bool) -> Iterator[Any]:
-        count: IntArray = np.arange((len(known) if everything else len(train)) * per_row)
-        for picked in epochs(count, batch, rng):
-            yield {"rows": opaque_rows(picked), "noise": to_tensor(rng.standard_normal((s.latent, batch)))}
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        return {"rows": opaque_rows(rows), "noise": to_tensor(rng.standard_normal((s.latent, len(rows))))}
 
     def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
         return fire_loss(params, data, given, s.beta)
 
-    best = np.inf
-    score = None
-    if len(validation):
-        held = slice(len(train) * per_row, None)
-        truth, given_unit, given_uplink = downlink[held], unit[held], uplink[held]
+    held = slice(len(train) * per_row, None)
+    truth, given_unit, given_uplink = downlink[held], unit[held], uplink[held]
 
-        def score(params: Mapping[str, Any]) -> float:
-            nonlocal best
-            predicted = predict_samples(params, given_uplink, given_unit, truth.shape[-1])
-            value = float(np.median(relative_error(_rows(predicted, per_row), _rows(truth, per_row))))
-            best = min(best, value)
-            return value
+    def score(params: Mapping[str, Any]) -> float:
+        predicted = predict_samples(params, given_uplink, given_unit, truth.shape[-1])
+        return float(np.median(relative_error(_rows(predicted, per_row), _rows(truth, per_row))))
 
-    weights, _ = fit_network(
-        Descent(weights, loss, s.training.averaging), data, draw, score, s.training, listen, f"fire {sample}"
-    )
-    return best, weights
+    rows = [np.arange(len(part) * per_row) for part in (train, known)]
+    ends = rows[:1], rows[1:], score if len(validation) else None, "relative error"
+    network = Network(f"fire {sample}", weights, loss, data, draw, *ends)
+    config = s if sample == "antenna" else replace(s, batch=s.row_batch)
+    return train_network(network, config, (seed, int(sample == "row")), session)
 
 
 def _rows(samples: NDArray[Any], per_row: int) -> NDArray[Any]:
@@ -291,8 +281,7 @@ def _rows(samples: NDArray[Any], per_row: int) -> NDArray[Any]:
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
     """From `FittedFire.arrays`."""
-    plain = json.loads(str(arrays["settings"]))
-    settings = FireSettings(**plain | {"training": Training(**plain["training"])})
+    settings = settings_from(FireSettings, json.loads(str(arrays["settings"])), "fire")
     return FittedFire(str(arrays["sample"]), under("network", arrays), bands_from(arrays)[1], settings)
 
 

@@ -13,9 +13,10 @@ from scipy.spatial import KDTree
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.angles import FloatArray
 
+from ..fit.session import FitSession
 from ..tasks import task_of
 from .by_receiver import ByReceiver, fit_each, load_each
-from .method import Listen, Method
+from .method import Method
 
 NAME = "idw"
 
@@ -115,7 +116,7 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def fit(record: Record, split: Split, settings: IdwSettings, seed: int, listen: Listen) -> ByReceiver:
+def fit(record: Record, split: Split, settings: IdwSettings, seed: int, session: FitSession) -> ByReceiver:
     """Keep the training rows that each receiver received.
 
     Raises:
@@ -128,7 +129,7 @@ def fit(record: Record, split: Split, settings: IdwSettings, seed: int, listen: 
     def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
         return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
 
-    return fit_each(NAME, record, split, listen, one)
+    return fit_each(NAME, record, split, session.report, one)
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:

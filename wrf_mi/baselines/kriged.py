@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record, Split
 from ..core.angles import FloatArray
+from ..fit.session import FitSession
 from ..tasks import task_of
 from .by_receiver import ByReceiver, fit_each, load_each
 from .kriging import KrigedMean, Kriging, Trend, constant, log_distance
-from .method import Listen, Method
+from .method import Method
 
 NAME = "kriging"
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
@@ -67,7 +68,7 @@ class Kriged:
         return {TREND: np.asarray(self.trend), **self.mean.arrays()}
 
 
-def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, listen: Listen) -> ByReceiver:
+def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, session: FitSession) -> ByReceiver:
     """Krige what each receiver received.
 
     Raises:
@@ -94,7 +95,7 @@ def fit(record: Record, split: Split, settings: KrigingSettings, seed: int, list
         )
         return Kriged(model.fit(tx_pos, observed, heading).mean, name)
 
-    return fit_each(NAME, record, split, listen, one, settings.heading and task_of(record).in_decibel)
+    return fit_each(NAME, record, split, session.report, one, settings.heading and task_of(record).in_decibel)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:

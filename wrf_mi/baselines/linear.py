@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
+from ..fit.session import FitSession
 from .csi_bands import finite_uplink, relative_error, training_rows
 from .method import Inputs, Listen, Method
 
@@ -146,7 +147,7 @@ def choose(record: Record, train: IntArray, judges: IntArray, listen: Listen) ->
     return PENALTIES[int(np.argmin(errors))]
 
 
-def fit(record: Record, split: Split, settings: LinearSettings, seed: int, listen: Listen) -> LinearMap:
+def fit(record: Record, split: Split, settings: LinearSettings, seed: int, session: FitSession) -> LinearMap:
     """Choose the penalty, then fit the map to all training rows; nothing is drawn.
 
     Raises:
@@ -158,9 +159,9 @@ def fit(record: Record, split: Split, settings: LinearSettings, seed: int, liste
     if not len(validation):
         picked = np.arange(len(train)) % JUDGES == 0
         train, validation = train[~picked], train[picked]
-    penalty = settings.penalty or choose(record, train, validation, listen)
+    penalty = settings.penalty or choose(record, train, validation, session.report)
     matrix = Normal.of(record, known).matrix(penalty)
-    listen(f"linear: penalty {penalty:.2g}", 1.0)
+    session.report(f"linear: penalty {penalty:.2g}", 1.0)
     return LinearMap(matrix, record.observation.shape[2], penalty)
 
 

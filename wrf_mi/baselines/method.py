@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..fit.session import FitSession
 
 Listen = Callable[[str, float], None]
 """Hears what is being done and the share of it that is done, 0 to 1."""
@@ -75,14 +76,15 @@ class Fitted(Protocol):
 
 @dataclass(frozen=True)
 class Method:
-    """A model that is fitted to a record's rows in one go, see `wrf_mi.models.Model` for all others.
+    """A model that is fitted to a record's rows alone, see `wrf_mi.models.Model` for all others.
 
     Attributes:
         name: as in ``wrf-mi train --model``.
         tasks: tasks of `wrf_mi.core.Record` that it serves; None: all.
         settings: frozen dataclass of its settings, all with defaults.
-        fit: ``fit(record, split, settings, seed, listen)``. ``split.validation`` may choose what is open; what is
-            returned has seen all of ``split.all_train`` and no other row.
+        fit: ``fit(record, split, settings, seed, session)``. ``split.validation`` may choose what is open; what is
+            returned has seen all of ``split.all_train`` and no other row. What is trained step by step keeps a
+            checkpoint in the session's folder, from which it goes on; all else tells ``session.report`` of progress.
         load: ``load(arrays, record)``, from `Fitted.arrays` and the record without its observations in mind: poses,
             frequencies and shapes only.
         source: where the method is from.
@@ -93,7 +95,7 @@ class Method:
     name: str
     tasks: tuple[str, ...] | None
     settings: type
-    fit: Callable[[Record, Split, Any, int, Listen], Fitted]
+    fit: Callable[[Record, Split, Any, int, FitSession], Fitted]
     load: Callable[[dict[str, NDArray[Any]], Record], Fitted]
     source: str
     needs_uplink: bool = False

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record, Split
 from ..core.angles import FloatArray
+from ..fit.session import FitSession
 from .by_receiver import ByReceiver, fit_each, load_each
 from .kriging import log_distance
-from .method import Listen, Method
+from .method import Method
 
 NAME = "mri"
 
@@ -59,7 +60,7 @@ class PathLoss:
         return {"law": self.law}
 
 
-def fit(record: Record, split: Split, settings: MriSettings, seed: int, listen: Listen) -> ByReceiver:
+def fit(record: Record, split: Split, settings: MriSettings, seed: int, session: FitSession) -> ByReceiver:
     """Fit the law to the training rows that were received.
 
     Raises:
@@ -74,7 +75,7 @@ def fit(record: Record, split: Split, settings: MriSettings, seed: int, listen: 
         known = ~np.isnan(observed)
         return PathLoss(receiver.position_m, _law(log_distance(receiver.position_m)(tx_pos[known]), observed[known]))
 
-    return fit_each(NAME, record, split, listen, one)
+    return fit_each(NAME, record, split, session.report, one)
 
 
 def _pairs(record: Record, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:

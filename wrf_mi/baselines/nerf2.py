@@ -25,8 +25,8 @@ What the authors leave open, and what was chosen:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import Any
 
 import drjit as dr
@@ -36,14 +36,17 @@ from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
 from ..core import Record, Split
+from ..core.settings import settings_from
+from ..core.types import IntArray
 from ..field.network import Weights
+from ..fit.session import FitSession
 from ..tasks.conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from .coordinates import Coordinates
-from .method import Inputs, Listen, Method, inputs_of
+from .method import Inputs, Method, inputs_of
 from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
-from .nerf2_march import Networks, Seen
+from .nerf2_march import Seen
 from .tensors import columns
-from .training import Descent, Training, epochs, fit_network, keyed, opaque_rows, positions, under, usable_rows
+from .training import Network, keyed, opaque_rows, positions, train_network, under, usable_rows
 
 SCORED_RAYS = 512
 """Pixels of each validation spectrum by which steps are chosen."""
@@ -98,7 +101,7 @@ class FittedNerf2:
         return own
 
 
-def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen: Listen) -> FittedNerf2:
+def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, session: FitSession) -> FittedNerf2:
     """Fit the networks.
 
     Raises:
@@ -117,18 +120,12 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, listen
     scales = channel_scales(record, known)
     frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
     field = Field(settings, frame)
-    networks = []
-    for g, members in enumerate(frame.groups):
-
-        def part(what: str, share: float, first: int = g) -> None:
-            listen(what, (first + share) / len(frame.groups))
-
-        networks.append(_fit_group(record, split, field, seed, part, members))
+    networks = [_fit_group(record, split, field, seed, session, members) for members in frame.groups]
     return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
 
 
 def _fit_group(
-    record: Record, split: Split, field: Field, seed: int, listen: Listen, members: tuple[int, ...]
+    record: Record, split: Split, field: Field, seed: int, session: FitSession, members: tuple[int, ...]
 ) -> Weights:
     s, frame, outputs = field.settings, field.frame, field.frame.outputs
     known = split.all_train
@@ -145,23 +142,12 @@ def _fit_group(
         for r in members:
             weights["offset"][r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
     n_rays, spectrum = frame.directions.shape[1], frame.task.image
-    batch = s.training.batch if spectrum else s.sphere_batch
+    config = s if spectrum else replace(s, batch=s.sphere_batch)
     all_rays = opaque_rows(np.arange(n_rays))
 
-    def draw(everyone: bool) -> Iterator[Any]:
-        batches = {
-            r: epochs(conditions_of(np.concatenate(rows[r]) if everyone else rows[r][0], outputs), batch, rng)
-            for r in members
-        }
-        while True:
-            for r in rng.permutation(members):
-                yield {
-                    "rows": opaque_rows(next(batches[r])),
-                    "rays": opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False))
-                    if spectrum
-                    else all_rays,
-                    "receiver": dr.opaque(mi.UInt32, int(r)),
-                }
+    def draw(chosen: IntArray, member: int, rng: np.random.Generator) -> Any:
+        rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
+        return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
     def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
         return step_loss(params, data, given, frame, s)
@@ -179,17 +165,18 @@ def _fit_group(
                 errors.append(np.square(found - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
 
+    train = [conditions_of(rows[r][0], outputs) for r in members]
+    everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
-    what = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
-    descent = Descent(weights, loss, s.training.averaging)
-    return fit_network(descent, data, draw, score if able else None, s.training, listen, what)[0]
+    name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
+    ends = train, everything, score if able else None, "mean squared error"
+    network = Network(name, weights, loss, data, draw, *ends)
+    return train_network(network, config, (seed, *members), session)[0]
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
     """What `FittedNerf2.arrays` described."""
-    plain = json.loads(str(arrays["settings"]))
-    nested = {"training": Training(**plain["training"]), "networks": Networks(**plain["networks"])}
-    settings = Nerf2Settings(**plain | nested)
+    settings = settings_from(Nerf2Settings, json.loads(str(arrays["settings"])), "nerf2")
     coordinates = Coordinates.load(under("frame", arrays))
     frame = frame_of(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
     networks = [under(f"group{g}", arrays) for g in range(len(frame.groups))]

@@ -18,6 +18,7 @@ from ..backend.device import to_tensor
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
+from ..fit.loop_config import COUNT, AdamConfig
 from ..fit.recorded import Recorded
 from ..hybrid.signal_kernels import fibonacci_sphere
 from ..tasks import Task, task_of
@@ -26,7 +27,7 @@ from .coordinates import Coordinates
 from .method import Inputs
 from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
 from .tensors import columns
-from .training import Training, opaque_rows
+from .training import NetworkSettings, network_adam, opaque_rows
 
 DARK = 1e-8
 """Added to |R|^2 under a root or a logarithm, whose slope at zero is infinite."""
@@ -39,15 +40,15 @@ PAIRS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
-class Nerf2Settings:
-    """Settings of NeRF2.
+class Nerf2Settings(NetworkSettings):
+    """Settings of NeRF2, beside those of the loop.
 
     Attributes:
-        training: how it learns; ``batch`` counts spectra.
+        batch: spectra of a step, at most.
         networks: sizes of the networks.
         rays: pixels of a spectrum in a step.
         sphere_rays: rays over the full sphere, for signal strengths and channels.
-        sphere_batch: transmitters of a step for these two; with an uplink, antennas of transmitters.
+        sphere_batch: transmitters of a step, at most, for these two; with an uplink, antennas of transmitters.
         samples: points along a ray.
         near_m: distance at which rays start.
         far_m: distance at which they end; 0: that of the farthest training transmitter, or where positions are
@@ -56,7 +57,10 @@ class Nerf2Settings:
         shared: one pair of networks for all receivers, or else one for each.
     """
 
-    training: Training = field(default_factory=lambda: Training(steps=4000, batch=16, rate=2e-3))
+    steps: int = 5000
+    batch: int = 16
+    validate_every: int = 500
+    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     networks: Networks = field(default_factory=Networks)
     rays: int = 256
     sphere_rays: int = 64
@@ -67,21 +71,17 @@ class Nerf2Settings:
     tx_octaves: int = 4
     shared: bool = True
 
+    ranges = NetworkSettings.ranges | dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples"), COUNT)
+
     def __post_init__(self) -> None:
         """Refuse what is no march.
 
         Raises:
             InputError: naming the setting.
         """
-        if min(self.rays, self.sphere_rays, self.sphere_batch, self.samples) < 1 or self.tx_octaves < 0:
-            raise InputError(
-                f"nerf2: {self.rays} rays, {self.sphere_rays} over the sphere, sphere_batch {self.sphere_batch}, "
-                f"{self.samples} samples, tx_octaves {self.tx_octaves}; choose 1 or more (octaves: 0 or more)"
-            )
-        if self.near_m < 0 or (self.far_m and self.far_m <= self.near_m):
-            raise InputError(
-                f"nerf2: rays from {self.near_m} m to {self.far_m} m; choose a far end behind the near one"
-            )
+        super().__post_init__()
+        if self.far_m and self.far_m <= self.near_m:
+            raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
 
 
 @dataclass(frozen=True)

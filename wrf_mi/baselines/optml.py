@@ -25,24 +25,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..core import Record, Split
 from ..core.angles import FloatArray
+from ..core.settings import settings_from
 from ..field.network import Weights
+from ..fit.loop_config import COUNT, AdamConfig, at_least
+from ..fit.session import FitSession
 from .cross_band import PathSettings, bands_arrays, bands_from, choose, downlink
 from .csi_bands import Bands, uplink_of
-from .method import Inputs, Listen, Method
+from .method import Inputs, Method
 from .path_network import PathNetwork, Simulation, fit_paths
-from .training import Training, keyed, under
+from .training import NetworkSettings, keyed, network_adam, under
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import Complex, Mask, Waves, waves_of
 
 
 @dataclass(frozen=True)
-class OptMLSettings(PathSettings):
-    """Settings of OptML, and of the search for paths, whose defaults ask for fewer steps than R2F2's.
+class OptMLSettings(PathSettings, NetworkSettings):
+    """Settings of OptML, of the loop, and of the search for paths, whose defaults ask for fewer steps than R2F2's.
 
     Attributes:
-        training: how the network learns.
         simulation: channels that it learns from.
         width: its channels.
         rounds: looks at what is left.
@@ -50,7 +52,10 @@ class OptMLSettings(PathSettings):
         threshold: least height of a peak in the network's map, which ends at 0 and 1.
     """
 
-    training: Training = field(default_factory=lambda: Training(steps=1500, batch=16, rate=2e-3, rounds=5))
+    steps: int = 1875
+    batch: int = 16
+    validate_every: int = 300
+    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     simulation: Simulation = field(default_factory=Simulation)
     width: int = 48
     rounds: int = 5
@@ -59,20 +64,19 @@ class OptMLSettings(PathSettings):
     between: int = 3
     final: int = 5
 
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("rounds", "at_once", "width", "simulation.paths"), COUNT),
+        "simulation.channels": at_least(2),  # to learn from and to validate
+    }
+
     def __post_init__(self) -> None:
         """Refuse what is no search.
 
         Raises:
             InputError: naming the setting.
         """
-        super().__post_init__()
-        if min(self.rounds, self.at_once, self.width, self.simulation.channels, self.simulation.paths) < 1:
-            raise InputError(
-                f"optml: {self.rounds} rounds of {self.at_once} paths, width {self.width}, "
-                f"{self.simulation.channels} channels of {self.simulation.paths} paths; choose 1 or more"
-            )
-        if self.simulation.channels < 2:
-            raise InputError("optml: 1 simulated channel; give two at least, to learn from and to validate")
+        PathSettings.__post_init__(self)
+        NetworkSettings.__post_init__(self)
 
 
 class OptML:
@@ -144,24 +148,22 @@ def prune_rows(
     return prune(waves, h[rows], theta[rows], present[rows], settings.between, settings.max_paths)
 
 
-def fit(record: Record, split: Split, settings: OptMLSettings, seed: int, listen: Listen) -> OptML:
+def fit(record: Record, split: Split, settings: OptMLSettings, seed: int, session: FitSession) -> OptML:
     """Choose what is open on validation rows, then learn from simulated channels.
 
     Raises:
         InputError: no uplink, shapes that do not fit, coefficients that are not finite, or one training row.
     """
-    kind, bands = choose(METHOD, record, split, settings, listen)
-    waves, rng = waves_of(kind, bands, settings.max_distance_m), np.random.default_rng(seed)
-    network = fit_paths(waves, bands, settings.simulation, settings.width, settings.training, rng, listen)
+    kind, bands = choose(METHOD, record, split, settings, session.report)
+    waves = waves_of(kind, bands, settings.max_distance_m)
+    network = fit_paths(waves, bands, settings.simulation, settings.width, settings, seed, session)
     return OptML(kind, bands, settings, network.weights)
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
     """From `OptML.arrays`."""
-    plain = json.loads(str(arrays["settings"]))
-    simulation = plain["simulation"] | {"noise_db": tuple(plain["simulation"]["noise_db"])}
-    nested = {"training": Training(**plain["training"]), "simulation": Simulation(**simulation)}
-    return OptML(*bands_from(arrays), OptMLSettings(**plain | nested), under("network", arrays))
+    settings = settings_from(OptMLSettings, json.loads(str(arrays["settings"])), "optml")
+    return OptML(*bands_from(arrays), settings, under("network", arrays))
 
 
 METHOD = Method(

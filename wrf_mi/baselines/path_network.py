@@ -8,7 +8,7 @@ few paths, as many as one likes, for the array and the bands at hand.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +21,11 @@ from ..backend.device import to_tensor
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear
+from ..fit.loop_config import LoopConfig
+from ..fit.session import FitSession
 from .csi_bands import Bands
-from .method import Listen
 from .tensors import columns
-from .training import Descent, Training, epochs, fit_network, opaque_rows
+from .training import Network, opaque_rows, train_network
 from .uplink_waves import ArrayWaves, Complex, Waves
 
 FLOOR_DB = 30.0
@@ -218,12 +219,13 @@ def fit_paths(
     bands: Bands,
     simulation: Simulation,
     width: int,
-    training: Training,
-    rng: np.random.Generator,
-    listen: Listen,
+    config: LoopConfig,
+    seed: int,
+    session: FitSession,
 ) -> PathNetwork:
     """Simulate channels and learn to see their paths; squared error of the maps."""
-    listen("simulating channels", 0.0)
+    session.report("simulating channels", 0.0)
+    rng = np.random.default_rng(seed)
     seen, truth = simulate(waves, simulation, bands, rng)
     channels, cells = len(waves.grid), len(waves.cosines)
     held = int(np.clip(len(seen) // 10, 1, HELD))
@@ -236,9 +238,8 @@ def fit_paths(
     }
     dr.make_opaque(data)
 
-    def draw(everything: bool) -> Iterator[Any]:
-        for picked in epochs(np.arange(0 if everything else held, len(seen)), training.batch, rng):
-            yield opaque_rows(picked)
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        return opaque_rows(rows)
 
     def loss(params: Mapping[str, Any], data: Any, rows: Any) -> Any:
         x, y = (_side_by_side(columns(data[name], rows), channels, cells) for name in ("seen", "truth"))
@@ -250,8 +251,9 @@ def fit_paths(
         return float(np.square(look(params, judged[0], around).numpy() - judged[1].numpy()).mean())
 
     weights = initial_weights(channels, len(neighbours(waves.lattice)), width, rng)
-    descent = Descent(weights, loss, training.averaging)
-    return PathNetwork(waves, fit_network(descent, data, draw, score, training, listen, "paths")[0])
+    rows = [np.arange(held, len(seen))], [np.arange(len(seen))]
+    network = Network("paths", weights, loss, data, draw, *rows, score, "mean squared error")
+    return PathNetwork(waves, train_network(network, config, (seed,), session)[0])
 
 
 def _side_by_side(x: Any, channels: int, cells: int) -> Any:

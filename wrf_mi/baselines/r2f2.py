@@ -30,9 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Record, Split
+from ..fit.session import FitSession
 from .cross_band import PathSettings, bands_arrays, bands_from, choose, downlink
 from .csi_bands import Bands, uplink_of
-from .method import Inputs, Listen, Method
+from .method import Inputs, Method
 from .uplink_paths import find_paths
 from .uplink_waves import waves_of
 
@@ -65,13 +66,13 @@ class R2F2:
         return bands_arrays(self.kind, self.bands) | settings
 
 
-def fit(record: Record, split: Split, settings: R2F2Settings, seed: int, listen: Listen) -> R2F2:
+def fit(record: Record, split: Split, settings: R2F2Settings, seed: int, session: FitSession) -> R2F2:
     """Choose what is open; the rest is each row's own.
 
     Raises:
         InputError: no uplink, shapes that do not fit, coefficients that are not finite, or one training row.
     """
-    return R2F2(*choose(METHOD, record, split, settings, listen), settings)
+    return R2F2(*choose(METHOD, record, split, settings, session.report), settings)
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> R2F2:

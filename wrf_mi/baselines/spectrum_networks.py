@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from ..backend.device import to_float, to_tensor
 from ..core import Record, Split
-from ..core.types import IntArray
+from ..core.settings import settings_from
 from ..field.network import Weights
+from ..fit.session import FitSession
 from ..loss.ssim import ssim
+from ..tasks import TASKS
 from .coordinates import Coordinates
-from .method import Inputs, Listen, Method
-from .training import Training, epochs, keyed, positions, under, usable_rows
+from .method import Inputs, Method
+from .training import Network, keyed, positions, train_network, under, usable_rows
 
+SPECTRUM = TASKS["spectrum"]
 Generate = Callable[[Mapping[str, Any], Any, Any, tuple[int, int]], Any]
 """Parameters, settings, features of positions [features, m] and a spectrum's height and width give greys
 [m * height * width], a flat Dr.Jit array."""
@@ -47,12 +50,14 @@ class ReceiverRows:
         """Height and width of a spectrum."""
         return int(self.spectra.shape[1]), int(self.spectra.shape[2])
 
-    def draw(self, everything: bool, batch: int, rng: np.random.Generator) -> Iterator[IntArray]:
-        """Batches of rows without end: of all of them, or of those that train."""
-        return epochs(np.arange(len(self.spectra) if everything else self.train), batch, rng)
+    def network(self, kind: str, weights: Weights, loss: Any, data: Any, draw: Any, score: Any) -> Network:
+        """What is trained on these rows, see `Network`."""
+        train, everything = [np.arange(self.train)], [np.arange(len(self.spectra))]
+        ends = weights, loss, data, draw, train, everything, score
+        return Network(f"{kind} {self.receiver}", *ends, SPECTRUM.label, SPECTRUM.higher_is_better)
 
     def score(self, generate: Generate, settings: Any) -> Callable[[Mapping[str, Any]], float] | None:
-        """1 - the median structural similarity of the rows that choose; None without such rows."""
+        """Median structural similarity of the rows that choose; None without such rows."""
         count = len(self.spectra) - self.train
         if not count:
             return None
@@ -61,7 +66,7 @@ class ReceiverRows:
         def of(params: Mapping[str, Any]) -> float:
             with dr.suspend_grad():
                 predicted = generate(params, settings, asked, self.shape)
-            return 1 - float(np.median(ssim(predicted, truth, count, *self.shape).numpy()))
+            return float(np.median(ssim(predicted, truth, count, *self.shape).numpy()))
 
         return of
 
@@ -72,17 +77,19 @@ class SpectrumNetwork:
 
     Attributes:
         name: of the method.
-        settings: class of its settings, which have ``octaves``, ``scale_m`` and ``training``.
-        fit: weights of a receiver's network from its rows, settings, a generator of random numbers and who listens.
-        generate: spectra of positions by such weights.
+        settings: class of its settings, which have ``octaves`` and ``scale_m``.
+        network: what is trained, from a receiver's rows, settings and a generator of random numbers.
+        generate: spectra of positions by its weights.
+        generator: prefix of the weights that it needs.
         at_once: spectra that are predicted together, which bounds the memory.
         source: who it is by.
     """
 
     name: str
     settings: type
-    fit: Callable[[ReceiverRows, Any, np.random.Generator, Listen], Weights]
+    network: Callable[[ReceiverRows, Any, np.random.Generator], Network]
     generate: Generate
+    generator: str
     at_once: int
     source: str
 
@@ -135,7 +142,7 @@ class FittedNetworks:
 
 
 def _fit(
-    kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, listen: Listen
+    kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, session: FitSession
 ) -> FittedNetworks:
     """Fit a network to each receiver.
 
@@ -143,25 +150,22 @@ def _fit(
         InputError: positions that the data do not tell, or a receiver without training rows.
     """
     coordinates = Coordinates.of(positions(record, kind.name)[split.all_train])
-    networks, count = [], len(record.receivers)
+    networks = []
     for r, receiver in enumerate(record.receivers):
         train, validation = usable_rows(record, split, r, kind.name)
         known = np.concatenate([train, validation])
         where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
         own = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
-
-        def part(what: str, share: float, first: int = r) -> None:
-            listen(what, (first + share) / count)
-
-        networks.append(kind.fit(own, settings, np.random.default_rng([seed, r]), part))
+        network = kind.network(own, settings, np.random.default_rng([seed, r]))
+        weights, _ = train_network(network, settings, (seed, r), session)
+        networks.append({name: values for name, values in weights.items() if name.startswith(kind.generator)})
     height, width = (int(side) for side in record.observation.shape[-2:])
     return FittedNetworks(kind, settings, coordinates, networks, (height, width))
 
 
 def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record) -> FittedNetworks:
     """What `FittedNetworks.arrays` described."""
-    plain = json.loads(str(arrays["settings"]))
-    settings = kind.settings(**plain | {"training": Training(**plain["training"])})
+    settings: Any = settings_from(kind.settings, json.loads(str(arrays["settings"])), kind.name)
     networks = [under(f"receiver{r}", arrays) for r in range(len(record.receivers))]
     height, width = (int(side) for side in arrays["shape"])
     return FittedNetworks(kind, settings, Coordinates.load(under("frame", arrays)), networks, (height, width))

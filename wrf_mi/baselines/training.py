@@ -1,18 +1,16 @@
-"""How the networks of this package are fitted: Adam on a recorded step, steps chosen on validation rows.
+"""How the networks of this package are fitted: by the loop of `wrf_mi.fit.loop`, like Gaussians and paths.
 
-One rule for all. First the network learns from the training rows alone and the running mean of its parameters is
-scored on the validation rows at regular steps; then it goes on from the best of those moments, with a learning rate
-that falls to zero (half a cosine), from all training rows, for a stated share of the steps that led there. So whatever
-is open is chosen on validation rows, and the result has seen every training row.
+First a network learns from the training rows alone, at a constant rate, and the running mean of its parameters is
+scored on the validation rows at regular steps; then it goes on from the best of those moments, with a rate that falls
+to zero, from all training rows, for a share of the steps that led there. So whatever is open is chosen on validation
+rows, and the result has seen every training row.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import reduce
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,259 +18,188 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import NDArray
 
-from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
 from ..field.network import Weights
-from ..fit.adam import NumericsError, watched_groups
-from ..fit.recorded import Recorded
-from .method import Listen
+from ..field.recorded import Recorded
+from ..fit.adam import NonFiniteReport, Params, guarded_step, rated_params
+from ..fit.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from ..fit.loop import Progress, TrainingLoop
+from ..fit.loop_config import POSITIVE, AdamConfig, LoopConfig
+from ..fit.schedule import plan
+from ..fit.session import FitSession
+from ..fit.state import FitState
 
-LOG_EVERY = 50
-"""Steps between two reports of progress."""
+HOLD_OUT = 0.8
+"""Share of the steps that choose, at a constant rate; in the rest it falls."""
+FINISHED = "finished/"
+"""Prefix of the arrays of networks in ``checkpoint.npz`` whose training has ended."""
+
+
+def network_adam(rate: float = 1e-3) -> AdamConfig:
+    """Adam with a rate that is constant while validation rows choose, and then falls to zero."""
+    return AdamConfig(rate, cosine_start=HOLD_OUT, final=0.0, averaging=0.998)
 
 
 @dataclass(frozen=True)
-class Training:
-    """How long and how fast a network learns.
+class NetworkSettings(LoopConfig):
+    """Settings of the loop, see `LoopConfig`, with the defaults of networks."""
+
+    hold_out: float = HOLD_OUT
+    patience: int = 8
+    optimiser: AdamConfig = field(default_factory=network_adam)
+    ranges = LoopConfig.ranges | {"optimiser.network": POSITIVE}
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network to be trained.
 
     Attributes:
-        steps: largest number of steps before the validation rows join.
-        batch: samples of a step.
-        rate: Adam's learning rate.
-        warm_up: steps over which the rate rises from zero.
-        averaging: decay of the running mean of the parameters, which is what predicts.
-        rounds: how often within ``steps`` the validation rows are scored.
-        refit: steps on all training rows after the best round, as a share of the steps that led there.
+        name: for progress and checkpoint.
+        weights: starting values.
+        loss: ``loss(params, data, given)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`).
+        data: Dr.Jit arrays that the loss needs in every step.
+        draw: ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in
+            ``train`` and a generator of random numbers.
+        train: samples of each receiver that train while others validate.
+        everything: all samples of each receiver.
+        score: of parameters on the validation rows; None: there are no such rows.
+        label: of that score.
+        higher_is_better: which way of it is better.
+        rates: learning rates of parameters that have not that of all networks.
+        momentum: Adam's decay of the first moment.
     """
 
-    steps: int = 2000
-    batch: int = 16
-    rate: float = 1e-3
-    warm_up: int = 100
-    averaging: float = 0.998
-    rounds: int = 8
-    refit: float = 0.25
-
-    def __post_init__(self) -> None:
-        """Refuse what is no training.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        if min(self.steps, self.batch, self.rounds) < 1 or self.warm_up < 0:
-            raise InputError(
-                f"training: {self.steps} steps of {self.batch} samples, {self.rounds} rounds; all at least 1"
-            )
-        if not (self.rate > 0 and 0 <= self.averaging < 1 and self.refit > 0):
-            raise InputError(
-                f"training: rate {self.rate}, averaging {self.averaging}, refit {self.refit}; choose "
-                "a positive rate and share and an averaging in [0, 1)"
-            )
+    name: str
+    weights: Weights
+    loss: Callable[[Mapping[str, Any], Any, Any], Any]
+    data: Any
+    draw: Callable[[IntArray, int, np.random.Generator], Any]
+    train: Sequence[IntArray]
+    everything: Sequence[IntArray]
+    score: Callable[[Mapping[str, Any]], float] | None
+    label: str
+    higher_is_better: bool = False
+    rates: Mapping[str, float] = field(default_factory=dict)
+    momentum: float = 0.9
 
 
-Loss = Callable[[Mapping[str, Any], Any, Any], Any]
-"""``loss(params, data, given)``: one Dr.Jit float; ``data`` stays, ``given`` is another for each step."""
-
-
-class Descent:
-    """Parameters that go down a loss by Adam; the step is recorded at its first call.
+class NetworkTrainer(TrainingLoop):
+    """The training loop of one network.
 
     Args:
-        weights: starting values.
-        loss: to be made small. It must capture no array and read no value (`dr.freeze`).
-        averaging: decay of the running mean.
-        momentum: Adam's decay of the first moment.
-        shares: learning rates of parameters in units of that of a step, where it is not one.
+        network: with its starting values.
+        config: settings of the loop.
+        seed: of the order of samples and of what else is drawn.
+        state: of a training that was stopped, to go on from.
+
+    Raises:
+        InputError: no sample that trains.
     """
 
     def __init__(
-        self,
-        weights: Weights,
-        loss: Loss,
-        averaging: float,
-        momentum: float = 0.9,
-        shares: Mapping[str, float] | None = None,
+        self, network: Network, config: LoopConfig, seed: Sequence[int], state: FitState | None = None
     ) -> None:
-        self._averaging, self._momentum = averaging, momentum
-        self.taken = 0
-        self._start({name: to_tensor(values) for name, values in weights.items()}, None)
-        names, own = list(weights), dict(shares or {})
+        self.network, self.config, self._seed = network, config, tuple(seed)
+        self.label, self.higher_is_better = network.label, network.higher_is_better
+        self.schedule = plan(config, network.train, network.everything, np.random.default_rng([*seed, 1]))
+        self.state = state or FitState(network.weights, network.momentum)
+        if self.state.chosen:
+            self.schedule, _ = self.schedule.after(self.state.chosen)
+        self.record_functions()
 
-        @Recorded
-        def step(adam: Adam, mean: dict[str, Any], data: Any, given: Any, rate: Any, decay: Any, fine: Any) -> Any:
-            # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
-            adam.set_learning_rate({name: rate * own.get(name, 1.0) for name in names})
-            params = {name: adam[name] for name in names}
-            value = loss(params, data, given)
-            dr.backward(value)
-            sums = [dr.sum(dr.abs(dr.grad(params[n]).array)) for n in watched_groups(names)]
-            fine = fine & reduce(operator.and_, [dr.isfinite(s) for s in [dr.detach(value), *sums]])
-            adam.step(eval=False, active=fine)
-            share = dr.select(fine, decay, 1)
-            mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in names}
-            value = dr.detach(value)
-            dr.eval(adam, mean, value, fine)
-            return mean, value, fine
+    def record_functions(self) -> None:
+        """See `TrainingLoop`."""
+        rate, own, loss_of = self.config.optimiser.network, self.network.rates, self.network.loss
+        rates = {name: own.get(name, rate) for name in self.state.adam}
 
-        self._step = step
+        def step(
+            adam: Adam,
+            mean: Params,
+            data: Any,
+            given: Any,
+            factor: Any,
+            decay: Any,
+            number: Any,
+            trouble: NonFiniteReport,
+        ) -> tuple[Params, NonFiniteReport, Any]:
+            params = rated_params(adam, rates, factor)
+            loss = loss_of(params, data, given)
+            mean, trouble, _ = guarded_step(adam, params, loss, mean, decay, number, trouble)
+            loss = dr.detach(loss)
+            dr.eval(adam, mean, trouble, loss)
+            return mean, trouble, loss
 
-    def _start(self, params: Mapping[str, Any], mean: Mapping[str, Any] | None) -> None:
-        self.adam = Adam(lr=0.0, beta_1=self._momentum)
-        self.adam.update(dict(params))
-        self.mean = dict(mean or {name: values + 0 for name, values in params.items()})
-        self._fine = dr.opaque(mi.Bool, True)
-        dr.make_opaque(self.mean)
+        self._step = Recorded(step)
 
-    @property
-    def params(self) -> dict[str, Any]:
-        """Current parameters, without gradients."""
-        return {name: dr.detach(self.adam[name]) for name in self.adam}
-
-    def step(self, data: Any, given: Any, rate: float) -> Any:
-        """Take one step; the loss before it, a Dr.Jit float. After one that was not finite nothing changes any more."""
-        # A young mean forgets faster, or it would be mostly the starting values.
-        decay = min(self._averaging, (self.taken + 1) / (self.taken + 10))
-        self.mean, value, self._fine = self._step(
-            self.adam, self.mean, data, given, dr.opaque(mi.Float, rate), dr.opaque(mi.Float, decay), self._fine
+    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """See `TrainingLoop`."""
+        state, schedule, t = self.state, self.schedule, self.state.step
+        # A generator of its own for each step: a resumed training draws what an uninterrupted one would.
+        rng = np.random.default_rng([*self._seed, 2, t])
+        state.mean, trouble, loss = self._step(
+            state.adam,
+            state.mean,
+            self.network.data,
+            self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
+            dr.opaque(mi.Float, float(schedule.factor[t])),
+            dr.opaque(mi.Float, float(schedule.decay[t])),
+            dr.opaque(mi.UInt32, t + 1),
+            trouble,
         )
-        self.taken += 1
-        return value
+        return loss, trouble
 
-    def require_finite(self) -> None:
-        """Look at what happened since.
-
-        Raises:
-            NumericsError: a loss or a gradient was not finite.
-        """
-        if not self._fine[0]:
-            raise NumericsError(f"a loss or gradient within the first {self.taken} steps is not finite; lower the rate")
-
-    def arrays(self) -> Weights:
-        """The running mean, as NumPy arrays."""
-        return {name: self.mean[name].numpy().copy() for name in self.mean}
-
-    def state(self) -> tuple[Weights, Weights]:
-        """Parameters and running mean, to go back to."""
-        return {name: values.numpy().copy() for name, values in self.params.items()}, self.arrays()
-
-    def restore(self, state: tuple[Weights, Weights]) -> None:
-        """Go back, with Adam's moments forgotten."""
-        params, mean = ({name: to_tensor(values) for name, values in part.items()} for part in state)
-        self._start(params, mean)
+    def validate(self) -> float:
+        """See `TrainingLoop`."""
+        return float("nan") if self.network.score is None else self.network.score(self.state.mean)
 
 
-def warm(step: int, training: Training) -> float:
-    """Learning rate of a step from 0 while steps are being chosen."""
-    return training.rate * min(1.0, (step + 1) / max(1, training.warm_up))
+def train_network(
+    network: Network, config: LoopConfig, seed: Sequence[int], session: FitSession
+) -> tuple[Weights, float]:
+    """Train a network, from its checkpoint in the session's folder if there is one.
 
-
-def falling(step: int, steps: int, training: Training) -> float:
-    """Learning rate of a step from 0 of the last part: Adam starts without moments, so it warms up again."""
-    return warm(step, training) * 0.5 * (1 + float(np.cos(np.pi * step / steps)))
-
-
-class Learner(Protocol):
-    """What `fit_network` fits: `Descent`, or several that learn together."""
-
-    @property
-    def taken(self) -> int:
-        """Steps taken."""
-        ...
-
-    @property
-    def mean(self) -> dict[str, Any]:
-        """Running mean of the parameters."""
-        ...
-
-    def step(self, data: Any, given: Any, rate: float) -> Any:
-        """Take a step."""
-        ...
-
-    def require_finite(self) -> None:
-        """Raise `NumericsError` where something was not finite."""
-        ...
-
-    def arrays(self) -> Weights:
-        """The running mean, as NumPy arrays."""
-        ...
-
-    def state(self) -> Any:
-        """To go back to."""
-        ...
-
-    def restore(self, state: Any) -> None:
-        """Go back."""
-        ...
-
-
-def fit_network(
-    learner: Learner,
-    data: Any,
-    draw: Callable[[bool], Iterator[Any]],
-    score: Callable[[Mapping[str, Any]], float] | None,
-    training: Training,
-    listen: Listen,
-    what: str = "network",
-) -> tuple[Weights, int]:
-    """Fit one network by the rule of this module.
+    Networks of one fit, which differ in their names, share that file: what has ended stays in it.
 
     Args:
-        learner: with its starting values.
-        data: what its loss needs in every step.
-        draw: ``draw(everything)`` draws batches without end, from all training rows or from those that do not validate.
-        score: of parameters on the validation rows, less is better; None: no such rows, so that all steps are taken
-            and all training rows are learned from throughout.
-        training: settings.
-        listen: hears of progress.
-        what: is being fitted, for the listener.
+        network: with its starting values.
+        config: settings of the loop.
+        seed: of all that is drawn.
+        session: folder, progress and stop.
 
     Returns:
-        The running mean of the parameters, and the number of steps that was chosen.
+        The running mean of the parameters, and the best score on validation rows, the higher the better.
 
     Raises:
-        NumericsError: a loss or gradient that is not finite.
+        InputError: no sample that trains.
+        Interrupted: stopped between two steps; the checkpoint is written.
+        NumericsError: a value that is not finite.
     """
-    most = training.steps + max(1, round(training.refit * training.steps))
+    folder, own = session.folder, f"{FINISHED}{network.name}"
+    stored = read_checkpoint(folder) if folder is not None and (folder / CHECKPOINT).exists() else {}
+    if f"{own}/score" in stored:
+        return under(f"{own}/mean", stored), float(stored[f"{own}/score"])
+    beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
+    beside["network"] = np.asarray(network.name)
+    begun = "network" in stored and str(stored["network"]) == network.name
+    state = FitState.from_arrays(stored, network.momentum) if begun else None
+    trainer = NetworkTrainer(network, config, seed, state)
+    trainer.seconds = float(stored.get("seconds", 0.0))
 
-    def walk(batches: Iterator[Any], first: int, last: int, rate: Callable[[int], float]) -> None:
-        for step in range(first, last):
-            learner.step(data, next(batches), rate(step))
-            if (step + 1) % LOG_EVERY == 0 or step + 1 == last:
-                learner.require_finite()
-                # The same words until something is known: a log has a line for each round, not for each step.
-                listen(said, min(1.0, learner.taken / most))
+    def save() -> None:
+        if folder is not None:
+            write_checkpoint(folder, trainer, beside)
 
-    chosen, said = training.steps, f"{what}: {training.steps} steps"
-    batches = draw(score is None)
-    if score is None:
-        walk(batches, 0, training.steps, lambda step: warm(step, training))
-    else:
-        best, kept, before = np.inf, None, 0
-        for moment in np.unique(np.linspace(0, training.steps, training.rounds + 1).round().astype(int)[1:]):
-            walk(batches, before, int(moment), lambda step: warm(step, training))
-            before, value = int(moment), score(learner.mean)
-            said = f"{what}: validation {value:.4g} after {before} of {training.steps} steps"
-            if value < best:
-                best, kept, chosen = value, learner.state(), before
-        if kept is None:
-            raise NumericsError("validation scores are not finite; lower the rate")
-        learner.restore(kept)
-    last = max(1, round(training.refit * chosen))
-    said = f"{what}: {last} steps on all rows after {chosen}"
-    walk(draw(True), 0, last, lambda step: falling(step, last, training))
-    listen(f"{what}: {chosen} steps chosen", 1.0)
-    return learner.arrays(), chosen
+    def heard(progress: Progress) -> None:
+        session.tell(network.name, progress.step / config.steps, progress)
 
-
-def epochs(rows: IntArray, batch: int, rng: np.random.Generator) -> Iterator[IntArray]:
-    """Batches of a constant size without end: every row once in each pass, in random order."""
-    waiting = np.empty(0, np.int64)
-    while True:
-        while len(waiting) < batch:
-            waiting = np.concatenate([waiting, rng.permutation(rows)])
-        yield waiting[:batch]
-        waiting = waiting[batch:]
+    if not trainer.run(heard, save, session.stop):
+        raise session.interrupted(f"after step {trainer.state.step} of {config.steps} of {network.name}")
+    weights, score = trainer.state.mean_params(), trainer.state.best_score
+    beside |= keyed(f"{own}/mean", weights) | {f"{own}/score": np.asarray(score)}
+    save()
+    return weights, score
 
 
 def usable_rows(record: Record, split: Split, receiver: int, what: str) -> tuple[IntArray, IntArray]:

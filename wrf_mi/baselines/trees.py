@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from wrf_mi.core import InputError, Prediction, Receiver, Record, Split
 from wrf_mi.core.angles import FloatArray
 
+from ..fit.session import FitSession
 from .by_receiver import ByReceiver, fit_each, load_each
-from .method import Listen, Method
+from .method import Method
 
 NAME = "trees"
 
@@ -203,7 +204,7 @@ class TreesSettings:
     heading: bool = True
 
 
-def fit(record: Record, split: Split, settings: TreesSettings, seed: int, listen: Listen) -> ByReceiver:
+def fit(record: Record, split: Split, settings: TreesSettings, seed: int, session: FitSession) -> ByReceiver:
     """Grow trees on what each receiver received.
 
     Raises:
@@ -213,7 +214,7 @@ def fit(record: Record, split: Split, settings: TreesSettings, seed: int, listen
     def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> GrownTrees:
         return Trees(settings.trees, settings.leaf_rows, seed).fit(tx_pos, observed, heading).grown()
 
-    return fit_each(NAME, record, split, listen, one, settings.heading)
+    return fit_each(NAME, record, split, session.report, one, settings.heading)
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:

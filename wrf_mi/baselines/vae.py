@@ -17,8 +17,8 @@ has not released it. Chosen here:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -26,24 +26,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
-from ..core import InputError
+from ..core.types import IntArray
 from ..field.network import Weights, init_layer, linear, relu
+from ..fit.loop_config import COUNT, POSITIVE, SHARE
 from .coordinates import feature_count
-from .method import Listen
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
-from .training import Descent, Training, fit_network, opaque_rows
+from .training import Network, NetworkSettings, opaque_rows
 
 AT_ONCE = 64
 """Spectra that are predicted together: bounds the memory."""
 
 
 @dataclass(frozen=True)
-class VaeSettings:
-    """Settings of the variational autoencoder.
+class VaeSettings(NetworkSettings):
+    """Settings of the variational autoencoder, beside those of the loop.
 
     Attributes:
-        training: how it learns.
         latent: numbers in z.
         width: neurons of the hidden layers.
         last: neurons of the decoder's second hidden layer, from which each pixel is made: most weights lie behind it.
@@ -55,7 +54,9 @@ class VaeSettings:
         prior_share: share of the reconstruction whose z is drawn from the prior.
     """
 
-    training: Training = field(default_factory=lambda: Training(steps=3000, batch=16))
+    steps: int = 3750
+    batch: int = 16
+    validate_every: int = 375
     latent: int = 16
     width: int = 256
     last: int = 64
@@ -66,22 +67,11 @@ class VaeSettings:
     beta: float = 3e-2
     prior_share: float = 0.8
 
-    def __post_init__(self) -> None:
-        """Refuse what is no network.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        if min(self.latent, self.width, self.last, self.pool) < 1 or self.octaves < 0:
-            raise InputError(
-                f"vae: latent {self.latent}, width {self.width}, last {self.last}, pool {self.pool}, "
-                f"octaves {self.octaves}; choose 1 or more (octaves: 0 or more)"
-            )
-        if not (self.noise > 0 and self.scale_m > 0 and self.beta >= 0 and 0 <= self.prior_share <= 1):
-            raise InputError(
-                f"vae: noise {self.noise}, scale_m {self.scale_m}, beta {self.beta}, prior_share {self.prior_share}; "
-                "choose positive numbers and a share up to 1"
-            )
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("latent", "width", "last", "pool"), COUNT),
+        **dict.fromkeys(("scale_m", "noise"), POSITIVE),
+        "prior_share": SHARE,
+    }
 
 
 def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
@@ -154,8 +144,8 @@ def generate(params: Mapping[str, Any], s: VaeSettings, where: Any, shape: tuple
     return dr.moveaxis(pixels, 0, 1).array
 
 
-def fit_receiver(own: ReceiverRows, s: VaeSettings, rng: np.random.Generator, listen: Listen) -> Weights:
-    """Weights of a receiver's decoder."""
+def network(own: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
+    """A receiver's encoder and decoder, to be trained."""
     cells, flat = pooled(own.spectra, s.pool), own.spectra.reshape(len(own.spectra), -1)
     data = {"cells": to_tensor(cells.T), "where": own.where, "pixels": to_tensor(flat.T)}
     dr.make_opaque(data)
@@ -164,25 +154,22 @@ def fit_receiver(own: ReceiverRows, s: VaeSettings, rng: np.random.Generator, li
     mean = np.clip(flat[: own.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
     weights["p.out.bias"] = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
 
-    def draw(everything: bool) -> Iterator[Any]:
-        for picked in own.draw(everything, s.training.batch, rng):
-            noise, prior = rng.standard_normal((2, s.latent, s.training.batch))
-            yield {"rows": opaque_rows(picked), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        noise, prior = rng.standard_normal((2, s.latent, len(rows)))
+        return {"rows": opaque_rows(rows), "noise": to_tensor(noise), "prior": to_tensor(prior)}
 
     def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
         return elbo_loss(params, data, given, s.noise, s.beta, s.prior_share)
 
-    descent = Descent(weights, loss, s.training.averaging)
-    score = own.score(generate, s)
-    fitted, _ = fit_network(descent, data, draw, score, s.training, listen, f"vae {own.receiver}")
-    return {name: values for name, values in fitted.items() if name[0] == "p"}
+    return own.network("vae", weights, loss, data, draw, own.score(generate, s))
 
 
 METHOD = SpectrumNetwork(
     "vae",
     VaeSettings,
-    fit_receiver,
+    network,
     generate,
+    "p.",
     AT_ONCE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
 ).method()

@@ -10,27 +10,29 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.files import readable, stored_arrays, write_arrays, write_atomically
-from .loop import Progress
-from .trainer import Trainer
+
+if TYPE_CHECKING:
+    from .loop import Progress, TrainingLoop
 
 FORMAT = 5
 """Version of ``checkpoint.npz``."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 
 
-def write_checkpoint(folder: Path, trainer: Trainer) -> None:
-    """Write ``checkpoint.npz``: enough to go on."""
-    own = {"format": np.asarray(FORMAT), "seconds": np.asarray(trainer.seconds)}
-    write_arrays(folder / CHECKPOINT, trainer.state.arrays() | own)
+def write_checkpoint(folder: Path, loop: TrainingLoop, beside: Mapping[str, NDArray[Any]] | None = None) -> None:
+    """Write ``checkpoint.npz``: enough to go on, and further arrays ``beside`` it."""
+    own = {"format": np.asarray(FORMAT), "seconds": np.asarray(loop.seconds)}
+    write_arrays(folder / CHECKPOINT, {**loop.state.arrays(), **own, **(beside or {})})
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
@@ -47,6 +49,15 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
     return arrays
+
+
+def checkpoint_seconds(folder: Path) -> float:
+    """Training time up to the checkpoint in a folder; 0 without one.
+
+    Raises:
+        InputError: as `read_checkpoint`.
+    """
+    return float(read_checkpoint(folder)["seconds"]) if (folder / CHECKPOINT).exists() else 0.0
 
 
 def append_log(folder: Path, progress: Progress) -> None:

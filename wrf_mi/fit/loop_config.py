@@ -11,6 +11,33 @@ from typing import Any
 from ..core import InputError
 from ..core.settings import flat
 
+Range = tuple[Callable[[float], bool], str]
+
+
+def at_least(smallest: float) -> Range:
+    """Numbers from a smallest one."""
+    return lambda x: x >= smallest, f"{smallest} or more"
+
+
+COUNT: Range = at_least(1)
+POSITIVE: Range = (lambda x: x > 0, "more than 0")
+INSIDE: Range = (lambda x: 0 < x < 1, "more than 0 and less than 1")
+SHARE: Range = (lambda x: 0 <= x <= 1, "0 to 1")
+NOT_NEGATIVE: Range = at_least(0)
+
+RANGES: dict[str, Range] = {
+    "steps": COUNT,
+    "batch": COUNT,
+    "hold_out": SHARE,
+    "checkpoint_every": COUNT,
+    "log_every": COUNT,
+    "validate_every": COUNT,
+    "optimiser.cosine_start": SHARE,
+    "optimiser.final": SHARE,
+    "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
+}
+"""What numbers of the loop may be, and words for it."""
+
 
 @dataclass(frozen=True)
 class AdamConfig:
@@ -57,6 +84,7 @@ class LoopConfig:
     log_every: int = 100
     validate_every: int = 1000
     optimiser: AdamConfig = field(default_factory=AdamConfig)
+    ranges = RANGES  # what numbers may be; other models have more of them
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use.
@@ -64,28 +92,25 @@ class LoopConfig:
         Raises:
             InputError: naming the setting.
         """
-        checked(self, RANGES)
+        checked(self, self.ranges)
 
 
-Range = tuple[Callable[[float], bool], str]
-COUNT: Range = (lambda x: x >= 1, "1 or more")
-POSITIVE: Range = (lambda x: x > 0, "more than 0")
-INSIDE: Range = (lambda x: 0 < x < 1, "more than 0 and less than 1")
-SHARE: Range = (lambda x: 0 <= x <= 1, "0 to 1")
-NOT_NEGATIVE: Range = (lambda x: x >= 0, "0 or more")
+@dataclass(frozen=True)
+class LoopOptions:
+    """Settings of the loop (`LoopConfig`) of a model that may be trained; null: those that it begins with."""
 
-RANGES: Mapping[str, Range] = {
-    "steps": COUNT,
-    "batch": COUNT,
-    "hold_out": SHARE,
-    "checkpoint_every": COUNT,
-    "log_every": COUNT,
-    "validate_every": COUNT,
-    "optimiser.cosine_start": SHARE,
-    "optimiser.final": SHARE,
-    "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-}
-"""What numbers of the loop may be, and words for it."""
+    steps: int | None = None
+    batch: int | None = None
+    hold_out: float | None = None
+    patience: int | None = None
+    checkpoint_every: int | None = None
+    log_every: int | None = None
+    validate_every: int | None = None
+
+    def chosen(self) -> list[str]:
+        """Those that are not null, as ``--set`` takes them."""
+        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(LoopOptions)}
+        return [f"{name}={value}" for name, value in values.items() if value is not None]
 
 
 def checked(settings: Any, ranges: Mapping[str, Range]) -> dict[str, Any]:

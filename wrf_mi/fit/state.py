@@ -20,6 +20,10 @@ Arrays = dict[str, NDArray[Any]]
 class FitState:
     """Parameters under optimisation.
 
+    Args:
+        params: starting values.
+        momentum: Adam's decay of the first moment.
+
     Attributes:
         adam: Dr.Jit's optimiser, which owns the current parameters.
         mean: running mean of the parameters, which is what is evaluated.
@@ -30,12 +34,12 @@ class FitState:
             everywhere.
         chosen: step from which the fit went on, see `wrf_mi.fit.config.TrainConfig.patience`; 0: from the last one.
         best: the state that scored best on validation rows (see `arrays`); None: none is kept.
-        best_score: its score, the higher the better.
+        best_score: its score, the higher the better; also once the fit went on from it.
         waited: scores since then.
     """
 
-    def __init__(self, params: Mapping[str, NDArray[np.float32]]) -> None:
-        self.adam = Adam(lr=0.0)
+    def __init__(self, params: Mapping[str, NDArray[np.float32]], momentum: float = 0.9) -> None:
+        self.adam = Adam(lr=0.0, beta_1=momentum)
         self.adam.update({name: to_tensor(values) for name, values in params.items()})
         self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = self.chosen = 0
@@ -110,8 +114,10 @@ class FitState:
             self.best, self.best_score, self.waited = self._now(), score, 0
 
     def go_back(self) -> FitState:
-        """The moment that was kept, with nothing kept in it."""
-        return self if self.best is None else FitState.from_arrays(self.best)
+        """The moment that was kept, with nothing kept in it but its score."""
+        if self.best is None:
+            return self
+        return FitState.from_arrays(self.best | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
 
     def arrays(self) -> Arrays:
         """All of it, for a checkpoint."""
@@ -128,19 +134,18 @@ class FitState:
         return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FitState:
-        """The state that `arrays` described."""
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
+        """The state that `arrays` described, with Adam's decay of the first moment."""
 
         def group(prefix: str) -> Arrays:
             return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
 
-        state = cls(group("param/"))
+        state = cls(group("param/"), momentum)
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
         state.urge_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
         state.urge = to_float(arrays["urge"])
         state.best = group("best/") or None
-        if state.best is not None:
-            state.best_score, state.waited = float(arrays["best_score"]), int(arrays["waited"])
+        state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

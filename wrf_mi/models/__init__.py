@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from ..baselines.method import Inputs, Method
 from ..core import InputError
 from ..core.registry import Registry
-from .model import Fitted, Interrupted, Model, Problem, Session, model_of
+from ..fit.session import Interrupted
+from .model import Fitted, Model, Problem, Session, model_of
 
 ENTRY_POINTS = "wrf_mi.models"
 """Group of the entry points by which other packages add models."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +17,13 @@ from ..baselines.method import Inputs, Method
 from ..core import AntennaOptions, Prediction, Receiver, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.types import IntArray
+from ..fit.checkpoint import checkpoint_seconds
+from ..fit.session import FitSession
 from ..parallel import Scheduler
 
-if TYPE_CHECKING:
-    from ..fit.loop import Progress
-
 Arrays = dict[str, NDArray[Any]]
-Listen = Callable[[str, float, "Progress | None"], None]
-"""Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time where steps are taken."""
-
 UNUSED_HEADING = "its model does not know how the transmitter is turned; leave heading_rad away"
 UNUSED_UPLINK = "its model does not predict from the uplink; leave uplink away"
-
-
-def quiet(stage: str, share: float, progress: Progress | None = None) -> None:
-    """A progress callback that shows nothing."""
-
-
-class Interrupted(Exception):
-    """A fit was stopped; what was fitted is stored."""
-
-    exit_status = 130
 
 
 @dataclass
@@ -102,44 +89,18 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Session:
-    """Where a fit keeps its work and what it reports to.
+class Session(FitSession):
+    """A session of a run.
 
     Attributes:
-        folder: for files of this fit; that of one fold where there are several. ``checkpoint.npz`` in it is removed
-            when the fitted model is stored.
-        run: the run folder, for files that all folds share.
-        listen: progress callback.
-        stop: asked whether to stop, wherever nothing would be lost.
         scheduler: computes parts of the work; None: this process.
         progress: show bars on standard error where the tracer takes time.
     """
 
     folder: Path
     run: Path
-    listen: Listen = quiet
-    stop: Callable[[], bool] = lambda: False
     scheduler: Scheduler | None = None
     progress: bool = False
-
-    @property
-    def fold(self) -> str:
-        """Name of the fold; "" where there is one split."""
-        return "" if self.folder == self.run else self.folder.name
-
-    def report(self, stage: str, share: float) -> None:
-        """Progress of a fit that is made in one go.
-
-        Raises:
-            Interrupted: it is to stop.
-        """
-        self.listen(f"{self.fold}: {stage}" if self.fold else stage, share, None)
-        if self.stop():
-            raise self.interrupted(f"in {stage}")
-
-    def interrupted(self, where: str) -> Interrupted:
-        """The error that ends a fit which was stopped."""
-        return Interrupted(f"stopped {where}; go on with: wrf-mi train --resume {self.run}")
 
 
 class Fitted(ABC):
@@ -262,7 +223,10 @@ def model_of(method: Method) -> Model:
     """The entry of a model that is fitted to a record's rows alone."""
 
     def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-        return FittedMethod(method.fit(problem.record, split, problem.settings, problem.seed, session.report))
+        before, start = checkpoint_seconds(session.folder), time.perf_counter()
+        fitted = FittedMethod(method.fit(problem.record, split, problem.settings, problem.seed, session))
+        fitted.train_seconds = before + time.perf_counter() - start
+        return fitted
 
     def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         return FittedMethod(method.load(arrays, problem.record))

@@ -30,6 +30,7 @@ from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
 from ..fit.config import calibration_config
+from ..fit.loop_config import LoopOptions
 from ..hybrid.corrected import check_materials, write_corrected_scene
 from ..measure.observations import place_of
 from ..parallel import Scheduler, row_parts
@@ -55,13 +56,12 @@ receivers alone, a part of any size costs as much as a few hundred positions, an
 
 
 @dataclass(frozen=True)
-class TracingSettings(TraceOptions):
-    """What is traced and fitted.
+class TracingSettings(LoopOptions, TraceOptions):
+    """What is traced and fitted, and with ``calibration`` settings of the training loop.
 
     Attributes:
         calibration: what is trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
             ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null: nothing.
-        steps: of that training; null: those of `wrf_mi.fit.config.calibration_config`.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters (`wrf_mi.trace.target`);
             null: none are chosen.
@@ -69,7 +69,6 @@ class TracingSettings(TraceOptions):
     """
 
     calibration: str | None = None
-    steps: int | None = None
     target_error_db: float | None = None
     target_kinds: str = ",".join(CHOSEN_KINDS)
 
@@ -80,10 +79,10 @@ class TracingSettings(TraceOptions):
             InputError: naming the setting.
         """
         super().__post_init__()
-        if self.steps is not None and (self.calibration is None or self.steps < 1):
-            raise InputError(f"setting steps: {self.steps}; a positive number, with calibration")
+        if self.calibration is None and (chosen := self.chosen()):
+            raise InputError(f"setting {chosen[0]}: of a training, and nothing is calibrated; set calibration, too")
         if self.calibration is not None:
-            calibration_config(self.calibration.split(","))
+            with_settings(calibration_config(self.calibration.split(",")), self.chosen())
             if self.target_error_db is not None:
                 raise InputError("target_error_db chooses what is traced without calibration; leave one of them away")
         if unknown := [kind for kind in self.target_kinds.split(",") if kind and kind not in CHOSEN_KINDS]:
@@ -184,7 +183,7 @@ def _graph_problem(problem: Problem) -> Problem:
     own = [f"seed={problem.seed}", f"traced.depth={options.max_depth}", f"traced.reflections={_reflections(options)}"]
     own += [f"traced.transmission={str(options.transmission).lower()}"]
     own += [] if options.rays == "auto" else [f"traced.rays={options.rays}"]
-    own += [] if settings.steps is None else [f"steps={settings.steps}"]
+    own += settings.chosen()
     config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), own)
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from ..core import InputError
 from ..fit.config import PRESETS
+from ..fit.session import Listen
 from ..measure import fetch
 from ..measure.registry import locate
-from ..models.model import Listen
 from ..scene.make import make_scene
 from ..trace import load_record
 from ..trace.laboratory import NAME as LABORATORY

@@ -17,11 +17,11 @@ from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.settings import with_settings
 from ..fit.checkpoint import CHECKPOINT
+from ..fit.session import Interrupted, Listen, quiet
 from ..fit.trainer import check_rows
 from ..measure import make_splits
 from ..measure.observations import check_observations, place_of
-from ..models import MODELS, Interrupted, Model, Problem, Session, known_model
-from ..models.model import Listen, quiet
+from ..models import MODELS, Model, Problem, Session, known_model
 from ..parallel import Scheduler
 from ..trace import load_record
 from .run import Run, load_part, open_run, predict_to_file

@@ -73,7 +73,8 @@ class Watch:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # it is without validation rows
             rows = "validation rows" if p.held_out else "validation rows, now trained on"
             self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
-        return f"loss {p.loss:.4f}  {self._score}  {p.gaussians} Gaussians  {_clock(p.left_s)} left"
+        gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
+        return f"loss {p.loss:.4f}  {self._score}  {gaussians}{_clock(p.left_s)} left"
 
 
 def _clock(seconds: float) -> str:
