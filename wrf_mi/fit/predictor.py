@@ -66,8 +66,9 @@ class Predictor:
     ) -> None:
         self.receivers = tuple(receivers)
         self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
-        # The operator and the recorded prediction are the magnitude at each direction.
-        self._pixels = field is not None and self.graph.scene is None and self.graph.form.receiver == PIXEL
+        # The operator and the recorded prediction are the splatted magnitude at each direction.
+        self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
+        self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
@@ -129,7 +130,7 @@ class Predictor:
         return heading
 
     def _traced(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> Any:
-        """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
+        """What a receiver reports of both sides, flat, unrecorded; positions without paths are learned ones alone."""
         side = self.graph.trace(tx_pos_m, receiver, heading_rad)
         if side is not None:
             side.refresh(self._params)
@@ -137,7 +138,7 @@ class Predictor:
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane)
 
     def _learned(self, condition: FloatArray, receiver: int) -> Any:
-        """What a receiver reports of conditions [3 or features, at most `TOGETHER`] without a scene, flat."""
+        """What a receiver reports of conditions [3 or features, at most `TOGETHER`], recorded, flat."""
         if receiver not in self._reports:
             report = self.graph.report(receiver, None)
 
@@ -162,12 +163,12 @@ class Predictor:
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
-        out, traced = np.empty((len(given), *shape), np.float32), self.graph.scene is not None
-        together = max(TOGETHER, TRACED_NUMBERS // math.prod(shape)) if traced else TOGETHER
+        out = np.empty((len(given), *shape), np.float32)
+        together = TOGETHER if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
         for start in range(0, len(given), together):
             part = given[start : start + together]
             turned = None if heading_rad is None else heading_rad[start : start + together]
-            found = self._traced(part, receiver, turned) if traced else self._learned(part.T, receiver)
+            found = self._learned(part.T, receiver) if self._recordable else self._traced(part, receiver, turned)
             out[start : start + together] = found.numpy().reshape(len(part), *shape)
         return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 

@@ -150,8 +150,9 @@ def make_step(
     loss_of: Loss,
     shape: tuple[int, ...],
     state: Callable[[], Any] | None = None,
+    recordable: bool = True,
 ) -> Callable[..., Any]:
-    """A recorded optimiser step.
+    """An optimiser step, recorded where the report can be.
 
     Args:
         report: what a receiver reports of the graph, see `wrf_mi.graph.Graph.report`.
@@ -159,6 +160,7 @@ def make_step(
         loss_of: loss of a batch.
         shape: of one observation.
         state: arrays that the report reads beside its arguments; None: none.
+        recordable: whether Dr.Jit can record the report; if not, each call is traced anew.
 
     Returns:
         ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
@@ -213,7 +215,15 @@ def make_step(
         dr.eval(adam, mean, trouble, told)
         return mean, trouble, told
 
-    return Recorded(step, state)
+    if recordable:
+        return Recorded(step, state)
+
+    def unrecorded(*arguments: Any) -> tuple[Params, Trouble, StepReport]:
+        # A recording takes its arguments as opaque: a row that is a constant of kernels would compile them anew.
+        dr.make_opaque(arguments)
+        return step(*arguments)
+
+    return unrecorded
 
 
 def evaluated(

@@ -144,6 +144,7 @@ class Trainer:
             scene,
             config.traced,
             record.tx_antenna,
+            config.evaluation,
         )
         self._shape = self.targets.truth.shape[2:]
         self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
@@ -228,7 +229,8 @@ class Trainer:
                 params = {name: self.state.adam[name] for name in self.state.adam}
                 first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
                 evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
-            self._steps[key] = make_step(report, self._rates(), self._loss, self._shape, state)
+            ends = self._loss, self._shape, state, self.graph.evaluation.recordable
+            self._steps[key] = make_step(report, self._rates(), *ends)
         return self._steps[key]
 
     def _rates(self) -> dict[str, float]:
