@@ -184,6 +184,11 @@ def test_training_by_tracing_scores_as_by_splatting_with_the_kernels_of_its_firs
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, name == "traced"):
             dr.kernel_history_clear()
             trainer.run(count_kernels if name == "traced" else lambda progress: None)
+        if name == "traced":
+            # A scene whose parameters keep derivatives hands them to whatever is traced in the process later.
+            kept = [one.params[key] for one in trainer.graph.evaluation._scenes for key in one.params.keys()]  # noqa: SIM118
+            assert kept
+            assert not dr.grad_enabled(kept)
         scores[name] = ssim(trainer.predictor().of_rows(record, split.test, 0), record.observation[0, split.test])
     draws = np.random.default_rng(0).choice(scores["splatted"], (4000, len(split.test)))
     low, high = np.percentile(np.median(draws, axis=1), (2.5, 97.5))

@@ -119,13 +119,20 @@ class _FieldScene:
         # Not optimised: materials that are alike at first are not the same.
         self.scene = mi.load_dict({"type": "scene"} | entries, optimize=False)
         self.params = mi.traverse(self.scene)
+        self._assigned: list[str] = []
 
     def render(self, values: Mapping[str, Any], views: int) -> list[Any]:
         """Images [height, width, 2] of all views, after parameters took these values."""
         for name, value in values.items():
             self.params[name] = value
         self.params.update()
+        self._assigned = list(values)
         return [mi.render(self.scene, self.params, sensor=i) for i in range(views)]
+
+    def release(self) -> None:
+        """Detach what was assigned; the values stay."""
+        for name in self._assigned:
+            self.params[name] = dr.detach(self.params[name])
 
 
 class Traced:
@@ -180,6 +187,14 @@ class Traced:
         flat = dr.concat([image.array for image in images])
         index = 2 * dr.arange(mi.UInt32, dr.width(flat) // 2)
         return dr.gather(mi.Float, flat, index), dr.gather(mi.Float, flat, index + 1)
+
+    def release(self) -> None:
+        """Detach the scenes' parameters.
+
+        Mitsuba's calls of materials read those of all scenes: what another scene traces would have derivatives by them.
+        """
+        for one in self._scenes:
+            one.release()
 
     def _scene(self, number: int, gaussians: Gaussians, plane: Plane, views: int) -> _FieldScene:
         form = gaussians.count, gaussians.opacity is None, plane.height, plane.width, views

@@ -23,6 +23,7 @@ from ..backend.device import on_device, to_tensor
 from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
+from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Field, Report
 from ..graph.settings import TRACED_NAMES
 from ..project.footprint import Pose
@@ -150,7 +151,7 @@ def make_step(
     loss_of: Loss,
     shape: tuple[int, ...],
     state: Callable[[], Any] | None = None,
-    recordable: bool = True,
+    evaluation: Evaluation | None = None,
 ) -> Callable[..., Any]:
     """An optimiser step, recorded where the report can be.
 
@@ -160,7 +161,7 @@ def make_step(
         loss_of: loss of a batch.
         shape: of one observation.
         state: arrays that the report reads beside its arguments; None: none.
-        recordable: whether Dr.Jit can record the report; if not, each call is traced anew.
+        evaluation: of the report's Gaussians; None: one that Dr.Jit can record.
 
     Returns:
         ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
@@ -215,13 +216,15 @@ def make_step(
         dr.eval(adam, mean, trouble, told)
         return mean, trouble, told
 
-    if recordable:
+    if evaluation is None or evaluation.recordable:
         return Recorded(step, state)
 
     def unrecorded(*arguments: Any) -> tuple[Params, Trouble, StepReport]:
         # A recording takes its arguments as opaque: a row that is a constant of kernels would compile them anew.
         dr.make_opaque(arguments)
-        return step(*arguments)
+        result = step(*arguments)
+        evaluation.release()
+        return result
 
     return unrecorded
 

@@ -229,7 +229,7 @@ class Trainer:
                 params = {name: self.state.adam[name] for name in self.state.adam}
                 first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
                 evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
-            ends = self._loss, self._shape, state, self.graph.evaluation.recordable
+            ends = self._loss, self._shape, state, self.graph.evaluation
             self._steps[key] = make_step(report, self._rates(), *ends)
         return self._steps[key]
 

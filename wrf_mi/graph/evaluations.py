@@ -48,6 +48,10 @@ class Evaluation(Protocol):
         """
         ...
 
+    def release(self) -> None:
+        """Let go of what the last call kept for its reverse pass."""
+        ...
+
 
 class Splatted:
     """Gaussians splatted on the plane of directions (`wrf_mi.splat`); walls of a scene are no part of it."""
@@ -62,6 +66,9 @@ class Splatted:
     ) -> Complex:
         """See `Evaluation`."""
         return learned_field(gaussians, pose, plane, sphere)
+
+    def release(self) -> None:
+        """See `Evaluation`: nothing is kept."""
 
 
 def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluation:
