@@ -28,10 +28,12 @@ from wrf_mi.fit.compress import Compression  # noqa: E402
 from wrf_mi.fit.predictor import Predictor  # noqa: E402
 from wrf_mi.fit.step import device_pose  # noqa: E402
 from wrf_mi.fit.trainer import Trainer  # noqa: E402
+from wrf_mi.graph.evaluations import evaluation_of  # noqa: E402
 from wrf_mi.graph.graph import Batch, Graph  # noqa: E402
 from wrf_mi.graph.receivers import Form  # noqa: E402
 from wrf_mi.graph.settings import TracedConfig  # noqa: E402
 from wrf_mi.hybrid.materials import slab  # noqa: E402
+from wrf_mi.hybrid.pose import position_name, receiver_pose, turn_name  # noqa: E402
 from wrf_mi.project.footprint import depth_order  # noqa: E402
 from wrf_mi.project.ray import ray_footprints  # noqa: E402
 from wrf_mi.report.compressed import compress_run  # noqa: E402
@@ -147,6 +149,28 @@ def test_traced_gradient_is_the_splatted_one_for_small_gaussians(model: str, for
         for name in ("traced", "splatted")
     ]
     assert_close(*found, PROJECTED)
+
+
+def test_traced_gradient_of_the_receivers_pose_is_the_splatted_one_for_small_gaussians() -> None:
+    """Position and turn of the receiver, which its sensor's ``to_world`` carries."""
+    gaussians = MODELS["wrf-gs+"].gaussians(
+        {name: to_tensor(value) for name, value in parameters("wrf-gs+").items()}, to_tensor(TX.T)
+    )
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, 3 * FINE[0] * FINE[1])
+    plane = perception_plane(*FINE, mi.Float)
+
+    def greys(name: str) -> Any:
+        evaluate = evaluation_of(name, None, TracedConfig())
+
+        def of(params: Any) -> Any:
+            pose = receiver_pose(RECEIVERS[0], params, mi.Float)
+            re, im = evaluate(gaussians, pose, plane, False, params)
+            return dr.sqrt(re * re + im * im + 1e-8)
+
+        return of
+
+    values = {position_name(RECEIVERS[0]): np.full(3, 0.01), turn_name(RECEIVERS[0]): np.array([0.02, -0.01, 0.03])}
+    assert_close(*(gradients(values, greys(name), weights) for name in ("traced", "splatted")), PROJECTED)
 
 
 def made_record(rows: int = 60) -> tuple[Record, Any]:

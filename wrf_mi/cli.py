@@ -293,7 +293,7 @@ def _add_training(sub: Any) -> None:
     sub.add_argument("--scene", metavar="SCENE", help=text)
     text = "of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     sub.add_argument("--receiver", metavar="NAME", help=text)
-    text = "of Gaussians: splatted (default), or traced by the Mitsuba plugins, with a scene through its walls"
+    text = "of Gaussians: splatted (default), or traced by the Mitsuba plugins, with a scene through its walls (slower)"
     sub.add_argument("--evaluation", choices=get_args(EvaluationName), help=text)
     _add_tracing(sub)
     sub.add_argument(
