@@ -17,6 +17,7 @@ from wrf_mi.core import InputError
 from wrf_mi.core.settings import describe, settings_from, with_settings
 from wrf_mi.fit.config import PRESETS, TrainConfig
 from wrf_mi.fit.fields import make_field
+from wrf_mi.splat.skip import Skip
 
 
 def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -58,6 +59,8 @@ def good_values(name: str, default: Any) -> st.SearchStrategy[Any]:
         return st.sampled_from(["auto", "pixel", "array"])
     if name == "traced.materials":
         return st.sampled_from(["named", "surface"])
+    if name == "evaluation":
+        return st.sampled_from(["splatted", "traced"])
     if isinstance(default, str):
         return st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
     if name == "initial.nearest_m":  # not beyond the farthest
@@ -87,6 +90,9 @@ def configurations(draw: st.DrawFn) -> TrainConfig:
             # Gaussians start from one source.
             source = draw(st.sampled_from(SOURCES))
             values |= {other: "" for other in SOURCES if other != source}
+        if values.get("evaluation") == "traced":
+            # Only splatting skips.
+            values["skip"] = Skip()
         return kind(**values)
 
     return build(TrainConfig, "")

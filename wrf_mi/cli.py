@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 from . import __version__
 from .cli_bench import bench_command
@@ -18,6 +18,7 @@ from .cli_train import print_json, progress_bar, show_metrics, sweep_command, tr
 from .core import BackendError, InputError
 from .core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from .core.files import os_failure
+from .graph.settings import EvaluationName
 from .models import MODELS
 
 Arguments = argparse.Namespace
@@ -308,6 +309,8 @@ def _add_training(sub: Any) -> None:
     sub.add_argument("--scene", metavar="SCENE", help=text)
     text = "of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     sub.add_argument("--receiver", metavar="NAME", help=text)
+    text = "of Gaussians: splatted (default), or traced by the Mitsuba plugins, with a scene through its walls (slower)"
+    sub.add_argument("--evaluation", choices=get_args(EvaluationName), help=text)
     _add_tracing(sub)
     sub.add_argument(
         "--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory"

@@ -27,7 +27,7 @@ def train_command(a: Arguments) -> int:
         return 0
     if a.resume:
         names = ("dataset", "out", "model", "split", "n_train", "seed", "preset", "scene", "material", "receiver")
-        given = (*(getattr(a, name) for name in names), *_traced(a))
+        given = (*(getattr(a, name) for name in names), a.evaluation, *_traced(a))
         if any(value is not None for value in given) or _antennas(a) or a.set or a.deterministic:
             raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
         return _resume(a)
@@ -42,7 +42,8 @@ def trace_command(a: Arguments) -> int:
     """``trace``: what ray tracing alone predicts."""
     from .parallel import open_scheduler
 
-    a.model, a.receiver, a.preset, a.set, a.deterministic = RAY_TRACING, None, None, [], False
+    a.model, a.receiver, a.evaluation, a.preset = RAY_TRACING, None, None, None
+    a.set, a.deterministic = [], False
     asked = _arguments(a)
     with open_scheduler(a.scheduler) as scheduler:
         return _train(a, asked | {"scheduler": scheduler if a.scheduler else None})
@@ -99,6 +100,7 @@ def _arguments(a: Arguments) -> dict[str, Any]:
         settings = [*_preset(a, name), *settings]
     place = {"scene": a.scene, "material": a.material, "antennas": _antennas(a), "receiver": a.receiver}
     rows = {"split": "official" if a.split is None else a.split, "n_train": a.n_train, "seed": a.seed or 0}
+    rows["evaluation"] = a.evaluation
     return {"model": name, "settings": settings, "deterministic": a.deterministic, **place, **rows}
 
 

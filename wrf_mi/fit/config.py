@@ -12,7 +12,7 @@ from ..core import InputError
 from ..core.settings import with_settings
 from ..field.encoding import telling_scale
 from ..graph.receivers import AUTO
-from ..graph.settings import TracedConfig
+from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
 from ..splat.skip import Skip
 from ..trace.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 from .loop_config import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, RANGES, SHARE, AdamConfig, LoopConfig, Range, checked
@@ -173,6 +173,9 @@ class TrainConfig(LoopConfig):
             its magnitude at each direction (the papers'), ``"array"``: the Bartlett spectrum of the array's element
             signals, scaled as the instrument does; ``"auto"``: array with a scene, else pixel. Of signal strengths
             ``"power"``, of channels ``"csi"``.
+        evaluation: how Gaussians become signals on directions, in steps and predictions alike: ``"splatted"``, or
+            ``"traced"`` by ``mi.render`` with the Mitsuba plugins, where walls of a scene attenuate what is behind
+            them; a step then takes several times as long, and nothing is skipped.
         view: how an antenna sees the field, where observations are no spectra.
         skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
         traced: paths that are trained together with the Gaussians, where a scene is given.
@@ -189,6 +192,7 @@ class TrainConfig(LoopConfig):
     network: NetworkConfig = field(default_factory=NetworkConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     receiver: str = AUTO
+    evaluation: EvaluationName = SPLATTED
     view: ViewConfig = field(default_factory=ViewConfig)
     skip: Skip = field(default_factory=Skip)
     traced: TracedConfig = field(default_factory=TracedConfig)
@@ -212,6 +216,8 @@ class TrainConfig(LoopConfig):
         nearest, farthest = values["initial.nearest_m"], values["initial.farthest_m"]
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
+        if self.evaluation == TRACED and self.skip.error:
+            raise InputError("settings skip.contribution and skip.rest belong to evaluation=splatted; set them to 0")
 
 
 _RANGES: Mapping[str, Range] = {

@@ -72,8 +72,9 @@ class Predictor:
     ) -> None:
         self.receivers, self.reach = tuple(receivers), reach
         self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
-        # The operator and the recorded prediction are the magnitude at each direction.
-        self._pixels = field is not None and self.graph.scene is None and self.graph.form.receiver == PIXEL
+        # The operator and the recorded prediction are the splatted magnitude at each direction.
+        self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
+        self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
@@ -137,7 +138,7 @@ class Predictor:
     def _traced(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
     ) -> Any:
-        """What a receiver reports of both sides, flat; positions without paths are learned ones alone."""
+        """What a receiver reports of both sides, flat, unrecorded; positions without paths are learned ones alone."""
         side = self.graph.trace(tx_pos_m, receiver, heading_rad)
         if side is not None:
             side.refresh(self._params)
@@ -174,10 +175,10 @@ class Predictor:
         def found(part: slice) -> Any:
             return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weight[part])
 
-        return self._in_parts(len(tx_pos_m), receiver, side is not None, found)
+        return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """What a receiver reports of conditions [3 or features, at most `TOGETHER`] without a scene, flat."""
+        """What a receiver reports of conditions [3 or features, at most `TOGETHER`] recorded, flat."""
         if receiver not in self._reports:
             report = self.graph.report(receiver, None)
 
@@ -201,23 +202,22 @@ class Predictor:
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
         weight = None if self.reach is None else self.reach.weight(given, receiver)
-        traced = self.graph.scene is not None
 
         def found(part: slice) -> Any:
             own = None if weight is None else weight[part]
-            if traced:
-                return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
-            return self._learned(given[part].T, receiver, own)
+            if self._recordable:
+                return self._learned(given[part].T, receiver, own)
+            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
 
-        return self._in_parts(len(given), receiver, traced, found)
+        return self._in_parts(len(given), receiver, found)
 
-    def _in_parts(self, count: int, receiver: int, traced: bool, found: Callable[[slice], Any]) -> NDArray[Any]:
+    def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
         """Reports of so many transmitters from the flat ones of parts of them."""
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
         out = np.empty((count, *shape), np.float32)
-        together = max(TOGETHER, TRACED_NUMBERS // math.prod(shape)) if traced else TOGETHER
+        together = TOGETHER if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
         for start in range(0, count, together):
             part = slice(start, min(start + together, count))
             out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)

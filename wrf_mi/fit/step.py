@@ -21,6 +21,7 @@ from ..backend.device import on_device, to_float, to_tensor
 from ..core import Receiver
 from ..field.parts import AT_ONCE, gaussians_in_parts
 from ..field.recorded import Recorded
+from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Field, Report
 from ..project.footprint import Pose
 from ..splat.render import splat
@@ -116,8 +117,9 @@ def make_step(
     loss_of: Loss,
     shape: tuple[int, ...],
     state: Callable[[], Any] | None = None,
+    evaluation: Evaluation | None = None,
 ) -> Callable[..., Any]:
-    """A recorded optimiser step.
+    """An optimiser step, recorded where the report can be.
 
     Args:
         report: what a receiver reports of the graph, see `wrf_mi.graph.Graph.report`.
@@ -125,6 +127,7 @@ def make_step(
         loss_of: loss of a batch.
         shape: of one observation.
         state: arrays that the report reads beside its arguments; None: none.
+        evaluation: of the report's Gaussians; None: one that Dr.Jit can record.
 
     Returns:
         ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
@@ -164,7 +167,17 @@ def make_step(
         dr.eval(adam, mean, trouble, told)
         return mean, trouble, told
 
-    return Recorded(step, state)
+    if evaluation is None or evaluation.recordable:
+        return Recorded(step, state)
+
+    def unrecorded(*arguments: Any) -> tuple[Params, NonFiniteReport, StepReport]:
+        # A recording takes its arguments as opaque: a row that is a constant of kernels would compile them anew.
+        dr.make_opaque(arguments)
+        result = step(*arguments)
+        evaluation.release()
+        return result
+
+    return unrecorded
 
 
 def evaluated(

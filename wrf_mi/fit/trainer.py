@@ -115,6 +115,7 @@ class Trainer(TrainingLoop):
             scene,
             config.traced,
             record.tx_antenna,
+            config.evaluation,
         )
         self._shape = self.targets.truth.shape[2:]
         self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
@@ -210,7 +211,8 @@ class Trainer(TrainingLoop):
                 params = {name: self.state.adam[name] for name in self.state.adam}
                 first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
                 evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
-            self._steps[key] = make_step(report, self._rates(), self._loss, self._shape, own)
+            ends = self._loss, self._shape, own, self.graph.evaluation
+            self._steps[key] = make_step(report, self._rates(), *ends)
         return self._steps[key]
 
     def _rates(self) -> dict[str, float]:

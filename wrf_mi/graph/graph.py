@@ -1,8 +1,8 @@
-"""One graph of both sides: Gaussians evaluated by splatting, paths evaluated on planes, receivers that report both.
+"""One graph of both sides: Gaussians splatted or traced, paths evaluated on planes, receivers that report both.
 
-    tx position or uplink ─► Gaussians ─ splat ─► L(u) ─┐
-                                                        ├─► receiver model ─► spectrum, dBm, channel
-    tx position ─► chains of planes ─► T ───────────────┘
+    tx position or uplink ─► Gaussians ─ splat or trace ─► L(u) ─┐
+                                                                 ├─► receiver model ─► spectrum, dBm, channel
+    tx position ─► chains of planes ─► T ────────────────────────┘
 
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.field`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
@@ -26,12 +26,12 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..field import Factorised, Gaussians, WrfGs, WrfGsPlus
 from ..field.gaussians import by_component
-from ..hybrid.learned import learned_field
 from ..hybrid.pose import receiver_pose
 from ..project.footprint import Pose
 from ..splat.tiles import Plane
+from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form, ReceiverModel
-from .settings import DEFAULT, TracedConfig
+from .settings import DEFAULT, SPLATTED, TracedConfig
 
 if TYPE_CHECKING:
     from ..hybrid.traced import TracedField, TracedPaths
@@ -80,6 +80,7 @@ class Graph:
         scene: from `wrf_mi.trace.open_scene`, at the carrier; None: Gaussians alone.
         traced: what is traced, and rates.
         tx_antenna: antenna of the transmitters.
+        evaluation: of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
 
     Raises:
         InputError: a receiver model or a scene for which array or carrier are not known, or nothing to evaluate.
@@ -93,6 +94,7 @@ class Graph:
         scene: Any | None = None,
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
+        evaluation: str = SPLATTED,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
         array = self.kind.needs_array and any(one.array_m is None for one in receivers)
@@ -107,6 +109,7 @@ class Graph:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.form, self.tx_antenna = form, tx_antenna
+        self.evaluation = evaluation_of(evaluation, scene, traced)
         self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, one) for one in receivers)
 
     @property
@@ -223,7 +226,8 @@ class Graph:
             if self.field is None or not learned:
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if moved else batch.pose
-            return model(paths, learned_field(self.gaussians(params, batch, paths), here, batch.plane, model.sphere))
+            gaussians = self.gaussians(params, batch, paths)
+            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params))
 
         return report
 

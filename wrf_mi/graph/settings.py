@@ -1,10 +1,14 @@
-"""Settings of the traced side of a graph, plain values that a configuration file states."""
+"""Settings of a graph, plain values that a configuration file states."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
+EvaluationName = Literal["splatted", "traced"]
+"""Ways to evaluate Gaussians (`wrf_mi.graph.evaluations`)."""
+SPLATTED: EvaluationName = "splatted"
+TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.")
 """Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
 

@@ -44,8 +44,7 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
     upper = splat(gaussians, pose, plane)
     if not sphere:
         return upper
-    turned = Pose(pose.position, [[row[0], -row[1], -row[2]] for row in pose.to_world])
-    lower = splat(gaussians, turned, plane)
+    lower = splat(gaussians, facing_down(pose), plane)
     tensor_type: Any = dr.tensor_t(type(upper[0]))
     shape = (gaussians.batch, plane.pixels)
     re, im = (
@@ -53,6 +52,11 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
         for halves in zip(upper, lower, strict=True)
     )
     return re, im
+
+
+def facing_down(pose: Pose) -> Pose:
+    """The pose after half a turn about the receiver's x axis: its upper hemisphere is the lower one of ``pose``."""
+    return Pose(pose.position, [[row[0], -row[1], -row[2]] for row in pose.to_world])
 
 
 def hemisphere_pair(height: int, width: int) -> FloatArray:

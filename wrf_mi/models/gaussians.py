@@ -72,7 +72,7 @@ class FittedField(Fitted):
         form, config, antenna = self.form, self.config, Antenna(*map(str, self._arrays["tx_antenna"]))
         assert self.receivers is not None
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
-        graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna)
+        graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
         ends = self.field, self.params, self.receivers, *form.size, config.skip
         reach = _reach(self._arrays)
         return Predictor(*ends, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
@@ -165,7 +165,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         form = form_of(record, config, targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         field = None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)
-        Graph(field, receivers, form, scene, config.traced)
+        Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
         plan_rows(config, targets, rows, field is not None and scene is not None)
         drawn = np.random.default_rng([config.seed, 0])
         initial_gaussians(config.initial, replace(record, receivers=receivers), rows.train, drawn)
@@ -188,7 +188,7 @@ def _entry(name: str) -> Model:
         SOURCE,
         scene="optional",
         uplink="optional",
-        given=("model", "seed", "deterministic", "receiver"),
+        given=("model", "seed", "deterministic", "receiver", "evaluation"),
         presets=PRESETS,
         check=check,
         prepare=prepare,

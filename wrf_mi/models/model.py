@@ -159,8 +159,8 @@ class Model:
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from how the transmitter is turned.
         complete: whether it needs every receiver's observation of every training row.
-        given: those of the arguments ``model``, ``seed``, ``deterministic`` and ``receiver`` of `wrf_mi.train` that
-            are settings of its own.
+        given: those of the arguments ``model``, ``seed``, ``deterministic``, ``receiver`` and ``evaluation`` of
+            `wrf_mi.train` that are settings of its own.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
         presets: named settings, ``key=value``.
         check: ``check(problem, splits)`` raises `InputError` where a fit would, before anything is written.

@@ -18,6 +18,7 @@ from ..fit.checkpoint import append_log
 from ..fit.compress import Compression, compress
 from ..fit.loop import Progress
 from ..fit.predictor import Predictor
+from ..graph.settings import TRACED
 from ..measure import save_split
 from .evaluate import stored_metrics
 from .run_folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
@@ -89,6 +90,8 @@ def compress_run(
     asked, field = opened.config, opened.field
     if asked.scene is not None:
         raise InputError(f"{source}: trained together with the paths of {asked.scene}; compress a run without a scene")
+    if field.config.evaluation == TRACED:
+        raise InputError(f"{source}: evaluated by tracing; compress a run with evaluation=splatted")
     data = opened.problem.record
     split = load_rows(source, data)
     start = time.perf_counter()

@@ -56,6 +56,7 @@ def plan_run(
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
     receiver: str | None = None,
+    evaluation: str | None = None,
     split: str | Split = "official",
     n_train: int | float | None = None,
     seed: int = 0,
@@ -72,10 +73,13 @@ def plan_run(
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
     chosen = entry.serving(record.task, scene is not None)
+    if evaluation is not None and "evaluation" not in chosen.given:
+        raise InputError(f"--evaluation belongs to Gaussians (wrf-gs, wrf-gs+, factorised), not to {model}")
     if receiver is not None and "receiver" not in chosen.given:
         raise InputError(f"--receiver belongs to fields of spectra (wrf-gs, wrf-gs+, factorised), not to {model}")
     _check_place(chosen, record, place, material, antennas)
     given = {"model": model, "seed": seed, "deterministic": deterministic, "receiver": receiver}
+    given["evaluation"] = evaluation
     own = _settings_of(chosen, settings, given)
     if "seed" in chosen.given:
         seed, deterministic = own.seed, own.deterministic
@@ -119,6 +123,7 @@ def train(
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
     receiver: str | None = None,
+    evaluation: str | None = None,
     split: str | Split = "official",
     n_train: int | float | None = None,
     seed: int = 0,
@@ -139,6 +144,7 @@ def train(
         material: of a bare mesh.
         antennas: patterns and polarisations in place of what the data state; with a scene.
         receiver: ``"pixel"``, ``"array"`` or ``"auto"``, of models that have a choice.
+        evaluation: of Gaussians, ``"splatted"`` or ``"traced"`` (`wrf_mi.graph.evaluations`).
         split: name of a split (``blocked`` fits every fold in turn and pools the scores), or rows of your own.
         n_train: number or fraction of the training rows to use; None: all; 0: none, where a scene alone predicts.
         seed: of split and fit.
@@ -160,7 +166,7 @@ def train(
     if deterministic:  # before anything is read: whatever reads a data set may choose the GPU
         init("llvm", threads=1)
     place: dict[str, Any] = {"scene": scene, "material": material, "antennas": antennas, "receiver": receiver}
-    rows: dict[str, Any] = {"split": split, "n_train": n_train, "seed": seed}
+    rows: dict[str, Any] = {"split": split, "n_train": n_train, "seed": seed, "evaluation": evaluation}
     own: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
     problem, config, splits = plan_run(dataset, model, **place, **rows, **own)
     if config.deterministic:

@@ -39,6 +39,7 @@ OPTIONS = (
     "model",
     "scene",
     "material",
+    "evaluation",
     "split",
     "n-train",
     "seed",

@@ -1,0 +1,210 @@
+"""The traced evaluation of a graph's Gaussians: ``mi.render`` with `wrf_traced`, walls of its scene included.
+
+A scene is built once for each transmitter of a batch, and each call assigns what has changed by ``mi.traverse``. The
+reverse pass of ``mi.render`` reads the scene again, so two transmitters whose derivatives are asked for cannot take
+turns in one scene; without derivatives they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from wrf_mi.backend import init
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import numpy as np  # noqa: E402
+
+from wrf_mi.backend.device import to_float  # noqa: E402
+from wrf_mi.core import InputError  # noqa: E402
+from wrf_mi.core.angles import FloatArray  # noqa: E402
+from wrf_mi.field.gaussians import Gaussians  # noqa: E402
+from wrf_mi.graph.settings import DEFAULT, TracedConfig  # noqa: E402
+from wrf_mi.hybrid.follow import Complex  # noqa: E402
+from wrf_mi.hybrid.learned import facing_down  # noqa: E402
+from wrf_mi.hybrid.materials import Materials, slabs_of_faces  # noqa: E402
+from wrf_mi.project.footprint import Pose  # noqa: E402
+from wrf_mi.splat.tiles import Plane  # noqa: E402
+from wrf_mi.trace.surfaces import scene_surfaces  # noqa: E402
+
+from . import register_all  # noqa: E402
+from .shape import gaussian_shape, shape_parameters  # noqa: E402
+
+SHAPE = "gaussians"
+
+
+class SceneWalls:
+    """The surfaces of a Sionna RT scene as walls of another Mitsuba scene, one mesh for each material.
+
+    The Sionna RT scene is read and never changed: materials are copies, with parameters of their own.
+
+    Args:
+        scene: from `wrf_mi.trace.open_scene`.
+        materials: whether each named material or each surface has a permittivity and a conductivity, see
+            `wrf_mi.hybrid.materials`.
+
+    Attributes:
+        names: of the materials, or ``object/plane`` of the surfaces, in the order of the walls.
+        shapes: entries for ``mi.load_dict``, ``wall_0`` and so on. ``mi.traverse`` lists each ``wall_<k>.bsdf.eta_r``
+            (relative permittivity), ``.sigma`` (conductivity, S/m) and ``.d`` (thickness, m).
+        frequency_hz: carrier of the scene.
+
+    Raises:
+        InputError: a surface whose material is no slab.
+    """
+
+    def __init__(self, scene: Any, materials: Materials = "named") -> None:
+        surfaces = scene_surfaces(scene)
+        self._slabs, slab = slabs_of_faces(scene, surfaces, materials)
+        if (slab < 0).any():
+            thing = surfaces.called(int(surfaces.object_of(np.flatnonzero(slab < 0))[0]))
+            raise InputError(
+                f"object {thing}: its material is no slab, which no wave is traced through; choose another"
+            )
+        self._stated = self._slabs.constants(mi.Float)
+        self._used = np.unique(slab).tolist()
+        self.names = tuple(self._slabs.names[k] for k in self._used)
+        self.frequency_hz = float(scene.frequency[0])
+        self.shapes = {
+            f"wall_{i}": _mesh(f"wall_{i}", surfaces.triangles[slab == k], self._material(k))
+            for i, k in enumerate(self._used)
+        }
+
+    def _material(self, k: int) -> Any:
+        from sionna.rt import RadioMaterial
+
+        slabs = self._slabs
+        constants = slabs.permittivity[k], slabs.conductivity[k], slabs.thickness_m[k]
+        names = "relative_permittivity", "conductivity", "thickness"
+        return RadioMaterial(f"slab-{k}", **dict(zip(names, map(float, constants), strict=True)))
+
+    def values(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """What to assign in ``mi.traverse`` for trained materials, differentiable; those without stay as stated.
+
+        Args:
+            params: Dr.Jit tensors by the names of `wrf_mi.hybrid.materials.SlabMaterials.parameters`.
+        """
+        tables = self._slabs.tables(params, self._stated[:2])
+        return {
+            f"wall_{i}.bsdf.{name}": dr.gather(mi.Float, table, mi.UInt32(k))
+            for i, k in enumerate(self._used)
+            for name, table in zip(("eta_r", "sigma"), tables, strict=True)
+        }
+
+
+def _mesh(name: str, triangles: FloatArray, bsdf: Any) -> Any:
+    """A mesh of triangles [f, 3, 3], metres, world frame."""
+    props = mi.Properties()
+    props["mesh_bsdf"] = bsdf
+    mesh = mi.Mesh(name, vertex_count=3 * len(triangles), face_count=len(triangles), props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = to_float(triangles.reshape(-1))
+    params["faces"] = dr.arange(mi.UInt32, 3 * len(triangles))
+    params.update()
+    return mesh
+
+
+class _FieldScene:
+    """A scene of Gaussians and walls, with a perception plane for each view of the receiver."""
+
+    def __init__(self, gaussians: Gaussians, plane: Plane, views: int, walls: SceneWalls | None) -> None:
+        film = {"type": "hdrfilm", "width": plane.width, "height": plane.height, "rfilter": {"type": "box"}}
+        sensor = {"type": "wrf_perception_plane", "film": film | {"pixel_format": "luminance"}}
+        carrier = {} if walls is None else {"frequency_hz": walls.frequency_hz}
+        entries: dict[str, Any] = {"integrator": {"type": "wrf_traced"} | carrier, SHAPE: gaussian_shape(gaussians)}
+        entries |= {f"view_{i}": sensor for i in range(views)} | ({} if walls is None else walls.shapes)
+        # Not optimised: materials that are alike at first are not the same.
+        self.scene = mi.load_dict({"type": "scene"} | entries, optimize=False)
+        self.params = mi.traverse(self.scene)
+        self._assigned: list[str] = []
+
+    def render(self, values: Mapping[str, Any], views: int) -> list[Any]:
+        """Images [height, width, 2] of all views, after parameters took these values."""
+        for name, value in values.items():
+            self.params[name] = value
+        self.params.update()
+        self._assigned = list(values)
+        return [mi.render(self.scene, self.params, sensor=i) for i in range(views)]
+
+    def release(self) -> None:
+        """Detach what was assigned; the values stay."""
+        for name in self._assigned:
+            self.params[name] = dr.detach(self.params[name])
+
+
+class Traced:
+    """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`: `wrf_mi.graph.Evaluation`.
+
+    Derivatives reach Gaussians, the receiver's pose and the walls' materials. With a scene each Gaussian behind walls
+    is multiplied by what they pass of a wave polarised along the world's z axis. Scenes are built by the first calls
+    and whenever the number of Gaussians changes; Dr.Jit then finds each kernel compiled, but cannot record a call
+    (`dr.freeze`), which builds bounding volumes anew.
+
+    Args:
+        scene: from `wrf_mi.trace.open_scene`; None: no walls.
+        traced: what of the scene is trained.
+
+    Raises:
+        InputError: planes that training moves, or a material that is no slab.
+    """
+
+    recordable = False
+
+    def __init__(self, scene: Any | None = None, traced: TracedConfig = DEFAULT) -> None:
+        if scene is not None and traced.moves_planes:
+            remedy = "set traced.shift=0 and traced.tilt=0, or evaluation=splatted"
+            raise InputError(f"setting evaluation: traced walls stand where the scene has them; {remedy}")
+        register_all()
+        self._walls = None if scene is None else SceneWalls(scene, traced.materials)
+        self._scenes: list[_FieldScene] = []
+        self._form: tuple[Any, ...] = ()
+
+    def __call__(
+        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+    ) -> Complex:
+        """Complex signal on directions, in the order of `wrf_mi.hybrid.learned.learned_field`."""
+        poses = [pose, facing_down(pose)] if sphere else [pose]
+        if not gaussians.count:
+            pixels = gaussians.batch * len(poses) * plane.pixels
+            return dr.zeros(mi.Float, pixels), dr.zeros(mi.Float, pixels)
+        gaussians = gaussians.spread()
+        own = {f"view_{i}.to_world": _to_world(one) for i, one in enumerate(poses)}
+        if self._walls is not None:
+            own |= self._walls.values(params)
+        each = [
+            own | {f"{SHAPE}.{name}": value for name, value in shape_parameters(gaussians, k).items()}
+            for k in range(gaussians.batch)
+        ]
+        taking_turns = not dr.grad_enabled(each)
+        images = [
+            image
+            for k, values in enumerate(each)
+            for image in self._scene(0 if taking_turns else k, gaussians, plane, len(poses)).render(values, len(poses))
+        ]
+        flat = dr.concat([image.array for image in images])
+        index = 2 * dr.arange(mi.UInt32, dr.width(flat) // 2)
+        return dr.gather(mi.Float, flat, index), dr.gather(mi.Float, flat, index + 1)
+
+    def release(self) -> None:
+        """Detach the scenes' parameters.
+
+        Mitsuba's calls of materials read those of all scenes: what another scene traces would have derivatives by them.
+        """
+        for one in self._scenes:
+            one.release()
+
+    def _scene(self, number: int, gaussians: Gaussians, plane: Plane, views: int) -> _FieldScene:
+        form = gaussians.count, gaussians.opacity is None, plane.height, plane.width, views
+        if form != self._form:
+            self._form, self._scenes = form, []
+        while len(self._scenes) <= number:
+            self._scenes.append(_FieldScene(gaussians, plane, views, self._walls))
+        return self._scenes[number]
+
+
+def _to_world(pose: Pose) -> Any:
+    rows = [[*row, x] for row, x in zip(pose.to_world, pose.position, strict=True)]
+    return mi.AffineTransform4f(mi.Matrix4f([*rows, [0, 0, 0, 1]]))

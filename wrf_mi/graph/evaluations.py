@@ -1,0 +1,88 @@
+"""Ways to evaluate the Gaussians of a graph on a receiver's directions, by name.
+
+`Splatted` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
+`wrf_traced`; the plugins import this package, so they are imported where they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from ..core import InputError
+from ..core.registry import resolve
+from ..field import Gaussians
+from ..hybrid.follow import Complex
+from ..hybrid.learned import learned_field
+from ..project.footprint import Pose
+from ..splat.tiles import Plane
+from .settings import SPLATTED, TRACED, TracedConfig
+
+EVALUATIONS: Mapping[str, str] = {
+    SPLATTED: "wrf_mi.graph.evaluations:Splatted",
+    TRACED: "wrf_mi_plugins.evaluation:Traced",
+}
+"""Addresses of classes of (scene or None, `TracedConfig`) whose objects are an `Evaluation`."""
+
+
+class Evaluation(Protocol):
+    """Complex signal of Gaussians on a receiver's directions.
+
+    Attributes:
+        recordable: whether Dr.Jit can record a call (`dr.freeze`).
+    """
+
+    recordable: bool
+
+    def __call__(
+        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+    ) -> Complex:
+        """Real and imaginary part [batch * directions], see `wrf_mi.hybrid.learned.learned_field`.
+
+        Args:
+            gaussians: of one field for a batch of transmitters.
+            pose: of the receiver.
+            plane: pixels of a hemisphere.
+            sphere: the lower hemisphere too.
+            params: parameters of the graph by name, those of the scene's materials among them.
+        """
+        ...
+
+    def release(self) -> None:
+        """Let go of what the last call kept for its reverse pass."""
+        ...
+
+
+class Splatted:
+    """Gaussians splatted on the plane of directions (`wrf_mi.splat`); walls of a scene are no part of it."""
+
+    recordable = True
+
+    def __init__(self, scene: Any | None, traced: TracedConfig) -> None:
+        pass
+
+    def __call__(
+        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+    ) -> Complex:
+        """See `Evaluation`."""
+        return learned_field(gaussians, pose, plane, sphere)
+
+    def release(self) -> None:
+        """See `Evaluation`: nothing is kept."""
+
+
+def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluation:
+    """The evaluation of a name.
+
+    Args:
+        name: a key of `EVALUATIONS`.
+        scene: from `wrf_mi.trace.open_scene`; None: none.
+        traced: what of the scene is trained.
+
+    Raises:
+        InputError: no evaluation of that name, or one that cannot serve the scene.
+    """
+    if name not in EVALUATIONS:
+        raise InputError(f"setting evaluation: {name!r} is unknown; choose from {', '.join(EVALUATIONS)}")
+    made: Evaluation = resolve(EVALUATIONS[name])(scene, traced)
+    return made
