@@ -18,7 +18,8 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .spectrum_gains import Antennas, Slabs, coefficients, gains
+from ..trace.slab import slab
+from .spectrum_gains import Antennas, Slabs, gains
 from .spectrum_loss import Grid
 from .spectrum_rays import Met
 from .spectrum_sheets import KINDS, Frame, Known, Sheet
@@ -88,8 +89,8 @@ class Search:
         self._passed = []
         for kind in KINDS:
             permittivity, conductivity, thickness = (np.array([value]) for value in kind)
-            through = coefficients(np.ones(1), permittivity, conductivity, thickness, frequency_hz)[2]
-            self._passed.append(complex(through[0]))
+            passed = slab(np.ones(1), permittivity, conductivity, thickness, frequency_hz)
+            self._passed.append(complex(passed.transmitted_te[0]))
 
     def plane(self, frame: int, offset_m: float, kinds: int = len(KINDS)) -> Plane:
         """What a plane of a family would do."""
