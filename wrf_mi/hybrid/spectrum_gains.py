@@ -14,6 +14,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
+from ..trace.image_method import mirrored
 from ..trace.slab import slab
 from .spectrum_rays import Met
 
@@ -58,8 +59,8 @@ def gains(met: Met, slabs: Slabs, antennas: Antennas, frequency_hz: float) -> Co
     depth = met.thing.shape[1]
     directions = [-arrival]
     for level in reversed(range(depth)):
-        back = np.where(met.plane[:, level] >= 0, (directions[0] * met.normal[:, level]).sum(axis=1), 0.0)
-        directions.insert(0, directions[0] - 2 * back[:, None] * met.normal[:, level])
+        turned = mirrored(directions[0], met.normal[:, level])
+        directions.insert(0, np.where(met.plane[:, level, None] >= 0, turned, directions[0]))
     field: ComplexArray = antennas[0].field(directions[0]).astype(complex)
     for level in range(depth):
         row = np.flatnonzero(met.thing[:, level] >= 0)

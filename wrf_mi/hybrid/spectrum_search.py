@@ -18,6 +18,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..trace.image_method import mirrored
 from ..trace.slab import slab
 from .spectrum_gains import Antennas, Slabs, gains
 from .spectrum_loss import Grid
@@ -97,7 +98,7 @@ class Search:
         axes = self.frames[frame].axes
         normal = axes[2]
         height = self._tx @ normal - offset_m
-        image = self._tx - 2 * height[:, None] * normal - self._rx
+        image = mirrored(self._tx, normal, offset_m) - self._rx
         n = len(image)
         zeros = np.zeros((n, 1), np.int64)
         met = Met(zeros[:, 0], zeros[:, 0], image, zeros, zeros, np.broadcast_to(normal, (n, 1, 3)))
