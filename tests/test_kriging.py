@@ -11,6 +11,7 @@ import pytest
 from wrf_mi.baselines.kriging import Kriging, constant, log_distance
 from wrf_mi.baselines.trees import Trees
 from wrf_mi.core import InputError
+from wrf_mi.kriging import KrigingSystem, component_root
 from wrf_mi.measure import load, make_splits
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import summary
@@ -56,6 +57,24 @@ def test_universal_kriging_solves_the_augmented_system():
     variance = np.einsum("nq,nm,mq->q", values, left, values) / 23
     share = 1.3 - (weights * right).sum(axis=0)
     np.testing.assert_allclose(found.std, np.sqrt(share[:, None] * variance), atol=EXACT)
+
+
+def test_restricted_likelihood_is_that_of_contrasts_free_of_the_trend():
+    """Up to the volume of B: of A^T y, A an orthonormal basis of what B leaves, for many components of rank 25."""
+    positions, heading, rng = made(25)
+    k, b, values = (
+        covariance(positions, heading, positions, heading),
+        rng.normal(size=(25, 2)),
+        rng.normal(size=(25, 90)),
+    )
+    a = np.linalg.qr(np.concatenate([b, rng.normal(size=(25, 23))], axis=1))[0][:, 2:]
+    contrasts = a.T @ (k + 0.3 * np.eye(25)) @ a
+    power = np.trace(values.T @ a @ np.linalg.solve(contrasts, a.T @ values)) / 23
+    # |K| |B^T K^-1 B| = |A^T K A| |B^T B|
+    expected = 23 * np.log(power) + np.linalg.slogdet(contrasts)[1] + np.linalg.slogdet(b.T @ b)[1]
+    root = component_root(values)
+    assert root.shape == (25, 25)
+    assert KrigingSystem(k, 0.3, b).restricted_cost(root, 0.0) == pytest.approx(expected, rel=EXACT)
 
 
 def test_regression_kriging_adds_the_residuals_of_least_squares():

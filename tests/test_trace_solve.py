@@ -31,6 +31,7 @@ from wrf_mi.trace import TraceOptions, recompute, trace_paths
 from wrf_mi.trace import images as images_module
 from wrf_mi.trace import search as search_module
 from wrf_mi.trace import solve as solve_module
+from wrf_mi.trace.image_method import image_sources, meeting_point
 from wrf_mi.trace.materials import perfect_reflector
 
 SINGLE = 2e-4
@@ -91,6 +92,19 @@ def test_lengths_in_a_shoebox_are_those_of_the_mirror_images(shoebox: Any):
             np.testing.assert_allclose(own, image_lengths(tx[i], rx[k].position_m, 3), atol=EXACT_M)
     order = np.lexsort((paths.length_m, paths.tx, paths.rx))
     np.testing.assert_array_equal(order, np.arange(len(paths)))
+
+
+def test_images_in_a_corner_and_where_the_line_to_them_meets_a_plane():
+    """Three perpendicular planes reflect a point through their corner; a chain may end, or begin, with no plane."""
+    normal, offset = np.eye(3)[[2, 0, 1]], np.array([3.0, 1.0, 2.0])
+    source, target = np.array([0.2, 0.3, 0.5]), np.array([[0.7, 1.1, 1.4]])
+    images = image_sources(normal, offset, np.array([[0, 1, 2], [1, -1, -1], [-1, -1, 1]]), source)
+    np.testing.assert_allclose(images[0, [0, 1, 3]], [source, [0.2, 0.3, 5.5], [1.8, 3.7, 5.5]], rtol=1e-15)
+    np.testing.assert_allclose(images[1:, -1], [[1.8, 0.3, 0.5]] * 2, rtol=1e-15)
+    point, near, far = meeting_point(target, images[1:2, -1], normal[[1]], offset[[1]])
+    np.testing.assert_allclose([near, far], [[-0.3], [0.8]], rtol=1e-14)
+    np.testing.assert_allclose(point, target + 3 / 11 * (images[1, -1] - target), rtol=1e-14)
+    np.testing.assert_array_equal(meeting_point(target, target + np.eye(3)[1], normal[[1]], offset[[1]])[0], target)
 
 
 def test_points_of_reflection_lie_on_the_walls_that_are_named(shoebox: Any):

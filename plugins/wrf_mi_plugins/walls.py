@@ -12,12 +12,12 @@ init()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
-from scipy.constants import speed_of_light  # noqa: E402
 
 from wrf_mi.core import InputError  # noqa: E402
 from wrf_mi.project.footprint import Pose  # noqa: E402
 from wrf_mi.splat.rays import Walls  # noqa: E402
 from wrf_mi.trace.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ  # noqa: E402
+from wrf_mi.trace.slab import slab  # noqa: E402
 
 from .shape import interleave  # noqa: E402
 
@@ -112,7 +112,7 @@ def walls_of(
 ) -> Walls | None:
     """The complex transmission along rays, differentiable in the parameters of Sionna RT's radio materials.
 
-    Each wall is one slab, as in Sionna RT (ITU-R P.2040, eq. 43), and passes the receiver's polarisation by
+    Each wall is one slab (`wrf_mi.trace.slab`, as in Sionna RT), and passes the receiver's polarisation by
     T = T_TE s + T_TM (1 - s), where s is the share of it across the plane of incidence.
 
     Args:
@@ -124,21 +124,17 @@ def walls_of(
     Raises:
         InputError: a shape without a radio material, or one unknown at this frequency.
     """
-    from sionna.rt.utils import complex_relative_permittivity, itu_coefficients_single_layer_slab
-
     if not crossings.distance:
         return None
     constants = [radio_constants(shape, frequency_hz, thickness_m) for shape in shapes]
-    eta_r, sigma, slab = (interleave(list(column)) for column in zip(*constants, strict=True))
+    columns = [interleave(list(column)) for column in zip(*constants, strict=True)]
     re, im = mi.Float(1), mi.Float(0)
     passed = [(re, im)]
     for distance, cosine, across, wall in zip(
         crossings.distance, crossings.cosine, crossings.across, crossings.wall, strict=True
     ):
-        own = [dr.gather(mi.Float, c, wall) for c in (eta_r, sigma, slab)]
-        eta = complex_relative_permittivity(own[0], own[1], dr.two_pi * frequency_hz)
-        _, _, te, tm = itu_coefficients_single_layer_slab(cosine, eta, own[2], speed_of_light / frequency_hz)
-        t = te * across + tm * (1 - across)
+        c = slab(cosine, *(dr.gather(mi.Float, column, wall) for column in columns), frequency_hz)
+        t = c.transmitted_te * across + c.transmitted_tm * (1 - across)
         there = dr.isfinite(distance)
         t_re, t_im = dr.select(there, t.real, 1), dr.select(there, t.imag, 0)
         re, im = re * t_re - im * t_im, re * t_im + im * t_re

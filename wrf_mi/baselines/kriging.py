@@ -3,12 +3,8 @@
 An observation is a trend, a smooth field of zero mean and noise: y(x) = b(x) . beta + z(x) + e with
 Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared by all components of an observation
 (pixels, subcarriers), so that one Cholesky factor serves all of them; the variance s^2 and the trend are each
-component's own. Written over SciPy's Cholesky factor and not over scikit-learn's `GaussianProcessRegressor`, which
+component's own. Written over `wrf_mi.kriging` and not over scikit-learn's `GaussianProcessRegressor`, which
 has no trend, and whose likelihood stores a matrix of rows x rows for each component (6 GiB for 160 spectra).
-
-Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2, 2.7 and 5.4; Chiles and
-Delfiner, "Geostatistics" (2012), section 3.4 (universal kriging); Patterson and Thompson, "Recovery of inter-block
-information when block sizes are unequal" (1971) (restricted likelihood).
 """
 
 from __future__ import annotations
@@ -20,22 +16,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.linalg import LinAlgError
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
-from scipy.spatial.distance import cdist
 
 from wrf_mi.core import InputError, Prediction
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.kriging import KERNELS, KrigingSystem, component_root, correlation
 
 Trend = Callable[[FloatArray], FloatArray]
 """From positions [n, 3] to the columns [n, p] that the trend is a sum of."""
-
-KERNELS: dict[str, Callable[[FloatArray], FloatArray]] = {
-    "exponential": lambda d: np.exp(-d),
-    "matern32": lambda d: (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d),
-    "gaussian": lambda d: np.exp(-(d**2) / 2),
-}
-"""Correlation over the distance in lengths."""
 
 LENGTH_M = (0.01, 100.0)
 HEADING_LENGTH = (0.1, 100.0)
@@ -70,7 +58,7 @@ class KrigedMean:
     """What a fitted kriging predicts: a trend and weights of the training rows' correlations.
 
     Attributes:
-        kernel: a key of `KERNELS`.
+        kernel: a key of `wrf_mi.kriging.KERNELS`.
         lengths: correlation length in metres, and over headings where there are any.
         positions_m: of the rows [n, 3].
         circle: cosine and sine of their headings [n, 2], or None.
@@ -100,7 +88,7 @@ class KrigedMean:
             raise InputError(f"kriging: fitted with {had}; predict with the same")
         turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
         asked = _coordinates(positions_m, turned, self.lengths)
-        return KERNELS[self.kernel](cdist(asked, _coordinates(self.positions_m, self.circle, self.lengths)))
+        return correlation(asked, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
         """As `Kriging.predict`."""
@@ -134,7 +122,7 @@ class Kriging:
         length_m: correlation length in metres, or None.
         noise: variance of the noise as a share of the field's, or None.
         heading_length: correlation length over headings, in chords of the unit circle, or None; unused without.
-        kernel: a key of `KERNELS`.
+        kernel: a key of `wrf_mi.kriging.KERNELS`.
         trend: columns of the trend; one unknown mean by default.
         trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
             kriging), which a crowd of rows in one place pulls to itself.
@@ -202,13 +190,12 @@ class Kriging:
             columns = columns[:, :0]
         self._lengths, self.chosen_noise = self._choose(y - start, columns)
         try:
-            self._factor = cho_factor(self._covariance(slice(None), self._lengths, self.chosen_noise), lower=True)
+            self._system = self._factored(slice(None), columns, self._lengths, self.chosen_noise)
         except LinAlgError:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
-        self._whitened = solve_triangular(self._factor[0], columns, lower=True)
         field = y - start
-        beta = _trend_of(self._factor, columns, field)
-        weights = cho_solve(self._factor, field - columns @ beta)
+        beta = self._system.coefficients(field)
+        weights = self._system.weights(field, beta)
         self.mean = KrigedMean(
             self.kernel,
             self._lengths,
@@ -253,21 +240,17 @@ class Kriging:
         mean = self.predict(tx_pos, tx_heading_rad)
         positions = np.atleast_2d(np.asarray(tx_pos, float))
         cross = self.mean.correlations(positions, tx_heading_rad)
-        columns = self.trend(positions)[:, : self._whitened.shape[1]]
-        half = solve_triangular(self._factor[0], cross.T, lower=True)
-        share = 1 + self.chosen_noise - np.square(half).sum(axis=0)
-        if columns.shape[1]:
-            gap = columns - half.T @ self._whitened
-            share += (gap * np.linalg.solve(self._whitened.T @ self._whitened, gap.T).T).sum(axis=1)
-        std = np.sqrt(np.maximum(share, 0))[:, None] * np.sqrt(self._variance)
+        columns = self.trend(positions)[:, : self._system.trend.shape[1]]
+        share = self._system.variance(1.0, cross, columns) + self.chosen_noise
+        std = np.sqrt(share)[:, None] * np.sqrt(self._variance)
         return Prediction(mean, std.reshape(mean.shape))
 
-    def _covariance(self, rows: slice | NDArray[np.intp], lengths: FloatArray, noise: float) -> FloatArray:
+    def _factored(
+        self, rows: slice | NDArray[np.intp], columns: FloatArray, lengths: FloatArray, noise: float
+    ) -> KrigingSystem:
         circle = None if self._circle is None else self._circle[rows]
         x = _coordinates(self._positions[rows], circle, lengths)
-        covariance = KERNELS[self.kernel](cdist(x, x))
-        covariance[np.diag_indices_from(covariance)] += noise
-        return covariance
+        return KrigingSystem(correlation(x, x, self.kernel), noise, columns[rows])
 
     def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
         """Lengths and noise: as given, or of the greatest likelihood."""
@@ -280,7 +263,7 @@ class Kriging:
         rows = np.arange(len(field))
         if len(rows) > self.likelihood_rows:
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
-        root = _root(field[rows])
+        root = component_root(field[rows])
         if not root.any():
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
 
@@ -288,15 +271,10 @@ class Kriging:
             """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
             value[free] = np.exp(logarithm)
             try:
-                factor = cho_factor(self._covariance(rows, value[:-1], float(value[-1])), lower=True)[0]
+                system = self._factored(rows, columns, value[:-1], float(value[-1]))
             except LinAlgError:
                 return np.inf
-            half = solve_triangular(factor, root, lower=True)
-            basis, triangle = np.linalg.qr(solve_triangular(factor, columns[rows], lower=True))
-            left = max(np.square(half).sum() - np.square(basis.T @ half).sum(), np.finfo(float).tiny)
-            free_rows = len(rows) - columns.shape[1]
-            volumes = np.log(np.diag(factor)).sum() + np.log(np.abs(np.diag(triangle))).sum()
-            return float(free_rows / 2 * np.log(left) + volumes)
+            return system.restricted_cost(root, np.finfo(float).tiny) / 2
 
         start = self._start(rows)[free]
         simplex = np.concatenate([start[None], start + np.eye(len(start))])
@@ -326,24 +304,3 @@ def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: Fl
 def _circle(heading_rad: ArrayLike) -> FloatArray:
     heading = np.asarray(heading_rad, float)
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-
-
-def _trend_of(factor: tuple[FloatArray, bool], columns: FloatArray, field: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    """Coefficients [p, components] of generalised least squares; none for a trend without columns."""
-    if not columns.shape[1]:
-        return np.zeros((0, field.shape[1]), field.dtype)
-    whole = cho_solve(factor, columns)
-    beta: NDArray[np.inexact] = np.linalg.solve(columns.T @ whole, whole.T @ field)
-    return beta
-
-
-def _root(field: NDArray[np.inexact]) -> FloatArray:
-    """A matrix [n, r] with the same real part of Y Y^H as the components Y [n, q], r at most n.
-
-    The likelihood needs no more of them, and an image has many more pixels than there are rows.
-    """
-    parts = np.concatenate([field.real, field.imag], axis=1) if np.iscomplexobj(field) else field
-    if parts.shape[1] <= len(parts):
-        return np.ascontiguousarray(parts)
-    power, basis = np.linalg.eigh(parts @ parts.T)
-    return basis * np.sqrt(np.maximum(power, 0))

@@ -1,8 +1,7 @@
 """Image sources of an antenna in plane mirrors, and how clearly each is seen from where.
 
-Image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4. Beside the length of each path come
-its *margins*: how far, in metres, it is from being cut off by an outline, by which a hard decision turns into a
-probability.
+Image method (`wrf_mi.trace.image_method`). Beside the length of each path come its *margins*: how far, in metres, it is
+from being cut off by an outline, by which a hard decision turns into a probability.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..trace.image_method import image_sources, meeting_point
 from .walls import Walls
 
 AT_ONCE = 1 << 19
@@ -54,7 +54,7 @@ class Images:
 def images_of(walls: Walls, source_m: FloatArray, plane: IntArray) -> Images:
     """Mirror a source [3], or one of each chain [c, 3], at the planes of each chain [c, b] in turn."""
     count, depth = plane.shape
-    image = np.repeat(np.broadcast_to(source_m, (count, 3))[:, None], depth + 1, axis=1)
+    image = image_sources(walls.normal, walls.offset_m, plane, source_m)
     slope = np.zeros((count, depth, 3, 3))
     for level in range(depth):
         used = plane[:, level] >= 0
@@ -64,7 +64,6 @@ def images_of(walls: Walls, source_m: FloatArray, plane: IntArray) -> Images:
         n, centre, axes = walls.normal[q], walls.centre_m[q], walls.axes[q]
         here = image[:, level]
         height = (here * n).sum(axis=1) - walls.offset_m[q]
-        image[:, level + 1] = np.where(used[:, None], here - 2 * height[:, None] * n, here)
         before = slope[:, :level] - 2 * np.einsum("clkd,cd->clk", slope[:, :level], n)[..., None] * n[:, None, None]
         slope[:, :level] = np.where(used[:, None, None, None], before, slope[:, :level])
         tilt = np.einsum("cad,cd->ca", axes, here - centre)[..., None] * n[:, None] + height[:, None, None] * axes
@@ -149,12 +148,10 @@ def _part(
         inside, edge = np.full(len(row), np.inf), np.full(len(row), -1)
         for level in reversed(range(count)):
             q = images.plane[chain, level]
-            n, image = walls.normal[q], images.image_m[chain, level + 1]
-            here = (place * n).sum(axis=1) - walls.offset_m[q]
-            there = (image * n).sum(axis=1) - walls.offset_m[q]
-            through = here * there < 0
-            place = place + (image - place) * np.divide(here, here - there, out=here * 0, where=through)[:, None]
+            image = images.image_m[chain, level + 1]
+            place, here, there = meeting_point(place, image, walls.normal[q], walls.offset_m[q])
             flat = walls.flat(q, place)
+            through = here * there < 0
             through &= ((flat > walls.low_m[q] - reach_m) & (flat < walls.high_m[q] + reach_m)).all(axis=1)
             row, chain, place, flat, q = row[through], chain[through], place[through], flat[through], q[through]
             within, nearest = walls.inside_m(q, flat)
@@ -186,9 +183,9 @@ def _clear(walls: Walls, plane: IntArray, point_m: FloatArray, reach_m: float) -
             own = np.flatnonzero(plane[:, level] >= 0)
             cross[own, plane[own, level]] = False
         path, q = np.nonzero(cross)
-        here, there = before[path, q], after[path, q]
-        start, end = point_m[path, leg], point_m[path, leg + 1]
-        flat = walls.flat(q, start + (end - start) * (here / (here - there))[:, None])
+        ends = point_m[path, leg], point_m[path, leg + 1]
+        place, here, there = meeting_point(*ends, walls.normal[q], walls.offset_m[q])
+        flat = walls.flat(q, place)
         near = ((flat > walls.low_m[q] - reach_m) & (flat < walls.high_m[q] + reach_m)).all(axis=1)
         path, q, flat = path[near], q[near], flat[near]
         within, nearest = walls.inside_m(q, flat)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..core.angles import FloatArray
+from ..kriging import simple_weights
 
 NEIGHBOURS = 32
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
@@ -54,9 +55,9 @@ class Diffuse:
         between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
         matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
         across = self.share * np.sinc(self.k * distance / np.pi)
-        weight = np.linalg.solve(matrix, across[..., None])[..., 0]
+        weight, known = simple_weights(matrix, across)
         mean = np.einsum("mn,mnf->mf", weight, self.value[index])
-        return mean, self.power * np.maximum(1 - (weight * across).sum(axis=1), 1e-6)
+        return mean, self.power * np.maximum(1 - known, 1e-6)
 
 
 def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> Diffuse:

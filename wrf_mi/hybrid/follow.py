@@ -22,7 +22,7 @@ from scipy.constants import speed_of_light
 from ..core import Antenna
 from ..core.antenna import ANTENNA, POLE
 from ..project.footprint import Pose
-from .materials import slab
+from ..trace.slab import slab
 
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal: any plane of incidence will do."""
@@ -120,7 +120,7 @@ def follow(
         tx_antenna: antenna of the transmitters.
 
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
-    and 5.3; slabs as `wrf_mi.hybrid.materials.slab`.
+    and 5.3; slabs as `wrf_mi.trace.slab`.
     """
     image = list(chains.source_m)
     for level in chains.levels:

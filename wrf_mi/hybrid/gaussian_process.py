@@ -3,7 +3,7 @@
     y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
 
 beta is common to all receivers, so that what they have in common is learned from all of them at once; the fields f_r
-are independent, so that the exact posterior needs one Cholesky factor for each receiver and one of the size of beta.
+are independent, so that the exact posterior needs one Cholesky factor for each receiver (`wrf_mi.kriging`).
 The noise's heavy tails are reached by reweighting: a row whose residual is large has a larger variance.
 
 Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with
@@ -18,10 +18,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.linalg import LinAlgError
-from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from ..core.angles import FloatArray
+from ..kriging import KrigingSystem
 
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of places."""
@@ -47,15 +46,6 @@ class Part:
     variance: FloatArray
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """A receiver's factor and what it has solved: lower Cholesky factor [n, n], K^-1 phi [n, k], K^-1 y [n]."""
-
-    factor: FloatArray
-    basis: FloatArray
-    value: FloatArray
-
-
 class PooledProcess:
     """The posterior of all receivers.
 
@@ -74,22 +64,15 @@ class PooledProcess:
             point_variance: k(x, x).
 
         Raises:
-            LinAlgError: a covariance that is not positive definite.
+            numpy.linalg.LinAlgError: a covariance that is not positive definite.
         """
         self.parts, self.kernel, self.point_variance = tuple(parts), kernel, point_variance
-        precision, pull = np.diag(1 / np.square(prior_sd)), np.zeros(len(prior_sd))
-        self._solved = []
-        for part in self.parts:
-            matrix = kernel(part.places, part.places)
-            matrix[np.diag_indices_from(matrix)] += part.variance + JITTER * point_variance
-            factor = cholesky(matrix, lower=True, overwrite_a=True, check_finite=False) if len(matrix) else matrix
-            both = np.column_stack([part.basis, part.value])
-            solved = cho_solve((factor, True), both, check_finite=False) if len(matrix) else both
-            self._solved.append(_Solved(factor, solved[:, :-1], solved[:, -1]))
-            precision = precision + part.basis.T @ solved[:, :-1]
-            pull += part.basis.T @ solved[:, -1]
-        self._shared = cholesky(precision, lower=True)
-        self.beta: FloatArray = cho_solve((self._shared, True), pull)
+        jitter = JITTER * point_variance
+        self._systems = [KrigingSystem(kernel(p.places, p.places), p.variance + jitter, p.basis) for p in self.parts]
+        pairs = list(zip(self._systems, self.parts, strict=True))
+        self._information = np.diag(1 / np.square(prior_sd)) + sum(system.information for system in self._systems)
+        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
+        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
 
     def predict(self, receiver: int, places: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance of phi . beta + f, without noise, at m places, [m] each.
@@ -99,15 +82,9 @@ class PooledProcess:
             places: as the kernel takes them.
             basis: phi at each place, [m, k].
         """
-        part, solved = self.parts[receiver], self._solved[receiver]
-        cross = self.kernel(places, part.places)
-        mean = basis @ self.beta + cross @ (solved.value - solved.basis @ self.beta)
-        variance = np.full(len(basis), self.point_variance)
-        if len(part.value):
-            half = solve_triangular(solved.factor, cross.T, lower=True, check_finite=False)
-            variance -= np.square(half).sum(axis=0)
-        gap = solve_triangular(self._shared, (basis - cross @ solved.basis).T, lower=True)
-        return mean, np.maximum(variance, 0) + np.square(gap).sum(axis=0)
+        cross = self.kernel(places, self.parts[receiver].places)
+        mean = basis @ self.beta + cross @ self._weights[receiver]
+        return mean, self._systems[receiver].variance(self.point_variance, cross, basis, self._information)
 
     def reweighted(self, degrees: float, variance: Sequence[FloatArray]) -> list[Part]:
         """Parts whose variances follow their residuals, as a Student-t noise asks for.
@@ -120,13 +97,9 @@ class PooledProcess:
         v = scale (degrees + e^2 / scale) / (degrees + 1).
         """
         out = []
-        for part, solved, scale in zip(self.parts, self._solved, variance, strict=True):
-            if not len(part.value):
-                out.append(part)
-                continue
-            inverse = solve_triangular(solved.factor, np.eye(len(part.value)), lower=True, check_finite=False)
-            precision = np.square(inverse).sum(axis=0)
-            residual = part.variance * (solved.value - solved.basis @ self.beta)
+        for part, system, weights, scale in zip(self.parts, self._systems, self._weights, variance, strict=True):
+            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
+            residual = part.variance * weights
             square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
             out.append(replace(part, variance=scale * (degrees + square / scale) / (degrees + 1)))
         return out
@@ -143,13 +116,10 @@ def fit_pooled(
     """Fit, with ``rounds`` of reweighting for Student-t noise; see `PooledProcess`.
 
     Raises:
-        LinAlgError: a covariance that is not positive definite.
+        numpy.linalg.LinAlgError: a covariance that is not positive definite.
     """
     process = PooledProcess(parts, kernel, prior_sd, point_variance)
     scale = [part.variance for part in parts]
     for _ in range(rounds if np.isfinite(degrees) else 0):
         process = PooledProcess(process.reweighted(degrees, scale), kernel, prior_sd, point_variance)
     return process
-
-
-__all__ = ["Kernel", "LinAlgError", "Part", "PooledProcess", "fit_pooled"]

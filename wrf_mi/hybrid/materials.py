@@ -1,4 +1,4 @@
-"""Radio materials as parameters without bounds, and what a slab of them does to a wave.
+"""Radio materials as parameters without bounds.
 
 Relative permittivity 1 + exp(x) and conductivity exp(y) in S/m: an optimiser may move x and y freely, a step changes
 both by a factor, and the bounds (permittivity > 1, conductivity > 0) hold by construction.
@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import epsilon_0, speed_of_light
 
 from ..backend.device import on_device
 from ..core.angles import FloatArray
@@ -170,44 +168,3 @@ def physical(parameters: Mapping[str, NDArray[Any]]) -> dict[str, float]:
             for k, exp in enumerate(np.exp(np.ravel(np.asarray(value, float)))):
                 values[f"{name}[{k}]" if several else name] = least + float(exp)
     return values
-
-
-@dataclass
-class SlabCoefficients:
-    """Complex coefficients of p passages, as Dr.Jit's complex arrays: reflection and transmission, TE and TM."""
-
-    reflected_te: Any
-    reflected_tm: Any
-    transmitted_te: Any
-    transmitted_tm: Any
-
-
-def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, frequency_hz: float) -> SlabCoefficients:
-    """Reflection at and transmission through a homogeneous slab in air. Differentiable in all arrays.
-
-    The same equations as Sionna RT's ``itu_coefficients_single_layer_slab``, which computes in float32 whatever it is
-    given.
-
-    Args:
-        cosine: of the angle of incidence, any float type, [p].
-        permittivity: relative, [p].
-        conductivity: S/m, [p].
-        thickness_m: metres, [p].
-        frequency_hz: of the carrier.
-
-    Source: ITU-R P.2040-3, equations 37, 43 and 44.
-    """
-    kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)
-    eta = kind(permittivity, -conductivity / (2 * np.pi * frequency_hz * epsilon_0))
-    root = dr.sqrt(eta - (1 - cosine * cosine))
-    te = (cosine - root) / (cosine + root)
-    tm = (eta * cosine - root) / (eta * cosine + root)
-    once = dr.exp(kind(0, -2 * np.pi * frequency_hz / speed_of_light) * thickness_m * root)
-    twice = once * once
-    through_te, through_tm = (dr.rcp(1 - r * r * twice) for r in (te, tm))
-    return SlabCoefficients(
-        te * (1 - twice) * through_te,
-        tm * (1 - twice) * through_tm,
-        (1 - te * te) * once * through_te,
-        (1 - tm * tm) * once * through_tm,
-    )

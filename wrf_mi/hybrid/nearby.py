@@ -5,8 +5,7 @@ their phases against each other less than a step across it (`wrf_mi.hybrid.signa
 as fast as across it horizontally. Grey values are exponentially correlated over the position in lengths of its own on
 each of three axes, with one unknown mean; all of it of most likelihood.
 
-Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.7, 5.1 and 5.4; Dubrule,
-"Cross validation of kriging in a unique neighborhood" (1983) for rows held out.
+Source: `wrf_mi.kriging`.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from ..core.angles import FloatArray
+from ..kriging import KrigingSystem, component_root, correlation, left_out
 
 LENGTH = (0.03, 30.0)
 """Where the likelihood looks, in wavelengths."""
@@ -71,29 +70,22 @@ class NearbySpectra:
         self.tx_pos_m, self.observed = tx_pos_m, observed
         self.axes, self.length_m, self.noise = axes, length_m, noise
         n = len(tx_pos_m)
-        self._inverse = np.linalg.inv(self._correlation(tx_pos_m) + noise * np.eye(n))
-        mean = self._inverse.sum(axis=0) / self._inverse.sum()
-        self._mean = mean
-        # Weights of the observations are linear in the correlations: c (I - 1 mean^T) with the mean added.
-        self._centred = self._inverse - np.outer(self._inverse.sum(axis=1), mean)
+        self._system = KrigingSystem(self._correlation(tx_pos_m), noise, np.ones((n, 1)))
+        self._precision, self._mean = self._system.precision, self._system.coefficients(np.eye(n))[0]
 
     def _correlation(self, tx_pos_m: FloatArray) -> FloatArray:
-        turned = [positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m)]
-        return np.exp(-cdist(*turned))
+        here, there = (positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m))
+        return correlation(here, there)
 
     def predict(self, tx_pos_m: ArrayLike) -> NDArray[np.float32]:
         """Expected observations at positions [q, 3], metres."""
-        weights = self._correlation(np.asarray(tx_pos_m, float)) @ self._centred + self._mean
+        weights = self._correlation(np.asarray(tx_pos_m, float)) @ self._precision + self._mean
         return np.tensordot(weights.astype(np.float32), self.observed, 1)
 
     def std(self, tx_pos_m: ArrayLike) -> NDArray[np.float32]:
         """Standard deviation of observations at positions [q, 3], metres, about `predict`."""
-        correlation = self._correlation(np.asarray(tx_pos_m, float))
-        solved = correlation @ self._inverse
-        known = (solved * correlation).sum(axis=1)
-        # The last term is the mean's own uncertainty.
-        unknown = 1 + self.noise - known + (1 - solved.sum(axis=1)) ** 2 / self._inverse.sum()
-        return self._deviation(np.maximum(unknown, self.noise))
+        cross = self._correlation(np.asarray(tx_pos_m, float))
+        return self._deviation(self.noise + self._system.variance(1.0, cross, np.ones((len(cross), 1))))
 
     def _deviation(self, unknown: FloatArray) -> NDArray[np.float32]:
         share = np.sqrt(unknown).reshape(-1, *[1] * (self.observed.ndim - 1))
@@ -102,10 +94,10 @@ class NearbySpectra:
     @cached_property
     def _scale(self) -> FloatArray:
         """Standard deviation of the field, shape of an observation; of most restricted likelihood."""
-        centred = (self.observed - np.tensordot(self._mean.astype(np.float32), self.observed, 1)).reshape(
-            len(self.observed), -1
-        )
-        variance = np.einsum("np,np->p", self._inverse.astype(np.float32) @ centred, centred) / max(len(centred) - 1, 1)
+        flat = self.observed.reshape(len(self.observed), -1)
+        centred = flat - self._mean.astype(np.float32) @ flat
+        squares = np.einsum("np,np->p", self._precision.astype(np.float32) @ centred, centred)
+        variance = squares / max(len(centred) - 1, 1)
         return np.sqrt(np.maximum(variance, 0)).reshape(self.observed.shape[1:])
 
     def held_out(self, radius_m: float, rows: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -117,10 +109,7 @@ class NearbySpectra:
             block = np.flatnonzero(near)
             if len(block) == len(near):
                 continue
-            column = np.linalg.solve(self._centred[np.ix_(block, block)], (block == row).astype(float))
-            weights[number] = -column @ self._centred[block]
-            weights[number, block] = 0
-            unknown[number] = column[block == row][0]
+            weights[number], unknown[number] = left_out(self._precision, block, row)
         return np.tensordot(weights.astype(np.float32), self.observed, 1), self._deviation(unknown)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -164,19 +153,13 @@ def fit_nearby(
     local = tx_pos_m[chosen] @ axes.T / wavelength_m
     flat = observed[chosen].reshape(len(chosen), -1)
     flat = flat[:, :: max(round(flat.shape[1] / PIXELS), 1)].astype(float)
-    products = flat @ flat.T / flat.shape[1]
-    n = len(chosen)
+    root = component_root(flat) / np.sqrt(flat.shape[1])
+    mean = np.ones((len(chosen), 1))
 
     def cost(logarithms: FloatArray) -> float:
-        correlation = np.exp(-cdist(local / np.exp(logarithms[:3]), local / np.exp(logarithms[:3])))
-        factor = cho_factor(correlation + np.exp(logarithms[3]) * np.eye(n), lower=True, check_finite=False)
-        inverse = cho_solve(factor, np.eye(n), check_finite=False)
-        total = inverse.sum(axis=0)
-        # Restricted: one unknown mean for each pixel is projected out.
-        projected = inverse - np.outer(total, total) / total.sum()
-        variance = max(float((projected * products).sum()), VARIANCE) / (n - 1)
-        determinant = 2 * np.log(np.diag(factor[0])).sum() + np.log(total.sum())
-        return float((n - 1) * np.log(variance) + determinant) / n
+        scaled = local / np.exp(logarithms[:3])
+        system = KrigingSystem(correlation(scaled, scaled), np.exp(logarithms[3]), mean)
+        return system.restricted_cost(root, VARIANCE) / len(root)
 
     bounds = [tuple(np.log(LENGTH))] * 3 + [tuple(np.log(NOISE))]
     found = np.exp(minimize(cost, np.log(START), method="L-BFGS-B", bounds=bounds).x)

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from ..core.angles import FloatArray
+from ..kriging import KrigingSystem
 
 ComplexArray = NDArray[np.complex128]
 
@@ -127,16 +127,16 @@ def fit_shares(signal: ComplexArray, covariances: ComplexArray, steps: int, leas
     power = max(float(np.mean(np.abs(signal) ** 2)), least_power, TINY)
     weight, noise = np.full(count, power / count), 0.1 * power
     for step in range(steps + 1):
-        factor = cho_factor((weight @ flat).reshape(n, n) + noise * np.eye(n), lower=True, check_finite=False)
-        solved = cho_solve(factor, signal, check_finite=False)
+        system = KrigingSystem((weight @ flat).reshape(n, n), noise)
+        solved = system.solve(signal)
         if step == steps:
             break
-        inverse = cho_solve(factor, np.eye(n, dtype=complex), check_finite=False)
+        inverse = system.precision
         explained = (flat @ np.outer(solved.conj(), solved).ravel()).real
         expected = (flat @ inverse.T.ravel()).real
         weight = weight * np.sqrt(np.maximum(explained, 0) / np.maximum(expected, TINY))
         weight[weight < NEGLIGIBLE * weight.max()] = 0
         noise *= np.sqrt(float((np.abs(solved) ** 2).sum()) / float(np.trace(inverse).real))
         noise = max(noise, LEAST_NOISE * power)
-    cost = float((signal.conj() @ solved).real + 2 * np.log(np.diag(factor[0]).real).sum())
+    cost = float((signal.conj() @ solved).real) + system.log_determinant
     return Shares(weight, noise, cost)

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from ..core.angles import FloatArray
+from ..kriging import KrigingSystem, left_out
 from ..receive.beams import mirror_order
 from ..receive.retrieve import align_signals
 from .signal_kernels import ComplexArray, Covariances, Shares, fit_shares
@@ -86,12 +86,8 @@ class SignalProcess:
         self.basis, self.weight, self.noise = basis, weight, noise
         self._components: ComplexArray = signals @ basis.conj()
         own = covariances.mixed(tx_pos_m, tx_pos_m, weight)
-        n = len(tx_pos_m)
         self._inverse: ComplexArray = np.stack(
-            [
-                cho_solve(cho_factor(part + level * np.eye(n), lower=True), np.eye(n, dtype=complex))
-                for part, level in zip(own, noise, strict=True)
-            ]
+            [KrigingSystem(part, level).precision for part, level in zip(own, noise, strict=True)]
         )
         self._solved: ComplexArray = np.einsum("cij,jc->ci", self._inverse, self._components)
 
@@ -112,10 +108,7 @@ class SignalProcess:
         return Posterior(mean @ self.basis.T, np.maximum(variance, self.noise), self.basis, self.prior)
 
     def held_out(self, radius_m: float, rows: NDArray[np.int64]) -> Posterior:
-        """Posterior at training rows [q] from the rows further away than ``radius_m``.
-
-        Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), section 5.4.2, for blocks.
-        """
+        """Posterior at training rows [q] from the rows further away than ``radius_m``."""
         mean = np.zeros((len(rows), len(self.noise)), complex)
         variance = np.zeros(mean.shape)
         near = cdist(self.tx_pos_m[rows], self.tx_pos_m) <= radius_m
@@ -124,12 +117,9 @@ class SignalProcess:
             if len(block) == near.shape[1]:
                 variance[number] = self.prior
                 continue
-            place = int(np.flatnonzero(block == row)[0])
-            unit = np.eye(len(block))[place]
             for c, inverse in enumerate(self._inverse):
-                column = np.linalg.solve(inverse[np.ix_(block, block)], unit)
-                mean[number, c] = self._components[row, c] - column.conj() @ self._solved[c, block]
-                variance[number, c] = column[place].real
+                weights, variance[number, c] = left_out(inverse, block, row)
+                mean[number, c] = weights @ self._components[:, c]
         return self._posterior(mean, variance)
 
     def arrays(self) -> dict[str, NDArray]:

@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..trace.image_method import mirrored
 from .spectrum_gains import Antennas, Slabs, gains
 from .spectrum_loss import Grid
 from .spectrum_rays import ChainTable, Met
@@ -82,15 +83,13 @@ class Waves:
         self.met, self.count, self._antennas, self._elements = table(tx_pos_m), len(tx_pos_m), antennas, elements_m
         self._hz, self.wavenumber = frequency_hz, 2 * np.pi * frequency_hz / speed_of_light
         # An image moves by twice a plane's displacement, mirrored by what reflects after it: exactly linear.
-        normal = np.zeros((0, 3)) if table.surfaces is None else table.surfaces.normal
-        self._moved = np.zeros((len(normal), len(self.met), 3))
+        self._moved = np.zeros((len(table.normal), len(self.met), 3))
         levels = table.chain[self.met.chain]
         for level in range(levels.shape[1]):
             row = np.flatnonzero(levels[:, level] >= 0)
-            shift = 2 * normal[levels[row, level]]
+            shift = 2 * table.normal[levels[row, level]]
             for after in reversed(range(level)):  # towards the receiver, which is the chain's beginning
-                n = normal[levels[row, after]]
-                shift = shift - 2 * (shift * n).sum(axis=1, keepdims=True) * n
+                shift = mirrored(shift, table.normal[levels[row, after]])
             np.add.at(self._moved, (levels[row, level], row), shift)
         self.sum = sparse.csr_matrix(
             (np.ones(len(self.met)), (self.met.tx, np.arange(len(self.met)))), shape=(self.count, len(self.met))

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import epsilon_0, speed_of_light
+from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
+from ..trace.image_method import mirrored
+from ..trace.slab import slab
 from .spectrum_rays import Met
 
 ComplexArray = NDArray[np.complex128]
@@ -38,27 +40,6 @@ class Slabs:
     thickness_m: FloatArray
 
 
-def coefficients(
-    cosine: FloatArray, permittivity: FloatArray, conductivity: FloatArray, thickness_m: FloatArray, frequency_hz: float
-) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Reflection (TE, TM) at and transmission (TE, TM) through a homogeneous slab in air, as `materials.slab`.
-
-    Source: ITU-R P.2040-3, equations 37, 43 and 44.
-    """
-    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * epsilon_0)
-    root = np.sqrt(eta - (1 - cosine**2))
-    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
-    once = np.exp(-2j * np.pi * frequency_hz / speed_of_light * thickness_m * root)
-    twice = once**2
-    through_te, through_tm = 1 / (1 - te**2 * twice), 1 / (1 - tm**2 * twice)
-    return (
-        te * (1 - twice) * through_te,
-        tm * (1 - twice) * through_tm,
-        (1 - te**2) * once * through_te,
-        (1 - tm**2) * once * through_tm,
-    )
-
-
 def gains(met: Met, slabs: Slabs, antennas: Antennas, frequency_hz: float) -> ComplexArray:
     """Lambda / (4 pi length) times interactions and antennas' fields of each path, without the phase of travelling.
 
@@ -78,8 +59,8 @@ def gains(met: Met, slabs: Slabs, antennas: Antennas, frequency_hz: float) -> Co
     depth = met.thing.shape[1]
     directions = [-arrival]
     for level in reversed(range(depth)):
-        back = np.where(met.plane[:, level] >= 0, (directions[0] * met.normal[:, level]).sum(axis=1), 0.0)
-        directions.insert(0, directions[0] - 2 * back[:, None] * met.normal[:, level])
+        turned = mirrored(directions[0], met.normal[:, level])
+        directions.insert(0, np.where(met.plane[:, level, None] >= 0, turned, directions[0]))
     field: ComplexArray = antennas[0].field(directions[0]).astype(complex)
     for level in range(depth):
         row = np.flatnonzero(met.thing[:, level] >= 0)
@@ -88,10 +69,9 @@ def gains(met: Met, slabs: Slabs, antennas: Antennas, frequency_hz: float) -> Co
         before, after, normal = directions[level][row], directions[level + 1][row], met.normal[row, level]
         which, mirror = met.thing[row, level], met.plane[row, level] >= 0
         cosine = np.abs((before * normal).sum(axis=1))
-        r_te, r_tm, t_te, t_tm = coefficients(
-            cosine, slabs.permittivity[which], slabs.conductivity[which], slabs.thickness_m[which], frequency_hz
-        )
-        te, tm = np.where(mirror, r_te, t_te), np.where(mirror, r_tm, t_tm)
+        c = slab(cosine, slabs.permittivity[which], slabs.conductivity[which], slabs.thickness_m[which], frequency_hz)
+        te = np.where(mirror, c.reflected_te, c.transmitted_te)
+        tm = np.where(mirror, c.reflected_tm, c.transmitted_tm)
         across = _unit_or(np.cross(before, normal), _any_across(before))
         s, p = (field[row] * across).sum(axis=1), (field[row] * np.cross(across, before)).sum(axis=1)
         field[row] = (te * s)[:, None] * across + (tm * p)[:, None] * np.cross(across, after)

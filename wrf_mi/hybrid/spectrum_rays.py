@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..trace.image_method import image_sources, meeting_point
 from ..trace.search import shoot
 from ..trace.surfaces import Surfaces, find_planes
 
@@ -128,7 +129,9 @@ class ChainTable:
         self._scene: Any = None if opened_room is None else opened_room[0]
         self.surfaces: Surfaces | None = None if opened_room is None else opened_room[1]
         self._things = np.zeros(0, np.int64)
+        self.normal, self.offset_m = np.zeros((0, 3)), np.zeros(0)
         if self.surfaces is not None:
+            self.normal, self.offset_m = self.surfaces.normal, self.surfaces.offset
             self._things = np.full(int(self.surfaces.shape_ids.max(initial=0)) + 1, -1)
             self._things[self.surfaces.shape_ids] = np.arange(len(self.surfaces.names))
 
@@ -144,18 +147,8 @@ class ChainTable:
             tx_pos_m: of each path [p, 3].
             chain: of each path [p].
         """
-        planes = self.chain[chain]
-        out = np.empty((len(chain), planes.shape[1] + 1, 3))
-        out[:, planes.shape[1]] = here = np.array(tx_pos_m, float)
         # From the receiver on, the last plane of a chain is the first that the transmitter's wave meets.
-        for level in reversed(range(planes.shape[1])):
-            used = planes[:, level] >= 0
-            if self.surfaces is not None and used.any():
-                n, d = self.surfaces.normal[planes[used, level]], self.surfaces.offset[planes[used, level]]
-                here = here.copy()
-                here[used] -= 2 * ((here[used] * n).sum(axis=1) - d)[:, None] * n
-            out[:, level] = here
-        return out
+        return image_sources(self.normal, self.offset_m, self.chain[chain][:, ::-1], tx_pos_m)[:, ::-1]
 
     def __call__(self, tx_pos_m: FloatArray) -> Met:
         """Unobstructed paths of transmitters [n, 3] in metres, through at most ``passed`` surfaces."""
@@ -185,11 +178,8 @@ class ChainTable:
                 break
             s, which = self.surfaces, planes[row, level]
             assert s is not None
-            n, d = s.normal[which], s.offset[which]
-            near, far = (here[row] * n).sum(axis=1) - d, (images[row, level] * n).sum(axis=1) - d
+            met, near, far = meeting_point(here[row], images[row, level], s.normal[which], s.offset[which])
             fine = near * far < 0
-            share = near / np.where(fine, near - far, 1.0)
-            met = here[row] + (images[row, level] - here[row]) * share[:, None]
             along = np.einsum("pc,pac->pa", met, s.axes[which])
             fine &= ((along >= s.low[which] - MARGIN_M) & (along <= s.high[which] + MARGIN_M)).all(axis=1)
             here[row] = vertices[row, level] = met

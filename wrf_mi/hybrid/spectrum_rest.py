@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.distance import cdist
 
 from ..core.angles import FloatArray
+from ..kriging import KrigingSystem, correlation
 
 COMPONENTS = 64
 """Principal images of the rest that are kept: the square of a 4 x 4 array's spectrum has 49 degrees of freedom."""
@@ -90,21 +89,16 @@ class Rest:
         scale = np.sqrt(value[kept])
         image = (vector[:, kept] / scale).T @ flat
         length_m = kind.wavelengths * wavelength_m
-        factor = cho_factor(_alike(place_m, place_m, length_m) + kind.noise * np.eye(len(place_m)))
-        values, mean = vector[:, kept] * scale, np.zeros(len(kept))
-        if kind.centred:
-            each = cho_solve(factor, np.ones(len(place_m)))
-            mean = each @ values / each.sum()
-        weight = cho_solve(factor, values - mean)
+        scaled, values = place_m / length_m, vector[:, kept] * scale
+        trend = np.ones((len(place_m), int(kind.centred)))
+        system = KrigingSystem(correlation(scaled, scaled), kind.noise, trend)
+        mean = system.coefficients(values)
         images = image.reshape(-1, *rest.shape[1:]).astype(np.float32)
-        return cls(place_m, length_m, weight, images, mean, kind.share)
+        return cls(place_m, length_m, system.weights(values, mean), images, mean.sum(axis=0), kind.share)
 
     def __call__(self, place_m: FloatArray, predicted: NDArray[np.float32]) -> NDArray[np.float32]:
         """Spectra at positions [m, 3] of which the room predicts [m, height, width]; 0..1."""
-        value = (_alike(place_m, self.place_m, self.length_m) @ self.weight + self.mean).astype(np.float32)
+        alike = correlation(place_m / self.length_m, self.place_m / self.length_m)
+        value = (alike @ self.weight + self.mean).astype(np.float32)
         added = np.tensordot(value, self.image, axes=1)
         return np.asarray(np.clip(np.float32(self.share) * predicted + added, 0, 1))
-
-
-def _alike(a_m: FloatArray, b_m: FloatArray, length_m: float) -> FloatArray:
-    return np.asarray(np.exp(-cdist(a_m, b_m) / length_m))

@@ -18,7 +18,9 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .spectrum_gains import Antennas, Slabs, coefficients, gains
+from ..trace.image_method import mirrored
+from ..trace.slab import slab
+from .spectrum_gains import Antennas, Slabs, gains
 from .spectrum_loss import Grid
 from .spectrum_rays import Met
 from .spectrum_sheets import KINDS, Frame, Known, Sheet
@@ -88,15 +90,15 @@ class Search:
         self._passed = []
         for kind in KINDS:
             permittivity, conductivity, thickness = (np.array([value]) for value in kind)
-            through = coefficients(np.ones(1), permittivity, conductivity, thickness, frequency_hz)[2]
-            self._passed.append(complex(through[0]))
+            passed = slab(np.ones(1), permittivity, conductivity, thickness, frequency_hz)
+            self._passed.append(complex(passed.transmitted_te[0]))
 
     def plane(self, frame: int, offset_m: float, kinds: int = len(KINDS)) -> Plane:
         """What a plane of a family would do."""
         axes = self.frames[frame].axes
         normal = axes[2]
         height = self._tx @ normal - offset_m
-        image = self._tx - 2 * height[:, None] * normal - self._rx
+        image = mirrored(self._tx, normal, offset_m) - self._rx
         n = len(image)
         zeros = np.zeros((n, 1), np.int64)
         met = Met(zeros[:, 0], zeros[:, 0], image, zeros, zeros, np.broadcast_to(normal, (n, 1, 3)))

@@ -30,6 +30,7 @@ from ..core import InputError
 from ..field.gaussians import Gaussians
 from ..project.footprint import Footprints, Pose, depth_order, project
 from .blend import _along_azimuth, _footprint, pack, read
+from .recurrence import Pair, ahead
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -95,31 +96,23 @@ def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
 
 @dataclass
 class _Walk:
-    """Where the next entry of each pixel of a lane goes, and its transmittance (re, im) so far."""
+    """Where the next entry of each pixel of a lane goes, and its transmittance so far."""
 
     place: list[Any]
-    t_re: list[Any]
-    t_im: list[Any]
+    t: list[Pair]
 
 
-def _store(record: list[Any], i: Any, strip: Plane, walk: _Walk, product: bool, out: tuple[Any, ...]) -> _Walk:
+def _store(record: list[Any], i: Any, strip: Plane, walk: _Walk, out: tuple[Any, ...]) -> _Walk:
     """Write one Gaussian's weight at each pixel of a lane that sees it; the walk behind it."""
-    place, t_re, t_im = [], [], []
-    for k, g in enumerate(_seen(record, strip)):
-        hit, at, x, y = (g > 0) & strip.active[k], walk.place[k], walk.t_re[k], walk.t_im[k]
-        alpha = g if product else record[9] * g
-        dr.scatter(out[0], i, at, hit)
-        dr.scatter(out[1], x * alpha, at, hit)
-        if product:
-            dr.scatter(out[2], y * alpha, at, hit)
-            u, v = 1 - g * (1 - record[9]), g * record[10]
-            t_re.append(x * u - y * v)
-            t_im.append(x * v + y * u)
-        else:
-            t_re.append(dr.fma(-x, alpha, x))
-            t_im.append(y)
-        place.append(dr.select(hit, at + 1, at))
-    return _Walk(place, t_re, t_im)
+    result = _Walk([], [])
+    for g, active, at, t in zip(_seen(record, strip), strip.active, walk.place, walk.t, strict=True):
+        hit = (g > 0) & active
+        weight, after = ahead(record[9:], g, t)
+        for array, value in zip(out, (i, *weight), strict=True):
+            dr.scatter(array, value, at, hit)
+        result.place.append(dr.select(hit, at + 1, at))
+        result.t.append(after)
+    return result
 
 
 @dr.syntax
@@ -139,10 +132,10 @@ def _fill(
     """
     float_type, index_type = type(table), type(lists.index)
     j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
-    walk = _Walk(place, [float_type(1)] * LANE_ROWS, [float_type(0)] * LANE_ROWS)
+    walk = _Walk(place, [(float_type(1), float_type(0)) for _ in place])
     while j < end:
         i = dr.gather(index_type, lists.index, start + j)
-        walk = _store(read(table, i, 11 if product else 10), i, strip, walk, product, out)
+        walk = _store(read(table, i, 11 if product else 10), i, strip, walk, out)
         j += 1
     dr.eval(out)
 

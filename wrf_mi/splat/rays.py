@@ -1,7 +1,7 @@
 """Complex blending along rays: the traced evaluation, with its derivatives.
 
-The sum is that of `wrf_mi.splat.blend`, with the response of the 3D Gaussian along the ray in place of the projected
-footprint (`wrf_mi.project.ray`) and, where walls stand between, their complex transmission W:
+The sum is that of `wrf_mi.splat.recurrence`, with the response of the 3D Gaussian along the ray in place of the
+projected footprint (`wrf_mi.project.ray`) and, where walls stand between, their complex transmission W:
 
     R = sum_i w_i S_i W(t_i) T_i,   T_{i+1} = T_i b_i
 
@@ -18,8 +18,9 @@ from typing import Any
 import drjit as dr
 
 from ..project.ray import RAY_FIELDS, RayFootprints, peak_distance, response, response_slope
-from .blend import RECORD, behind_alpha, behind_product, pack, read
+from .blend import RECORD, pack, read
 from .bundles import Bundles, RayLists
+from .recurrence import Rest, Sum, ahead, before, behind, conjugate_times, plus, times
 
 
 @dataclass
@@ -68,46 +69,25 @@ def _passed(setting: _Setting, ray: Any, distance: Any) -> tuple[Any, Any, Any]:
     return *(dr.gather(type(distance), f, slot) for f in setting.factor), slot
 
 
-def _signal(setting: _Setting, record: list[Any], parts: Any, ray: Any, depth: Any) -> tuple[Any, Any, Any]:
+def _signal(setting: _Setting, record: list[Any], parts: Any, ray: Any, depth: Any) -> tuple[Any, Any]:
     """The Gaussian's signal as it comes through the walls, and what let it pass."""
     re, im = record[RAY_FIELDS : RAY_FIELDS + 2]
     if setting.walls is None:
-        return re, im, None
+        return (re, im), None
     passed = _passed(setting, ray, peak_distance(depth, parts))
-    return re * passed[0] - im * passed[1], re * passed[1] + im * passed[0], passed
+    return times(passed[:2], (re, im)), passed
 
 
-def _ahead(record: list[Any], g: Any, s: tuple[Any, Any], t: list[Any], product: bool) -> tuple[Any, Any, list[Any]]:
-    """One Gaussian's part of the sum, and the transmittance behind it (real under alpha blending)."""
-    if not product:
-        weight = t[0] * g * record[-1]
-        return weight * s[0], weight * s[1], [t[0] - t[0] * g * record[-1]]
-    d_re, d_im = record[-2:]
-    u, v = 1 - g * (1 - d_re), g * d_im
-    re, im = s[0] * t[0] - s[1] * t[1], s[0] * t[1] + s[1] * t[0]
-    return g * re, g * im, [t[0] * u - t[1] * v, t[0] * v + t[1] * u]
-
-
-@dataclass
-class _Sum:
-    """Blending so far, for each ray of a lane: sum (re, im) and transmittance (re, and im under product blending)."""
-
-    re: list[Any]
-    im: list[Any]
-    t: list[list[Any]]
-
-
-def _add(record: list[Any], depth: Any, so_far: _Sum, setting: _Setting) -> _Sum:
+def _add(record: list[Any], depth: Any, so_far: Sum, setting: _Setting) -> Sum:
     """One more Gaussian, behind all before it."""
-    re, im, t = [], [], []
+    result = Sum([], [])
     for k, ray in enumerate(setting.bundles.ray):
         parts = response(record, setting.bundles.direction[k])
-        s_re, s_im, _ = _signal(setting, record, parts, ray, depth)
-        own_re, own_im, behind = _ahead(record, parts[0], (s_re, s_im), so_far.t[k], setting.product)
-        re.append(so_far.re[k] + own_re)
-        im.append(so_far.im[k] + own_im)
-        t.append(behind)
-    return _Sum(re, im, t)
+        signal, _ = _signal(setting, record, parts, ray, depth)
+        weight, after = ahead(record[RAY_FIELDS + 2 :], parts[0], so_far.t[k])
+        result.total.append([plus(so_far.total[k][0], weight, signal)])
+        result.t.append(after)
+    return result
 
 
 def _record(setting: _Setting, i: Any) -> tuple[list[Any], Any]:
@@ -120,11 +100,7 @@ def _record(setting: _Setting, i: Any) -> tuple[list[Any], Any]:
 def _forward(setting: _Setting) -> tuple[Any, Any]:
     float_type, index_type = type(setting.table), type(setting.lists.index)
     bundles = setting.bundles
-    rays = range(len(bundles.ray))
-    one = [1, 0] if setting.product else [1]
-    state = _Sum(
-        [float_type(0) for _ in rays], [float_type(0) for _ in rays], [list(map(float_type, one)) for _ in rays]
-    )
+    state = Sum.start(float_type, len(bundles.ray))
     j = dr.gather(index_type, setting.lists.start, bundles.bundle)
     end = dr.gather(index_type, setting.lists.start, bundles.bundle + 1)
     while j < end:
@@ -133,57 +109,32 @@ def _forward(setting: _Setting) -> tuple[Any, Any]:
         j += 1
     # All at once: a scatter for each would run the loop anew for each.
     dr.eval(state)
-    re, im = (dr.gather(float_type, dr.concat(part), bundles.place) for part in (state.re, state.im))
+    parts = ([own[0][k] for own in state.total] for k in (0, 1))
+    re, im = (dr.gather(float_type, dr.concat(part), bundles.place) for part in parts)
     return re, im
 
 
-@dataclass
-class _Rest:
-    """The reverse pass so far, for each ray of a lane: transmittance and what lies behind, as pairs (re, im)."""
-
-    t: list[tuple[Any, Any]]
-    q: list[tuple[Any, Any]]
-
-
 def _take_away(
-    record: list[Any], depth: Any, rest: _Rest, slope: list[tuple[Any, Any]], setting: _Setting
-) -> tuple[list[Any], Any, _Rest, list[tuple[Any, Any, Any]]]:
+    record: list[Any], depth: Any, rest: Rest, slopes: list[Any], setting: _Setting
+) -> tuple[list[Any], Any, Rest, list[tuple[Any, Any, Any]]]:
     """One Gaussian's derivatives, summed over the lane's rays; whether any sees it; the rest; those of the walls."""
-    behind = behind_product if setting.product else behind_alpha
-    own = record[RAY_FIELDS:]
+    sent, own = record[RAY_FIELDS : RAY_FIELDS + 2], record[RAY_FIELDS + 2 :]
     total: list[Any] = [0 for _ in record]
-    t, q, factors, seen = [], [], [], False
+    after, factors, seen = Rest([], []), [], False
     for k, ray in enumerate(setting.bundles.ray):
         u = setting.bundles.direction[k]
         parts = response(record, u)
-        s_re, s_im, passed = _signal(setting, record, parts, ray, depth)
-        at = [None] * 9 + [s_re, s_im, *own[2:]]
-        d_g, d_own, next_t, next_q = behind(at, parts[0], rest.t[k], rest.q[k], slope[k])
-        d_re, d_im = d_own[:2]
+        signal, passed = _signal(setting, record, parts, ray, depth)
+        by_g, by_own, (by_signal,), t, q = behind(own, parts[0], rest.t[k], rest.q[k], [signal], slopes[k])
         if passed is not None:
-            w_re, w_im, slot = passed
-            factors.append((slot, d_re * own[0] + d_im * own[1], d_im * own[0] - d_re * own[1]))
-            d_re, d_im = d_re * w_re + d_im * w_im, d_im * w_re - d_re * w_im
-        mine = [*response_slope(record, u, parts, d_g), d_re, d_im, *d_own[2:]]
+            factors.append((passed[2], *conjugate_times(sent, by_signal)))
+            by_signal = conjugate_times(passed[:2], by_signal)
+        mine = [*response_slope(record, u, parts, by_g), *by_signal, *by_own]
         total = [a + b for a, b in zip(total, mine, strict=True)]
-        t.append(next_t)
-        q.append(next_q)
+        after.t.append(t)
+        after.q.append(q)
         seen |= parts[0] > 0
-    return total, seen, _Rest(t, q), factors
-
-
-def _before(bundles: Bundles, total: tuple[Any, Any], gradient: tuple[Any, Any]) -> tuple[list[Any], _Rest]:
-    """Gradient of each ray, and the rest before the first Gaussian."""
-    float_type: Any = type(total[0])
-    slope, t, q = [], [], []
-    for ray, active in zip(bundles.ray, bundles.active, strict=True):
-        # Rays that only fill a bundle have no gradient and so add nothing.
-        g_re, g_im, r_re, r_im = (dr.gather(float_type, a, ray, active) for a in (*gradient, *total))
-        slope.append((g_re, g_im))
-        # What lies behind, times the conjugate of the gradient, as in `wrf_mi.splat.blend`.
-        q.append((g_re * r_re + g_im * r_im, g_re * r_im - g_im * r_re))
-        t.append((float_type(1), float_type(0)))
-    return slope, _Rest(t, q)
+    return total, seen, after, factors
 
 
 @dr.syntax
@@ -191,7 +142,7 @@ def _backward(setting: _Setting, total: tuple[Any, Any], gradient: tuple[Any, An
     """Gradients of the table, in its layout, and of the walls' factors."""
     float_type, index_type = type(setting.table), type(setting.lists.index)
     bundles = setting.bundles
-    slope, rest = _before(bundles, total, gradient)
+    slopes, rest = before([[ray] for ray in bundles.ray], bundles.active, total, gradient)
     out = dr.zeros(float_type, dr.width(setting.table))
     out_factor = [dr.zeros(float_type, dr.width(f)) for f in setting.factor]
     dr.eval(out, out_factor)
@@ -200,7 +151,7 @@ def _backward(setting: _Setting, total: tuple[Any, Any], gradient: tuple[Any, An
     while j < end:
         i = dr.gather(index_type, setting.lists.index, j)
         record, depth = _record(setting, i)
-        values, seen, rest, factors = _take_away(record, depth, rest, slope, setting)
+        values, seen, rest, factors = _take_away(record, depth, rest, slopes, setting)
         for k in range(len(values)):
             dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=dr.ReduceMode.Local)
         for slot, d_re, d_im in factors:

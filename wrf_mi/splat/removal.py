@@ -12,71 +12,46 @@ import drjit as dr
 
 from ..field.gaussians import Gaussians
 from ..project.footprint import Pose, depth_order, project
-from .blend import (
-    SMALLEST_FACTOR,
-    _along_azimuth,
-    _before,
-    _footprint,
-    _forward,
-    _Lanes,
-    _lanes,
-    _Rest,
-    pack,
-    read,
-)
+from .blend import Lanes, _along_azimuth, _footprint, _forward, lanes_of, pack, read
+from .recurrence import Pair, Rest, before, behind
 from .tiles import Plane, TileLists, build_lists
 
-Pair = tuple[Any, Any]
+
+def _change(record: list[Any], g: Any, t: Pair, q: Pair) -> tuple[Any, Pair, Pair]:
+    """One pixel's |change|, and T and Q behind the Gaussian."""
+    one, signal, own = (1, 0), (record[9], record[10]), record[11:]
+    by_re, _, _, after, rest_re = behind(own, g, t, q, [signal], [one])
+    # The imaginary part is the real one of all divided by j.
+    by_im, _, _, _, rest_im = behind(own, g, t, (q[1], -q[0]), [(signal[1], -signal[0])], [one])
+    return g * dr.sqrt(dr.square(by_re) + dr.square(by_im)), after, (rest_re[0], rest_im[0])
 
 
-def _times(a: Pair, b: Pair) -> Pair:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _change(record: list[Any], g: Any, t: Pair, q: Pair, product: bool) -> tuple[Any, Pair, Pair]:
-    """One pixel's |change|, and the next T and Q (what lies behind)."""
-    if product:
-        hidden = (1 - record[11], -record[12])
-        weight = g
-    else:
-        # Footprint times opacity is the weight; what passes is the rest.
-        hidden, weight = (1, 0), g * record[11]
-    own = _times((record[9], record[10]), t)
-    q = (q[0] - weight * own[0], q[1] - weight * own[1])
-    b = (1 - weight * hidden[0], -weight * hidden[1])
-    scale = dr.rcp(dr.maximum(b[0] * b[0] + b[1] * b[1], SMALLEST_FACTOR**2))
-    through = _times(_times(q, (b[0] * scale, -b[1] * scale)), hidden)
-    change = weight * dr.sqrt(dr.square(own[0] - through[0]) + dr.square(own[1] - through[1]))
-    return change, _times(t, b), q
-
-
-def _step(record: list[Any], lanes: _Lanes, rest: _Rest, product: bool) -> tuple[Any, _Rest]:
+def _step(record: list[Any], lanes: Lanes, rest: Rest) -> tuple[Any, Rest]:
     """Sum of one Gaussian's |change| over a lane's pixels, and the rest behind it."""
     along = _along_azimuth(record, lanes.azimuth)
-    value, t, q = 0, [], []
+    value, after = 0, Rest([], [])
     for k, elevation in enumerate(lanes.elevation):
-        g = _footprint(along, elevation)[0]
-        change, next_t, next_q = _change(record, g, rest.t[k], rest.q[k], product)
-        t.append(next_t)
-        q.append(next_q)
+        change, t, q = _change(record, _footprint(along, elevation)[0], rest.t[k], rest.q[k])
+        after.t.append(t)
+        after.q.append(q)
         value += dr.select(lanes.active[k], change, 0)
-    return value, _Rest(t, q)
+    return value, after
 
 
 @dr.syntax
 def _walk(table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, total: Pair) -> Any:
     float_type, index_type = type(table), type(lists.index)
-    lanes = _lanes(plane, lists, n, batch)
+    lanes = lanes_of(plane, lists, n, batch)
     fields = 13 if product else 12
-    # With a gradient of one, what `_before` starts from is the whole sum.
-    whole = (dr.full(float_type, 1, dr.width(total[0])), dr.zeros(float_type, dr.width(total[0])))
-    _, rest = _before(lanes, total, whole, float_type)
+    # With a gradient of one, the rest before the first Gaussian is the whole sum.
+    one = (dr.full(float_type, 1, dr.width(total[0])), dr.zeros(float_type, dr.width(total[0])))
+    _, rest = before([[pixel] for pixel in lanes.pixel], lanes.active, total, one)
     out = dr.zeros(float_type, batch * n)
     dr.eval(out)
     j = index_type(0)
     while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
-        value, rest = _step(read(table, i, fields), lanes, rest, product)
+        value, rest = _step(read(table, i, fields), lanes, rest)
         dr.scatter_reduce(dr.ReduceOp.Add, out, value, i, value > 0, mode=dr.ReduceMode.Local)
         j += 1
     return out

@@ -11,6 +11,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, join, specular_legs, to_buffer
 from .fields import point_array
+from .image_method import meeting_point
 from .options import TraceOptions
 from .search import Chains, count_crossings, possible
 from .surfaces import Surfaces
@@ -100,9 +101,7 @@ def _transmissions(
     for level in reversed(range(chains.plane.shape[1])):
         has = length > level
         plane, image = chains.plane[chain[has], level], chains.image[chain[has], level]
-        n, d = surfaces.normal[plane], surfaces.offset[plane]
-        near, far = (there[has] * n).sum(axis=1) - d, (image * n).sum(axis=1) - d
-        here = there[has] + (image - there[has]) * (near / (near - far))[:, None]
+        here = meeting_point(there[has], image, surfaces.normal[plane], surfaces.offset[plane])[0]
         through[has, level + 1] = count_crossings(scene, here, there[has], depth)
         there[has] = here
     through[:, 0] = count_crossings(scene, np.broadcast_to(source_m, there.shape), there, depth)
@@ -140,10 +139,7 @@ def _exact(
         before = reflected[row, level]
         image[before > 0] = chains.image[chain[row[before > 0]], before[before > 0] - 1]
         plane = surfaces.plane[found.face[row, level]]
-        n, d = surfaces.normal[plane], surfaces.offset[plane]
-        near, far = (here[row] * n).sum(axis=1) - d, (image * n).sum(axis=1) - d
+        met, near, far = meeting_point(here[row], image, surfaces.normal[plane], surfaces.offset[plane])
         crosses = np.abs(near - far) > PARALLEL
-        share = np.divide(near, near - far, out=np.zeros_like(near), where=crosses)
-        met = np.where(crosses[:, None], here[row] + (image - here[row]) * share[:, None], vertices[row, level])
-        here[row] = vertices[row, level] = met
+        here[row] = vertices[row, level] = np.where(crosses[:, None], met, vertices[row, level])
     return Legs(found.source, found.target, found.interactions, found.face, vertices, found.probability, found.wedge)

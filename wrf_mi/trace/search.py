@@ -154,21 +154,6 @@ def _unique_rows(rows: IntArray) -> IntArray:
     return rows[np.unique(code, return_index=True)[1]]
 
 
-def with_images(surfaces: Surfaces, source_m: FloatArray, plane: IntArray) -> Chains:
-    """Mirror a source at the planes of each chain, one after the other.
-
-    Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
-    """
-    image = np.full((*plane.shape, 3), np.nan)
-    here = np.broadcast_to(source_m, (len(plane), 3)).copy()
-    for level in range(plane.shape[1]):
-        used = plane[:, level] >= 0
-        n, d = surfaces.normal[plane[used, level]], surfaces.offset[plane[used, level]]
-        here[used] -= 2 * ((here[used] * n).sum(axis=1) - d)[:, None] * n
-        image[used, level] = here[used]
-    return Chains(plane, image)
-
-
 def possible(
     surfaces: Surfaces, chains: Chains, targets_m: FloatArray, margin_m: float = 1e-3
 ) -> Iterator[tuple[IntArray, IntArray]]:

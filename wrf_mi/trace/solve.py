@@ -18,11 +18,12 @@ from ..core.antenna import ANTENNA
 from .buffer import Legs, join
 from .devices import before_walls, check_devices, tell_moved
 from .fields import path_gains, scattering_materials
+from .image_method import image_sources
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
 from .sampled import sampled_paths
-from .search import shoot, with_images
+from .search import Chains, shoot
 from .surfaces import Surfaces, scene_surfaces
 
 logger = logging.getLogger(__name__)
@@ -193,7 +194,8 @@ def _search(
 
 def _chains(scene: Any, surfaces: Surfaces, source: FloatArray, options: TraceOptions, rays: int, seed: int) -> Any:
     met = options.max_depth if options.transmission else options.reflections
-    return with_images(surfaces, source, shoot(scene, surfaces, source, rays, met, options.reflections, seed))
+    plane = shoot(scene, surfaces, source, rays, met, options.reflections, seed)
+    return Chains(plane, image_sources(surfaces.normal, surfaces.offset, plane, source)[:, 1:])
 
 
 def converged_rays(
