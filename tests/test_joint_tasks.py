@@ -13,7 +13,9 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
 from wrf_mi.fit.config import default_config
+from wrf_mi.fit.predictor import Predictor
 from wrf_mi.fit.trainer import Trainer
+from wrf_mi.splat.skip import Skip
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.trace import TraceOptions, open_scene, trace_paths
 
@@ -145,3 +147,14 @@ def test_beside_a_scene_positions_tell_and_not_the_uplink(rooms: dict[str, Path]
     nowhere = replace(first, tx_pos_m=np.full_like(first.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="room has no position in row 0"):
         trained(nowhere, rooms["known"])
+
+
+def test_skips_of_a_joint_prediction_stay_within_their_bound(rooms: dict[str, Path]) -> None:
+    record = measured("spectrum", rooms["whole"])
+    trainer = trained(record, rooms["known"], "receiver=pixel", "initial.signal=0.3")
+    own, ends = trainer.graph, (trainer.state.mean_params(), trainer.graph.receivers, *trainer.graph.form.size)
+    skipping = Predictor(own.field, *ends, Skip(contribution=0.3), graph=own, reach=trainer.reach())
+    everything = Predictor(own.field, *ends, graph=own, reach=trainer.reach())
+    row = record.tx_pos_m[:4]
+    change = np.abs(skipping(row, 0) - everything(row, 0)).max()
+    assert 0 < change <= 0.3

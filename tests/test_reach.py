@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
@@ -34,6 +35,7 @@ def test_weight_is_a_gaussian_of_the_distance_from_the_nearest_known_transmitter
     two = Reach((np.array([[0.0, 0, 0], [0, 3.0, 0]]),), 0.5)
     expected = np.exp(-np.square([0, 0.5, 1.5, 0.2]) / 0.25)
     np.testing.assert_allclose(two.weight(at(0, 0.5, 1.5, 2.8), 0), expected, rtol=FLOAT32)
+    assert (two.weight(at(10.0), 0) == 0).all()  # and where it is negligible, none
 
 
 def test_reach_of_zero_trusts_nowhere_and_an_infinite_one_everywhere() -> None:
@@ -132,3 +134,24 @@ def test_far_from_training_rows_a_joint_fit_predicts_what_its_paths_do(tmp_path:
     np.testing.assert_allclose(both, predict(far), rtol=FLOAT32)
     assert np.abs(both).max() > 0
     assert np.abs(known - predict(record.tx_pos_m[:1])).max() > 0
+
+
+def test_gaussians_that_are_not_trusted_are_not_evaluated(tmp_path: Path) -> None:
+    """Far from the training rows a joint fit launches the kernels of its paths alone."""
+    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+    position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (40, 3))
+    record, rows = channels(np.ones((40, 1)), position), np.arange(40)
+    config = with_settings(default_config("csi", True), [*SMALL, "steps=2", "traced.depth=1", "traced.rays=4096"])
+    trainer = Trainer(record, Split("own", 0, rows[:25], rows[25:30], rows[30:]), config, scene=scene)
+
+    def kernels(reach_m: float) -> int:
+        trainer.state.reach_m = reach_m
+        predict = trainer.predictor()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            predict(np.array([[4.5, 3.5, 1.2]]))
+            return len(dr.kernel_history([dr.KernelType.JIT]))
+
+    far, everywhere = kernels(0.1), kernels(np.inf)
+    assert far == kernels(0.0)
+    assert far < everywhere

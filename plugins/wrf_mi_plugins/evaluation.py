@@ -27,6 +27,7 @@ from wrf_mi.hybrid.follow import Complex  # noqa: E402
 from wrf_mi.hybrid.learned import facing_down  # noqa: E402
 from wrf_mi.hybrid.materials import Materials, slabs_of_faces  # noqa: E402
 from wrf_mi.project.footprint import Pose  # noqa: E402
+from wrf_mi.splat.skip import NOTHING, Skip  # noqa: E402
 from wrf_mi.splat.tiles import Plane  # noqa: E402
 from wrf_mi.trace.surfaces import scene_surfaces  # noqa: E402
 
@@ -163,9 +164,15 @@ class Traced:
         self._form: tuple[Any, ...] = ()
 
     def __call__(
-        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+        self,
+        gaussians: Gaussians,
+        pose: Pose,
+        plane: Plane,
+        sphere: bool,
+        params: Mapping[str, Any],
+        skip: Skip = NOTHING,
     ) -> Complex:
-        """Complex signal on directions, in the order of `wrf_mi.hybrid.learned.learned_field`."""
+        """Complex signal on directions, in the order of `wrf_mi.hybrid.learned.learned_field`; nothing is skipped."""
         poses = [pose, facing_down(pose)] if sphere else [pose]
         if not gaussians.count:
             pixels = gaussians.batch * len(poses) * plane.pixels

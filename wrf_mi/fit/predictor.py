@@ -153,7 +153,7 @@ class Predictor:
         weight: NDArray[Any] | None,
     ) -> Any:
         learned = side is None or weight is None or bool(np.any(weight))
-        report, pose = self.graph.report(receiver, side, learned), self._poses[receiver]
+        report, pose = self.graph.report(receiver, side, learned, self._skip), self._poses[receiver]
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
 
     def of_side(
@@ -180,7 +180,7 @@ class Predictor:
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
         """What a receiver reports of conditions [3 or features, at most `TOGETHER`] recorded, flat."""
         if receiver not in self._reports:
-            report = self.graph.report(receiver, None)
+            report = self.graph.report(receiver, None, skip=self._skip)
 
             def predicted(params: Params, batch: Batch) -> Any:
                 with dr.suspend_grad():
@@ -202,14 +202,20 @@ class Predictor:
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
         weight = None if self.reach is None else self.reach.weight(given, receiver)
+        if weight is not None and weight.any() and not weight.all():
+            # Where Gaussians are not trusted they are not evaluated.
+            parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
+            turned = [None if heading_rad is None else heading_rad[part] for part in parts]
+            found = [self._reported(given[part], receiver, own) for part, own in zip(parts, turned, strict=True)]
+            return np.concatenate(found)[np.argsort(np.concatenate(parts))]
 
-        def found(part: slice) -> Any:
+        def evaluate(part: slice) -> Any:
             own = None if weight is None else weight[part]
             if self._recordable:
                 return self._learned(given[part].T, receiver, own)
             return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
 
-        return self._in_parts(len(given), receiver, found)
+        return self._in_parts(len(given), receiver, evaluate)
 
     def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
         """Reports of so many transmitters from the flat ones of parts of them."""

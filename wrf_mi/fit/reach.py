@@ -33,6 +33,9 @@ HELD_OUT = 0.25
 LENGTHS = 7
 """Reaches that are tried beside 0: each twice the one before, the last four times the largest distance held out."""
 
+NEGLIGIBLE = 1e-4
+"""Weight below which Gaussians are not evaluated, so that no signal changes by more than this share of theirs."""
+
 
 @dataclass(frozen=True)
 class Reach:
@@ -52,10 +55,11 @@ class Reach:
         return np.asarray(cKDTree(known).query(tx_pos_m)[0]) if len(known) else np.full(len(tx_pos_m), np.inf)
 
     def weight(self, tx_pos_m: FloatArray, receiver: int) -> NDArray[np.float32]:
-        """Weight w of the Gaussians' signal for transmitters [m, 3], 0 to 1."""
+        """Weight w of the Gaussians' signal for transmitters [m, 3], 0 to 1; 0 where it is below `NEGLIGIBLE`."""
         if self.length_m == 0 or np.isinf(self.length_m):
             return np.full(len(tx_pos_m), float(self.length_m > 0), np.float32)
-        return np.exp(-np.square(self.distance(tx_pos_m, receiver) / self.length_m)).astype(np.float32)
+        weight = np.exp(-np.square(self.distance(tx_pos_m, receiver) / self.length_m))
+        return np.where(weight < NEGLIGIBLE, 0, weight).astype(np.float32)
 
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Reaches to choose from by held-out transmitters [m, 3] of each receiver, from 0 upwards."""

@@ -15,6 +15,7 @@ from ..field import Gaussians
 from ..hybrid.follow import Complex
 from ..hybrid.learned import learned_field
 from ..project.footprint import Pose
+from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
 from .settings import SPLATTED, TRACED, TracedConfig
 
@@ -35,7 +36,13 @@ class Evaluation(Protocol):
     recordable: bool
 
     def __call__(
-        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+        self,
+        gaussians: Gaussians,
+        pose: Pose,
+        plane: Plane,
+        sphere: bool,
+        params: Mapping[str, Any],
+        skip: Skip = NOTHING,
     ) -> Complex:
         """Real and imaginary part [batch * directions], see `wrf_mi.hybrid.learned.learned_field`.
 
@@ -45,6 +52,7 @@ class Evaluation(Protocol):
             plane: pixels of a hemisphere.
             sphere: the lower hemisphere too.
             params: parameters of the graph by name, those of the scene's materials among them.
+            skip: what is not evaluated; ``traced`` has none.
         """
         ...
 
@@ -62,10 +70,16 @@ class Splatted:
         pass
 
     def __call__(
-        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+        self,
+        gaussians: Gaussians,
+        pose: Pose,
+        plane: Plane,
+        sphere: bool,
+        params: Mapping[str, Any],
+        skip: Skip = NOTHING,
     ) -> Complex:
         """See `Evaluation`."""
-        return learned_field(gaussians, pose, plane, sphere)
+        return learned_field(gaussians, pose, plane, sphere, skip)
 
     def release(self) -> None:
         """See `Evaluation`: nothing is kept."""

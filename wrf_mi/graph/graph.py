@@ -28,6 +28,7 @@ from ..field import Factorised, Gaussians, WrfGs, WrfGsPlus
 from ..field.gaussians import by_component
 from ..hybrid.pose import receiver_pose
 from ..project.footprint import Pose
+from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
 from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form, ReceiverModel
@@ -211,13 +212,14 @@ class Graph:
             unit = dr.gather(kind, unit, dr.arange(mi.UInt32, count * each) // each)
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
-    def report(self, number: int, side: TracedField | None, learned: bool = True) -> Report:
+    def report(self, number: int, side: TracedField | None, learned: bool = True, skip: Skip = NOTHING) -> Report:
         """What a receiver reports, as a function of parameters, for transmitters of a traced side.
 
         Args:
             number: of the receiver.
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
+            skip: what of the Gaussians is not evaluated.
         """
         model, receiver, moved = self.models[number], self.receivers[number], self.moved(number)
 
@@ -227,7 +229,7 @@ class Graph:
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if moved else batch.pose
             gaussians = self.gaussians(params, batch, paths)
-            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params))
+            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
 
         return report
 

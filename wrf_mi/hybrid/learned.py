@@ -12,6 +12,7 @@ from ..core.angles import FloatArray, pixel_directions
 from ..field import Gaussians, InitialGaussians
 from ..project.footprint import Pose
 from ..splat.render import splat
+from ..splat.skip import NOTHING, Skip
 from ..splat.tiles import Plane
 from .follow import Complex
 
@@ -28,7 +29,9 @@ class Field(Protocol):
         ...
 
 
-def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:
+def learned_field(
+    gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False, skip: Skip = NOTHING
+) -> Complex:
     """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
 
     Args:
@@ -36,15 +39,16 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
         pose: of the receiver.
         plane: pixels of a hemisphere.
         sphere: the lower hemisphere too: what a receiver turned about its x axis by half a turn sees.
+        skip: what is not evaluated, with bounds on the error of each direction's signal.
 
     Returns:
         Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
         hemisphere, then those of the lower one, see `hemisphere_pair`.
     """
-    upper = splat(gaussians, pose, plane)
+    upper = splat(gaussians, pose, plane, skip)
     if not sphere:
         return upper
-    lower = splat(gaussians, facing_down(pose), plane)
+    lower = splat(gaussians, facing_down(pose), plane, skip)
     tensor_type: Any = dr.tensor_t(type(upper[0]))
     shape = (gaussians.batch, plane.pixels)
     re, im = (
