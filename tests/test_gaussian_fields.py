@@ -246,7 +246,8 @@ def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
         if model == "nerf2":
             kept = nerf2.METHOD.fit(one, split, small, 0, FitSession())
             return kept.predict(inputs_of(one, split.test), 1)
-        return fitted(one, split, f"model={model}", "view.components=2", "steps=10")(one.tx_pos_m[split.test], 1)
+        own = f"model={model}", "view.components=2", "steps=10", "patience=0"
+        return fitted(one, split, *own)(one.tx_pos_m[split.test], 1)
 
     plain, faint = predicted(record), predicted(fainter)
     assert np.abs(plain).max() > 1e-6

@@ -32,7 +32,6 @@ from wrf_mi.graph.evaluations import evaluation_of  # noqa: E402
 from wrf_mi.graph.graph import Batch, Graph  # noqa: E402
 from wrf_mi.graph.receivers import Form  # noqa: E402
 from wrf_mi.graph.settings import TracedConfig  # noqa: E402
-from wrf_mi.hybrid.materials import slab  # noqa: E402
 from wrf_mi.hybrid.pose import position_name, receiver_pose, turn_name  # noqa: E402
 from wrf_mi.project.footprint import depth_order  # noqa: E402
 from wrf_mi.project.ray import ray_footprints  # noqa: E402
@@ -42,6 +41,7 @@ from wrf_mi.splat.bundles import all_lists, ray_bundles  # noqa: E402
 from wrf_mi.splat.rays import blend_rays  # noqa: E402
 from wrf_mi.splat.tiles import perception_plane  # noqa: E402
 from wrf_mi.tasks.scores import ssim  # noqa: E402
+from wrf_mi.trace.slab import slab  # noqa: E402
 
 Float64: Any = dr.float64_array_t(mi.Float)
 SIZE, FINE = (30, 60), (45, 180)
