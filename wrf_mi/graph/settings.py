@@ -38,7 +38,7 @@ class TracedConfig:
     """
 
     depth: int = 3
-    reflections: int = 2
+    reflections: int = 3
     transmission: bool = True
     rays: int = 1 << 16
     pattern_degree: int = 0
