@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import resource
 import sys
 from collections.abc import Callable, Mapping
@@ -41,6 +42,8 @@ from .step import (
     make_step,
 )
 from .targets import form_of, plan_rows, targets_of
+
+logger = logging.getLogger(__name__)
 
 AT_ONCE = 64
 """Observations of a receiver by which its level starts."""
@@ -122,6 +125,7 @@ class Trainer(TrainingLoop):
         # Gaussians that correct something are chosen on rows away from those that train, too.
         self._chooses_reach = self.graph.corrects and config.patience > 0 and config.hold_out > 0
         self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
+        unjudged = self._chooses_reach and self._choosing is split
         joint = self.graph.field is not None and scene is not None
         self.schedule = plan_rows(config, self.targets, self._choosing, joint)
         if config.deterministic:
@@ -143,6 +147,9 @@ class Trainer(TrainingLoop):
         if state is None:
             self.graph.check_polarization(record.tx_pos_m[known])
             state = FitState(self._start(initial))
+            if unjudged:
+                logger.warning("%d training rows do not tell how far Gaussians hold: none are used", len(split.train))
+                state.reach_m = 0.0
         self.state = state
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
