@@ -170,7 +170,7 @@ def test_a_material_that_is_no_slab_is_named(scene: Any) -> None:
         traced = TracedField(scene, transmitters(2), receiver(), TracedOptions(OPTIONS, materials=of))
         traced._slab_of_face[:] = -1  # as of a material without a permittivity
         with pytest.raises(InputError, match="is not a slab"):
-            traced._search(receiver().position_m)
+            traced.search(receiver().position_m)
 
 
 def record_of(receivers: tuple[Receiver, ...], tx: np.ndarray, observation: np.ndarray, task: str) -> Record:
