@@ -170,7 +170,7 @@ def test_a_material_that_is_no_slab_is_named(scene: Any) -> None:
         traced = TracedField(scene, transmitters(2), receiver(), TracedOptions(OPTIONS, materials=of))
         traced._slab_of_face[:] = -1  # as of a material without a permittivity
         with pytest.raises(InputError, match="is not a slab"):
-            traced._search(receiver().position_m)
+            traced.search(receiver().position_m)
 
 
 def record_of(receivers: tuple[Receiver, ...], tx: np.ndarray, observation: np.ndarray, task: str) -> Record:
@@ -232,7 +232,7 @@ def test_receivers_share_planes_and_keep_their_recordings(scene: Any) -> None:
     # As a step does once the receiver is further than a quarter of a wavelength from where it was.
     side = trainer._sides[0]
     assert side is not None
-    side._search(own.position_m + np.array([0.05, 0, 0]))
+    side.search(own.position_m + np.array([0.05, 0, 0]))
     trainer.run(stop=stop_after(6))
     assert [side.searches for side in trainer._sides if side is not None] == [2, 1]
     assert trainer._steps[0, 2, True] is not first

@@ -18,6 +18,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
 from wrf_mi.fit.adam import NumericsError
 from wrf_mi.fit.config import TrainConfig, calibration_config, default_config
+from wrf_mi.fit.state import FitState
 from wrf_mi.fit.trainer import Trainer
 from wrf_mi.hybrid import PowerReceiver, TracedField, TracedOptions
 from wrf_mi.hybrid.materials import physical
@@ -207,3 +208,21 @@ def test_materials_are_replaced_for_a_block_only(tmp_path: Path) -> None:
     assert concrete.frequency_update_callback is callback
     with pytest.raises(InputError, match="no radio material 'itu_ice'"), with_materials(scene, {"itu_ice": (3, 0)}):
         pass
+
+
+def test_a_resumed_fit_goes_on_with_the_paths_that_it_had(tmp_path: Path) -> None:
+    """Paths are searched again where a receiver has moved by a quarter of a wavelength; a resumed fit does not know."""
+    own = ("traced.position=0.05", "optimiser.warm_up=1", "steps=40", "hold_out=0", "patience=0", "deterministic=true")
+    whole, part = (small(tmp_path / name, *own) for name in ("whole", "part"))
+    whole.run()
+    stated = np.stack([one.position_m for one in whole.graph.receivers])
+    assert (np.linalg.norm(whole.state.searched_m - stated, axis=1) > 0).any(), "the receivers have hardly moved"
+    part.run(stop=stop_after(25))
+    state = FitState.from_arrays(part.state.arrays())
+    resumed = Trainer(part.record, part.split, part.config, scene=part.graph.scene, state=state)
+    for side, searched_m in zip(resumed._sides, part.state.searched_m, strict=True):
+        assert side is not None
+        np.testing.assert_array_equal(side.searched_at_m, searched_m)
+    resumed.run()
+    for name, values in whole.state.params().items():
+        np.testing.assert_array_equal(resumed.state.params()[name], values, err_msg=name)

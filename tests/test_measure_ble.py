@@ -296,7 +296,13 @@ def test_precision_is_the_inverse_of_the_variance(folder: Path):
 
 WRONG_NOISE = {
     "readings of one anchor": ("count_3", "number", TRAIN_FILE, r"line 1: no column count_3; give one for every anch"),
-    "half a reading": ("4,2,0.5", "4,2.5,0.5", TRAIN_FILE, r"row 1: count_3 is '2\.5', .*number of readings, 1 or mo"),
+    "half a reading": ("4,2,0.5", "4,2.5,0.5", TRAIN_FILE, r"row 1: count_3 is '2\.5', .*number of readings, 1 to"),
+    "more readings than there are": (
+        "4,2,0.5",
+        "4,1e30,0.5",
+        TRAIN_FILE,
+        r"row 1: count_3 is .1e30., .*1 to a million",
+    ),
     "negative": ("4,2,0.5", "4,-2,0.5", TRAIN_FILE, "row 1: count_3 is '-2', where rssi_3 is known"),
     "no reading": ("4,2,0.5", "4,0,0.5", TRAIN_FILE, "row 1: count_3 is '0', where rssi_3 is known"),
     "no noise": ("4,2,0.5", "4,2,0", TRAIN_FILE, r"row 1: std_1 is '0', where rssi_1 is known; give the noise in dB"),

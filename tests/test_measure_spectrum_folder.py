@@ -205,6 +205,7 @@ WRONG = {
     "infinite position": (text("tx_pos.csv", r"^[^,x]+,", "-inf,"), "tx_pos.csv", "row 1: .*not finite"),
     "position of words": (text("tx_pos.csv", r"^[^,x]+,", "here,"), "tx_pos.csv", "row 1: .*three numbers"),
     "position of two numbers": (text("tx_pos.csv", r"^[^,x]+,", ""), "tx_pos.csv", "row 1: .*three numbers"),
+    "position of one number": (text("tx_pos.csv", r"^[^,x]+,[^\n]*", "5"), "tx_pos.csv", "row 1: .*three numbers"),
     "position of four numbers": (text("tx_pos.csv", r"^[^,x]+,", "1,2,"), "tx_pos.csv", "row 1: .*three numbers"),
     "no header": (text("tx_pos.csv", r"^x,y,z\n", ""), "tx_pos.csv", "line 1: header"),
     "no rows": (write("tx_pos.csv", "x,y,z\n"), "tx_pos.csv", "no positions"),

@@ -155,3 +155,17 @@ def test_gaussians_that_are_not_trusted_are_not_evaluated(tmp_path: Path) -> Non
     far, everywhere = kernels(0.1), kernels(np.inf)
     assert far == kernels(0.0)
     assert far < everywhere
+
+
+def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+    position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (12, 3))
+    record, rows = channels(np.ones((12, 1)), position), np.arange(12)
+    config = with_settings(default_config("csi", True), [*SMALL, "traced.depth=1", "traced.rays=4096"])
+    trainer = Trainer(record, Split("own", 0, rows[:6], rows[6:7], rows[7:]), config, scene=scene)
+    trainer.run()
+    assert trainer.state.reach_m == 0
+    assert "6 training rows do not tell how far Gaussians hold" in caplog.text
+    assert np.abs(trainer.predictor()(position[7:])).max() > 0

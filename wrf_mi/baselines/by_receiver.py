@@ -67,7 +67,9 @@ class ByReceiver:
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
             return self.models[receiver].predict(inputs.tx_pos_m, heading)
-        assert inputs.carriers_hz is not None, "see wrf_mi.baselines.checks.check_carriers_of_inputs"
+        if inputs.carriers_hz is None:
+            known = carriers_text(np.asarray(self.carriers_hz))
+            raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
         each = len(self.models) // len(self.carriers_hz)
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:

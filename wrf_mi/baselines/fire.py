@@ -220,7 +220,7 @@ def fit(record: Record, split: Split, settings: FireSettings, seed: int, session
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
     few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
-    unscored = not len(validation) or not settings.patience
+    unscored = not len(validation) or not settings.patience or not settings.hold_out
     if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
         kinds = ("antenna",)
     fits = [(*_fit(record, train, validation, settings, seed, session, kind), kind) for kind in kinds]

@@ -24,7 +24,7 @@ from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 if TYPE_CHECKING:
     from .loop import Progress, TrainingLoop
 
-FORMAT = 5
+FORMAT = 6
 """Version of ``checkpoint.npz``."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 

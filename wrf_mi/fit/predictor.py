@@ -209,6 +209,9 @@ class Predictor:
             found = [self._reported(given[part], receiver, own) for part, own in zip(parts, turned, strict=True)]
             return np.concatenate(found)[np.argsort(np.concatenate(parts))]
 
+        if self.graph.scene is None and weight is not None and not weight.any():
+            return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
+
         def evaluate(part: slice) -> Any:
             own = None if weight is None else weight[part]
             if self._recordable:

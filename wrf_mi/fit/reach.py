@@ -12,6 +12,7 @@ A reach of 0 switches the Gaussians off, an infinite one trusts them everywhere.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -79,11 +80,13 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
         Validation rows near training rows and away from them. The split itself where its rows are too few.
     """
     rows: IntArray = split.train
-    count = min(GROUPS, len(rows) // ROWS_OF_GROUP)
+    count = min(GROUPS, len(rows) // ROWS_OF_GROUP, len(np.unique(tx_pos_m[rows], axis=0)))
     if count < 2:
         return split
     rng = np.random.default_rng([split.seed, 3])
-    _, labels = kmeans2(tx_pos_m[rows], count, iter=50, minit="++", missing="warn", rng=rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # an empty cluster holds nothing out
+        _, labels = kmeans2(tx_pos_m[rows], count, iter=50, minit="++", missing="warn", rng=rng)
     held = np.zeros(len(rows), bool)
     for group in rng.permutation(count):
         more = held | (labels == group)

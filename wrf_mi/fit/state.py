@@ -32,6 +32,7 @@ class FitState:
         urge_steps: steps in that sum.
         reach_m: how far from training transmitters the Gaussians are trusted, metres (`wrf_mi.fit.reach`); infinite:
             everywhere.
+        searched_m: where each receiver was when paths were searched last, [n_rx, 3], metres; empty without a scene.
         chosen: step from which the fit went on, see `wrf_mi.fit.config.TrainConfig.patience`; 0: from the last one.
         best: the state that scored best on validation rows (see `arrays`); None: none is kept.
         best_score: its score, the higher the better; also once the fit went on from it.
@@ -43,7 +44,7 @@ class FitState:
         self.adam.update({name: to_tensor(values) for name, values in params.items()})
         self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = self.chosen = 0
-        self.reach_m = float(np.inf)
+        self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0
         self._clear_urge()
@@ -131,6 +132,7 @@ class FitState:
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
         scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
         flat |= {"urge": self.urge.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
+        flat |= {"searched_m": self.searched_m.copy()}
         return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
     @classmethod
@@ -145,7 +147,7 @@ class FitState:
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
         state.urge_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
-        state.urge = to_float(arrays["urge"])
+        state.urge, state.searched_m = to_float(arrays["urge"]), np.array(arrays["searched_m"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import resource
 import sys
 from collections.abc import Callable, Mapping
@@ -41,6 +42,8 @@ from .step import (
     make_step,
 )
 from .targets import form_of, plan_rows, targets_of
+
+logger = logging.getLogger(__name__)
 
 AT_ONCE = 64
 """Observations of a receiver by which its level starts."""
@@ -102,6 +105,8 @@ class Trainer(TrainingLoop):
         self.task = task_of(record)
         self.label, self.higher_is_better = self.task.label, self.task.higher_is_better
         check_observations(record, split, complete=self.task.image)
+        if record.carriers_hz is not None:
+            raise InputError(f"{record.name} has several carriers; train on one of them")
         known = split.all_train
         config = config.resolved(record.tx_pos_m[known])
         self.record, self.split, self.config = record, split, config
@@ -122,6 +127,7 @@ class Trainer(TrainingLoop):
         # Gaussians that correct something are chosen on rows away from those that train, too.
         self._chooses_reach = self.graph.corrects and config.patience > 0 and config.hold_out > 0
         self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
+        unjudged = self._chooses_reach and self._choosing is split
         joint = self.graph.field is not None and scene is not None
         self.schedule = plan_rows(config, self.targets, self._choosing, joint)
         if config.deterministic:
@@ -143,9 +149,13 @@ class Trainer(TrainingLoop):
         if state is None:
             self.graph.check_polarization(record.tx_pos_m[known])
             state = FitState(self._start(initial))
+            if unjudged:
+                logger.warning("%d training rows do not tell how far Gaussians hold: none are used", len(split.train))
+                state.reach_m = 0.0
         self.state = state
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
+        self._restore_paths()
         self.record_functions()
 
     @property
@@ -163,6 +173,15 @@ class Trainer(TrainingLoop):
         """Forget recorded kernels: the number of Gaussians stands in them as a constant."""
         self._steps: dict[Any, Callable[..., Any]] = {}
         self._predictor: Predictor | None = None
+
+    def _restore_paths(self) -> None:
+        """Go back to the paths of the state: a receiver that training moves is searched from where it was then."""
+        sides = [side for side in self._sides if side is not None]
+        if sides and not len(self.state.searched_m):
+            self.state.searched_m = np.stack([side.searched_at_m for side in sides])
+        for side, searched_m in zip(sides, self.state.searched_m, strict=True):
+            if not np.array_equal(side.searched_at_m, searched_m):
+                side.search(searched_m)
 
     def _start(self, initial: InitialGaussians | None) -> dict[str, NDArray[np.float32]]:
         """Starting values: Gaussians, gains and levels with which each side reports what was observed, on average."""
@@ -194,9 +213,9 @@ class Trainer(TrainingLoop):
     def _step_of(self, receiver: int) -> Callable[..., Any]:
         """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""
         side = self._sides[receiver]
-        if side is not None:
-            side.refresh({name: self.state.adam[name] for name in self.state.adam})
         state = self.state
+        if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
+            state.searched_m[receiver] = side.searched_at_m
         learned = side is None or (
             state.step >= self.schedule.first_stage and not (state.chosen and state.reach_m == 0)
         )
@@ -284,6 +303,8 @@ class Trainer(TrainingLoop):
     def choose(self, score: float) -> bool:
         """See `TrainingLoop`."""
         chosen = super().choose(score)
+        if chosen:
+            self._restore_paths()
         if chosen and self.state.reach_m == 0 and self.graph.scene is None:
             self.state.step = self.config.steps  # nothing is predicted better than zero: there is nothing to train
         return chosen

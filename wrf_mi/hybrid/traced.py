@@ -149,7 +149,7 @@ class TracedField:
         self._constants = self._materials.constants(Float64)
         self._planes = PlaneTables.of(self._surfaces)
         if traced is None:
-            self._search(receiver.position_m)
+            self.search(receiver.position_m)
         else:
             self._take(traced, receiver.position_m)
 
@@ -219,7 +219,7 @@ class TracedField:
         here = moved_m(self.receiver, parameters)
         if np.linalg.norm(here - self.searched_at_m) <= self._again_m:
             return False
-        self._search(here)
+        self.search(here)
         return True
 
     def __call__(self, parameters: Mapping[str, Any], rows: Any | None = None) -> TracedPaths:
@@ -257,7 +257,8 @@ class TracedField:
         """The receiver's corrected pose, for the learned side."""
         return receiver_pose(self.receiver, parameters, float_type)
 
-    def _search(self, here_m: FloatArray) -> None:
+    def search(self, here_m: FloatArray) -> None:
+        """Search for paths anew, the receiver at a position [3], world frame, metres."""
         receiver = replace(self.receiver, position_m=here_m)
         how: dict[str, Any] = {"tx_antenna": self.options.tx_antenna, "check": self._prepared is None}
         found = trace_paths(self.scene, self.tx_pos_m, receiver, self.options.trace, prepared=self._prepared, **how)

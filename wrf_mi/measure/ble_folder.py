@@ -49,6 +49,8 @@ CARRIER_HZ = 2.44e9
 """Where the files have no column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402, 2426
 and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
 RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
+MOST_READINGS = 10**6
+"""Readings that a row's mean may be of."""
 COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
 """Of ``anchors.csv``."""
 WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
@@ -270,6 +272,22 @@ def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
     return np.concatenate([table.numbers(column) for table in tables])
 
 
+def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
+    """Columns of a table that begin with a prefix, by the anchor that they name.
+
+    Raises:
+        InputError: two columns of one anchor.
+    """
+    found: dict[str, str] = {}
+    for column in table.header:
+        if column.startswith(prefix):
+            first = found.setdefault(_id(column.removeprefix(prefix)), column)
+            if first != column:
+                text = f"line 1: {first} and {column} name one anchor"
+                raise InputError(f"{table.path}: {text}; remove one of them")
+    return found
+
+
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
@@ -278,10 +296,7 @@ def _of_anchors(
     Raises:
         InputError: a column that is missing in some of the files, or a value that does not fit the signal strength.
     """
-    found = [
-        {_id(column.removeprefix(prefix)): column for column in table.header if column.startswith(prefix)}
-        for table in tables
-    ]
+    found = [_by_anchor(prefix, table) for table in tables]
     if not any(anchor in columns for columns in found for anchor in ids):
         return None
     counts, parts = prefix == COUNT, []
@@ -292,7 +307,7 @@ def _of_anchors(
         values = np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids])
         if counts:
             values[values == 0] = np.nan
-        good = values > 0 if not counts else (values > 0) & (values == np.floor(values))
+        good = values > 0 if not counts else (values > 0) & (values == np.floor(values)) & (values <= MOST_READINGS)
         wrong = np.argwhere(np.where(np.isnan(strength), ~np.isnan(values), ~good).T)
         if len(wrong):
             row, anchor = wrong[0]
@@ -300,7 +315,7 @@ def _of_anchors(
             if np.isnan(strength[anchor, row]):
                 remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
             else:
-                remedy = "give the number of readings, 1 or more" if counts else "give the noise in dB, above 0"
+                remedy = "give the number of readings, 1 to a million" if counts else "give the noise in dB, above 0"
                 remedy = f"where {RSSI}{ids[anchor]} is known; {remedy}"
             raise InputError(f"{table.path}: row {row + 1}: {what}, {remedy}")
         parts.append(values)
@@ -308,17 +323,11 @@ def _of_anchors(
 
 
 def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
-    found = {column: _id(column.removeprefix(RSSI)) for column in table.header if column.startswith(RSSI)}
-    unknown = sorted(column for column, anchor in found.items() if anchor not in ids)
-    lacking = [anchor for anchor in ids if anchor not in found.values()]
+    columns = _by_anchor(RSSI, table)
+    unknown = sorted(column for anchor, column in columns.items() if anchor not in ids)
+    lacking = [anchor for anchor in ids if anchor not in columns]
     if unknown or lacking:
-        text = f"{len(found)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
+        text = f"{len(columns)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
         raise InputError(f"{table.path}: {text} ({which}); give one column per anchor, named by its id")
-    columns = {anchor: column for column, anchor in found.items()}
-    if len(columns) < len(found):
-        twice = next(column for column, anchor in found.items() if columns[anchor] != column)
-        raise InputError(
-            f"{table.path}: line 1: {twice} and {columns[found[twice]]} name one anchor; remove one of them"
-        )
     return np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids]).astype(np.float32)

@@ -179,7 +179,8 @@ def _read_columns(path: Path, headers: tuple[tuple[str, ...], ...]) -> FloatArra
     values, count = np.empty((len(rows), len(header))), len(header)
     for row, text in enumerate(rows, start=1):
         try:
-            values[row - 1] = [float(value) for value in text.split(",", count)]
+            # A single number would be taken for all columns.
+            values[row - 1] = np.reshape([float(value) for value in text.split(",", count)], count)
         except ValueError:
             numbers = "three numbers x,y,z in metres" if count == 3 else f"{count} numbers {','.join(header)}"
             raise InputError(f"{path}: row {row}: {text[:60]!r}; give {numbers}") from None

@@ -180,6 +180,9 @@ def _graph_problem(problem: Problem) -> Problem:
     options = settings.options
     if options.diffraction or options.scattering:
         raise InputError("calibration: diffraction and scattering have no derivative here; trace without them")
+    if not options.line_of_sight or options.seed != TraceOptions().seed:
+        what = f"seed={options.seed}" if options.line_of_sight else "paths without line-of-sight"
+        raise InputError(f"calibration: {what} cannot be chosen there; leave it away")
     own = [f"seed={problem.seed}", f"traced.depth={options.max_depth}", f"traced.reflections={_reflections(options)}"]
     own += [f"traced.transmission={str(options.transmission).lower()}"]
     own += [] if options.rays == "auto" else [f"traced.rays={options.rays}"]
