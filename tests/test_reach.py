@@ -169,3 +169,18 @@ def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
     assert trainer.state.reach_m == 0
     assert "6 training rows do not tell how far Gaussians hold" in caplog.text
     assert np.abs(trainer.predictor()(position[7:])).max() > 0
+
+
+@pytest.mark.parametrize(("hold_out", "known"), [(0.7, 45), (1.0, None)])
+def test_rows_that_never_train_are_not_known(hold_out: float, known: int | None) -> None:
+    """Kept out to the end, held-out rows are judged by their distance from those that trained."""
+    rng = np.random.default_rng(0)
+    record, rows = channels(np.ones((60, 1)), rng.uniform(1, 2, (60, 3))), np.arange(60)
+    config = with_settings(default_config("csi"), [*SMALL, f"hold_out={hold_out}"])
+    trainer = Trainer(record, Split("own", 0, rows[:40], rows[40:45], rows[45:]), config)
+    trainer.run()
+    reach = trainer.reach()
+    assert trainer.state.chosen
+    assert reach is not None
+    assert len(reach.known_m[0]) == (known or len(trainer._choosing.train))
+    assert len(trainer._choosing.train) < 40

@@ -178,7 +178,7 @@ class Predictor:
         return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """What a receiver reports of conditions [3 or features, at most `TOGETHER`] recorded, flat."""
+        """What a receiver reports of conditions [3 or features, at most `TOGETHER`], recorded, flat."""
         if receiver not in self._reports:
             report = self.graph.report(receiver, None, skip=self._skip)
 

@@ -265,7 +265,8 @@ class Trainer(TrainingLoop):
         """Where the Gaussians are trusted, by the rows that train now; None: they correct nothing."""
         if not self.graph.corrects:
             return None
-        rows = self._known if self.state.chosen else self._choosing.train
+        joined = self.state.chosen and self.schedule.joined < self.config.steps
+        rows = self._known if joined else self._choosing.train
         known = [self.record.tx_pos_m[self.targets.received(r, rows)] for r in range(len(self.record.receivers))]
         return Reach(tuple(known), self.state.reach_m)
 
