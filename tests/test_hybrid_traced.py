@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import to_uint
@@ -231,6 +233,37 @@ def test_rows_of_a_batch(scene: Any) -> None:
     assert (some.batch, some.each) == (3, everything.each)
     length = everything.length_m.numpy().reshape(4, -1)
     np.testing.assert_array_equal(some.length_m.numpy().reshape(3, -1), length[[3, 1, 3]])
+
+
+@given(share=st.floats(1e-4, 0.5), seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_error_of_faint_paths_left_out_is_bounded(scene: Any, share: float, seed: int) -> None:
+    tx = transmitters(3, seed)
+    whole = TracedField(scene, tx, receiver(), TracedOptions(OPTIONS))
+    kept = TracedField(scene, tx, receiver(), TracedOptions(OPTIONS, faint=share))
+    response, amplitude, count = np.zeros((2, 3), complex), np.zeros(3), np.zeros((2, 3), int)
+    for i, traced in enumerate((whole, kept)):
+        paths = traced({})
+        gain = (paths.gain[0].numpy() + 1j * paths.gain[1].numpy()).reshape(3, -1)
+        phase = np.exp(-2j * np.pi * FREQUENCY_HZ / speed_of_light * paths.length_m.numpy().reshape(3, -1))
+        response[i], count[i] = (gain * phase).sum(1), traced.exists.reshape(3, -1).sum(1)
+        amplitude = np.maximum(amplitude, np.abs(gain).sum(1))
+    # Which paths are faint is decided by gains in single precision.
+    assert (np.abs(response[0] - response[1]) <= (share + SINGLE) * amplitude).all()
+    assert (count[1] <= count[0]).all()
+    assert (count[1] > 0).all()
+
+
+def test_kernels_of_a_step_are_launched_without_faint_paths(scene: Any) -> None:
+    sizes = []
+    for share in (0.0, 0.1):
+        traced = TracedField(scene, transmitters(4), receiver(), TracedOptions(OPTIONS, faint=share))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(traced({}).gain)
+            sizes.append(max(one["size"] for one in dr.kernel_history([dr.KernelType.JIT])))
+        assert sizes[-1] == traced.exists.size
+    assert sizes[1] < 0.8 * sizes[0]
 
 
 def test_free_space() -> None:

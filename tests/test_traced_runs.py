@@ -97,6 +97,16 @@ def calibrated(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathF
     ).folder
 
 
+def test_calibration_takes_the_seed_of_rows_and_of_training(
+    flat_folder: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = ["--paths", "line-of-sight", "--depth", "0", "--calibrate", "gain", "--set", "steps=2"]
+    asked = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, *paths, "--seed", "2"]
+    status, _, err = call([*asked, "--out", tmp_path / "run", "--json"], capsys)
+    assert status == 0, err
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["seed"] == 2
+
+
 def asked_rows(run: Path, record: Record, file: Path, heading: np.ndarray | None) -> Path:
     """The run's test rows as a file of `wrf-mi predict`, CSV or npz by its name."""
     tx_pos = record.tx_pos_m[read_run(run).row]

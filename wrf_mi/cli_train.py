@@ -124,7 +124,9 @@ def _tracing_settings(a: Arguments) -> list[str]:
     for name, given in (("--depth", a.depth), ("--rays", a.rays)):
         if target is not None and given is not None:
             raise InputError(f"trace: --target-error chooses what {name} states; give one of them")
-    numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": a.seed}
+    # Where paths are trained, the seed is the training's and that of the rows; they are searched with the default one.
+    seed = None if a.calibrate is not None else a.seed
+    numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": seed}
     options = with_kinds(DEFAULTS, a.paths, **numbers)
     stated: dict[str, Any] = {key: getattr(options, key) for key, given in numbers.items() if given is not None}
     if a.paths is not None:

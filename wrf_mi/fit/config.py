@@ -244,6 +244,7 @@ _RANGES: Mapping[str, Range] = {
     "traced.alone": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
     "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
     "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
+    "traced.faint": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
     "traced.pattern_degree": (lambda x: 0 <= x <= MAX_DEGREE, f"0 to {MAX_DEGREE}"),
 }
 """What numbers may be, and words for it; `NOT_NEGATIVE` where nothing is said here."""

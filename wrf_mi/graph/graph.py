@@ -163,7 +163,8 @@ class Graph:
             rays=t.rays,
         )
         ends: dict[str, Any] = {"tx_antenna": self.tx_antenna, "materials": t.materials, "planes": t.moves_planes}
-        options, receiver = TracedOptions(what, t.pattern_degree, **ends), self.receivers[number]
+        options = TracedOptions(what, t.pattern_degree, faint=t.faint, **ends)
+        receiver = self.receivers[number]
         return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:

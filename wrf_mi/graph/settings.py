@@ -24,6 +24,8 @@ class TracedConfig:
         reflections: of these at most so many reflections.
         transmission: paths through surfaces.
         rays: that search from each receiver.
+        faint: the weakest paths of a transmitter are left out while their amplitudes add up to less than this share of
+            those of all paths, with the scene's stated materials; 0: none are.
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
         materials: ``named``: each named material has a permittivity and a conductivity; ``surface``: each surface has
             its own, the faces of one object in one plane, started from the named material.
@@ -41,6 +43,7 @@ class TracedConfig:
     reflections: int = 3
     transmission: bool = True
     rays: int = 1 << 16
+    faint: float = 1e-3
     pattern_degree: int = 0
     materials: Literal["named", "surface"] = "named"
     alone: float = 0.25

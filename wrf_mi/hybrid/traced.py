@@ -57,6 +57,8 @@ class TracedOptions:
         materials: whether each named material has a permittivity and a conductivity of its own, or each surface, the
             faces of one object in one plane, started from its named material.
         planes: list shifts and tilts of the scene's planes among the parameters (`wrf_mi.hybrid.planes`).
+        faint: paths of a transmitter are left out, weakest first, while their amplitudes add up to less than this share
+            of the amplitudes of all, with the scene's materials; 0: none are.
         search_again_m: how far the receiver may move before paths are searched again; None: a quarter of a wavelength.
     """
 
@@ -67,6 +69,7 @@ class TracedOptions:
     tx_antenna: Antenna = ANTENNA
     materials: Materials = "named"
     planes: bool = False
+    faint: float = 0.0
 
     def __post_init__(self) -> None:
         """Reject what cannot be followed.
@@ -267,6 +270,8 @@ class TracedField:
 
     def _take(self, traced: TraceResult, here_m: FloatArray) -> None:
         """Lay paths out with as many places for each transmitter as the richest one needs."""
+        if self.options.faint:
+            traced = traced.without_faint(self.options.faint)
         surfaces, types = self._surfaces, traced.paths.interactions
         face = np.full(types.shape, -1)
         if types.any():

@@ -59,6 +59,22 @@ class TraceResult:
         kept = self.primitives[which], self.probability[which]
         return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
 
+    def without_faint(self, share: float) -> TraceResult:
+        """The paths without the weakest of each transmitter at each receiver.
+
+        Args:
+            share: amplitudes of those that are left out add up to less than this share of the amplitudes of all,
+                which bounds the error of a sum of the paths, whatever their phases.
+        """
+        pair, amplitude = self.paths.tx + self.paths.n_tx * self.paths.rx, np.abs(self.paths.gain)
+        order = np.lexsort((amplitude, pair))
+        ordered, upto = pair[order], np.cumsum(amplitude[order])
+        first = np.searchsorted(ordered, ordered)
+        upto -= (upto - amplitude[order])[first]
+        kept = np.empty(len(pair), bool)
+        kept[order] = upto >= share * np.bincount(pair, amplitude)[ordered]
+        return self.select(kept)
+
     def legs(self, surfaces: Surfaces) -> Legs:
         """The paths in the direction of the search, for Sionna RT.
 
