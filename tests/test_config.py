@@ -45,6 +45,7 @@ LARGEST = {
     "density.stop": 1.0,
     "density.grow": 1.0,
     "traced.alone": 0.4,
+    "traced.faint": 0.4,
     "traced.depth": 12,
     "traced.pattern_degree": 8,
     "traced.rays": 1 << 24,
