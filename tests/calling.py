@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrf_mi.cli import main
+from wrf_mi.cli.main import main
 
 SMALL = ["initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "log_every=2", "validate_every=4", "steps=4"]
 SET = [part for setting in SMALL for part in ("--set", setting)]

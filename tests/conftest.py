@@ -15,6 +15,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 from made_flat import write_flat, write_plain_flat
 
+from wrf_mi.backend import init
+
+init()  # before a test imports Dr.Jit
+
 if TYPE_CHECKING:
     from wrf_mi.core import Record
 
@@ -51,7 +55,7 @@ def one_gateway(two_gateways: Record) -> Record:
 @pytest.fixture(scope="session")
 def folder(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same as a data set."""
-    from wrf_mi.measure import write_spectrum_folder
+    from wrf_mi.datasets import write_spectrum_folder
 
     return write_spectrum_folder(tmp_path_factory.mktemp("data") / "made-here", one_gateway, bits=16)
 

@@ -13,7 +13,7 @@ from trimesh import Trimesh
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Receiver
-from wrf_mi.trace import open_scene
+from wrf_mi.tracing import open_scene
 
 FREQUENCY_HZ = 920e6
 LENGTH, WIDTH, HEIGHT = 6.0, 5.0, 3.0

@@ -6,13 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from wrf_mi.backend import init
-
-init()
-
-from wrf_mi.core import Receiver, Record  # noqa: E402
-from wrf_mi.field import Encoding, WrfGs, WrfGsPlus, random_gaussians  # noqa: E402
-from wrf_mi.fit.predictor import Predictor  # noqa: E402
+from wrf_mi.core import Receiver, Record
+from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.training.predictor import Predictor
 
 RECEIVERS = (
     Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])),

@@ -9,8 +9,8 @@ import numpy as np
 from small_fits import official, settings
 
 from wrf_mi.core import Receiver, Record
-from wrf_mi.field import Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.report.runs import train
+from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.runs.api import train
 
 RECEIVER = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from wrf_mi.core import Record, Split
 from wrf_mi.core.settings import with_settings
-from wrf_mi.fit.config import TrainConfig
-from wrf_mi.measure import make_splits
+from wrf_mi.datasets import make_splits
+from wrf_mi.training.config import TrainConfig
 
 QUICK = (
     "initial.gaussians=8",

@@ -12,7 +12,7 @@ from scipy.constants import speed_of_light
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Receiver
-from wrf_mi.trace import open_scene
+from wrf_mi.tracing import open_scene
 
 FREQUENCY_HZ = 2.4e9
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .core import BackendError, InputError, Receiver, Record, Split
     from .core.settings import with_settings
-    from .fit.config import TrainConfig
-    from .fit.trainer import Trainer
-    from .measure import fetch, make_splits
-    from .report.compare import compare
-    from .report.figures import spectrum_table
-    from .report.runs import Run, evaluate_run, open_run, predict_to_file, resume, train
-    from .report.view import scene_view
+    from .datasets import fetch, make_splits
+    from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
+    from .runs.compare import compare
+    from .runs.figures import spectrum_table
+    from .runs.scene_view import scene_view
     from .scene.make import make_scene
-    from .trace import TraceOptions
-    from .trace import load_record as load
+    from .synthetic import load_record as load
+    from .tracing import TraceOptions
+    from .training.config import TrainConfig
+    from .training.trainer import Trainer
 
 __version__ = "0.2.0"
 
@@ -30,23 +30,23 @@ _HOME = {
     "InputError": "core",
     "Receiver": "core",
     "Record": "core",
-    "Run": "report.runs",
+    "Run": "runs.api",
     "Split": "core",
-    "TraceOptions": "trace",
-    "TrainConfig": "fit.config",
-    "Trainer": "fit.trainer",
-    "compare": "report.compare",
-    "evaluate_run": "report.runs",
-    "fetch": "measure",
-    "load": "trace:load_record",
+    "TraceOptions": "tracing",
+    "TrainConfig": "training.config",
+    "Trainer": "training.trainer",
+    "compare": "runs.compare",
+    "evaluate_run": "runs.api",
+    "fetch": "datasets",
+    "load": "synthetic:load_record",
     "make_scene": "scene.make",
-    "make_splits": "measure",
-    "open_run": "report.runs",
-    "predict_to_file": "report.runs",
-    "resume": "report.runs",
-    "scene_view": "report.view",
-    "spectrum_table": "report.figures",
-    "train": "report.runs",
+    "make_splits": "datasets",
+    "open_run": "runs.api",
+    "predict_to_file": "runs.api",
+    "resume": "runs.api",
+    "scene_view": "runs.scene_view",
+    "spectrum_table": "runs.figures",
+    "train": "runs.api",
     "with_settings": "core.settings",
 }
 

@@ -3,7 +3,8 @@
 A ray through many overlapping ellipsoids costs one trace a hit, and each trace tests those around its start again.
 Three things keep that small:
 
-* one ray is traced for each bundle, through ellipsoids grown by the bundle's width (`wrf_mi.project.ray.hulls`);
+* one ray is traced for each bundle, through ellipsoids grown by the bundle's width
+  (`wrf_mi.gaussians.ray_response.hulls`);
 * the ellipsoids are dealt out to many places far from each other and traced in each, so that few overlap;
 * the caller keeps what was found for as long as neither the Gaussians' geometry nor the receiver changes.
 
@@ -24,18 +25,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 
-init()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.project.footprint import Pose, depth_order  # noqa: E402
-from wrf_mi.project.ray import Hulls, RayFootprints, hulls  # noqa: E402
-from wrf_mi.splat.bundles import Bundles, RayLists  # noqa: E402
+from wrf_mi.gaussians.bundles import Bundles, RayLists
+from wrf_mi.gaussians.footprint import Pose, depth_order
+from wrf_mi.gaussians.parameters import Gaussians
+from wrf_mi.gaussians.ray_response import Hulls, RayFootprints, hulls
 
 IN_PART = 64
 """Ellipsoids in a part, about: with fewer, most rays meet none of it; with more, each trace tests many."""

@@ -5,21 +5,17 @@ from __future__ import annotations
 import weakref
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+from numpy.typing import ArrayLike
 
-init()
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.optical_depth import attenuators, one, passing
+from wrf_mi.gaussians.parameters import Gaussians
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-from numpy.typing import ArrayLike  # noqa: E402
-
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.project.footprint_constants import CUTOFF  # noqa: E402
-from wrf_mi.project.optical_depth import attenuators, one, passing  # noqa: E402
-
-from .shape import gaussian_shape, shape_parameters  # noqa: E402
-from .source import FieldSource, source_from_properties, source_of  # noqa: E402
+from .shape import gaussian_shape, shape_parameters
+from .source import FieldSource, source_from_properties, source_of
 
 
 class GaussianEmitter(mi.Emitter):
@@ -141,7 +137,7 @@ def gaussian_emitter(
     """The emitter of a model of your own, or of parameters that no run folder holds; an entry for ``mi.load_dict``.
 
     Args:
-        field: any object with the method ``gaussians`` of `wrf_mi.field.WrfGsPlus`.
+        field: any object with the method ``gaussians`` of `wrf_mi.gaussians.WrfGsPlus`.
         params: its parameters by name.
         tx_position_m: three coordinates, world frame.
         name: under which ``mi.traverse`` lists its parameters; use it as the key in dictionaries, too.

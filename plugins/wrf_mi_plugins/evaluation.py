@@ -10,29 +10,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 
-init()
+from wrf_mi.backend.device import to_float
+from wrf_mi.core import InputError
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.gaussians.parameters import Gaussians
+from wrf_mi.gaussians.skip import NOTHING, Skip
+from wrf_mi.gaussians.tiles import Plane
+from wrf_mi.graph.learned import facing_down
+from wrf_mi.graph.settings import DEFAULT, TracedConfig
+from wrf_mi.tracing.evaluate_paths import Complex
+from wrf_mi.tracing.material_parameters import Materials, slabs_of_faces
+from wrf_mi.tracing.surfaces import scene_surfaces
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-
-from wrf_mi.backend.device import to_float  # noqa: E402
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.core.angles import FloatArray  # noqa: E402
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.graph.settings import DEFAULT, TracedConfig  # noqa: E402
-from wrf_mi.hybrid.follow import Complex  # noqa: E402
-from wrf_mi.hybrid.learned import facing_down  # noqa: E402
-from wrf_mi.hybrid.materials import Materials, slabs_of_faces  # noqa: E402
-from wrf_mi.project.footprint import Pose  # noqa: E402
-from wrf_mi.splat.skip import NOTHING, Skip  # noqa: E402
-from wrf_mi.splat.tiles import Plane  # noqa: E402
-from wrf_mi.trace.surfaces import scene_surfaces  # noqa: E402
-
-from . import register_all  # noqa: E402
-from .shape import gaussian_shape, shape_parameters  # noqa: E402
+from . import register_all
+from .shape import gaussian_shape, shape_parameters
 
 SHAPE = "gaussians"
 
@@ -43,9 +39,9 @@ class SceneWalls:
     The Sionna RT scene is read and never changed: materials are copies, with parameters of their own.
 
     Args:
-        scene: from `wrf_mi.trace.open_scene`.
+        scene: from `wrf_mi.tracing.open_scene`.
         materials: whether each named material or each surface has a permittivity and a conductivity, see
-            `wrf_mi.hybrid.materials`.
+            `wrf_mi.tracing.material_parameters`.
 
     Attributes:
         names: of the materials, or ``object/plane`` of the surfaces, in the order of the walls.
@@ -86,7 +82,7 @@ class SceneWalls:
         """What to assign in ``mi.traverse`` for trained materials, differentiable; those without stay as stated.
 
         Args:
-            params: Dr.Jit tensors by the names of `wrf_mi.hybrid.materials.SlabMaterials.parameters`.
+            params: Dr.Jit tensors by the names of `wrf_mi.tracing.material_parameters.SlabMaterials.parameters`.
         """
         tables = self._slabs.tables(params, self._stated[:2])
         return {
@@ -145,7 +141,7 @@ class Traced:
     (`dr.freeze`), which builds bounding volumes anew.
 
     Args:
-        scene: from `wrf_mi.trace.open_scene`; None: no walls.
+        scene: from `wrf_mi.tracing.open_scene`; None: no walls.
         traced: what of the scene is trained.
 
     Raises:
@@ -172,7 +168,7 @@ class Traced:
         params: Mapping[str, Any],
         skip: Skip = NOTHING,
     ) -> Complex:
-        """Complex signal on directions, in the order of `wrf_mi.hybrid.learned.learned_field`; nothing is skipped."""
+        """Complex signal on directions, in the order of `wrf_mi.graph.learned.learned_field`; nothing is skipped."""
         poses = [pose, facing_down(pose)] if sphere else [pose]
         if not gaussians.count:
             pixels = gaussians.batch * len(poses) * plane.pixels

@@ -7,8 +7,8 @@ Gaussians lie behind walls that pass at most the share p of the power on each of
     |sum_{k >= j} w_k S_k W_k T_k| <= sqrt(p) |T_j| M_j <= sqrt(p) M_j
 
 with M_j the largest |S_k| cut off, as their weights add up to less than one (alpha blending), or their sum (product
-blending, where |T| <= 1): the bound of `wrf_mi.splat.skip`, made smaller by the walls. Derivatives by S_k, which are
-w_k W_k T_k, are below sqrt(p) too.
+blending, where |T| <= 1): the bound of `wrf_mi.gaussians.skip`, made smaller by the walls. Derivatives by S_k, which
+are w_k W_k T_k, are below sqrt(p) too.
 
 A Gaussian lies behind what is nearer than its distance less three of its largest standard deviations, the low-pass
 included: where it is cut off, and so nearer than its strongest point on any ray that sees it.
@@ -18,18 +18,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
 
-init()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.project.footprint_constants import CUTOFF, LOW_PASS_RAD  # noqa: E402
-from wrf_mi.project.ray import RayFootprints  # noqa: E402
-from wrf_mi.splat.bundles import Bundles, RayLists  # noqa: E402
-from wrf_mi.splat.rays import Walls  # noqa: E402
+from wrf_mi.gaussians.blend_rays import Walls
+from wrf_mi.gaussians.bundles import Bundles, RayLists
+from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD
+from wrf_mi.gaussians.parameters import Gaussians
+from wrf_mi.gaussians.ray_response import RayFootprints
 
 ROUNDING = 1e-5
 """Share of a distance by which a Gaussian must be farther than a wall: some roundings of float32."""

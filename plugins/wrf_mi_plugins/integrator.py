@@ -7,26 +7,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba.python.ad.integrators.common import ADIntegrator
 
-init()
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.blend_rays import Walls, blend_rays
+from wrf_mi.gaussians.bundles import RayLists, ray_bundles
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.gaussians.ray_response import ray_footprints
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-from mitsuba.python.ad.integrators.common import ADIntegrator  # noqa: E402
-
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.project.footprint import Pose  # noqa: E402
-from wrf_mi.project.ray import ray_footprints  # noqa: E402
-from wrf_mi.splat.bundles import RayLists, ray_bundles  # noqa: E402
-from wrf_mi.splat.rays import Walls, blend_rays  # noqa: E402
-
-from .acceleration import traced_lists  # noqa: E402
-from .hidden import without_hidden  # noqa: E402
-from .sensor import RIGID_TOLERANCE, PerceptionPlane, pose_of  # noqa: E402
-from .shape import gaussian_shape_of, interleave, read_gaussians  # noqa: E402
-from .walls import find_crossings, wall_scene, wall_shapes, walls_of  # noqa: E402
+from .acceleration import traced_lists
+from .hidden import without_hidden
+from .sensor import RIGID_TOLERANCE, PerceptionPlane, pose_of
+from .shape import gaussian_shape_of, interleave, read_gaussians
+from .walls import find_crossings, wall_scene, wall_shapes, walls_of
 
 KEPT = 8
 """Views (sensor and pose, with geometry) whose rays, hits and walls are kept."""
@@ -68,8 +64,8 @@ class TracedField(ADIntegrator):
     Evaluates the complex field at a receiver along each ray of its sensor: from near to far, each Gaussian adds its
     signal times its largest response on the ray, times what nearer Gaussians and walls let pass. Gaussians with an
     ``opacity`` are blended as in WRF-GS+ (alpha), those with an ``attenuation`` as in WRF-GS (product). Order, cut-off
-    and low-pass are those of the splatted evaluation (`wrf_mi.splat.render.splat`); the footprint is exact where
-    splatting projects (`wrf_mi.project.ray`).
+    and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.render.splat`); the footprint is exact where
+    splatting projects (`wrf_mi.gaussians.ray_response`).
 
     The field is the scene's ``ellipsoids`` shape with the attribute ``signal``, see
     `wrf_mi_plugins.shape.gaussian_shape`; its parameters in ``mi.traverse(scene)`` have derivatives, forward and

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 
-init()
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.extinction_cells import largest_extinction, make_cells, to_device
+from wrf_mi.gaussians.optical_depth import attenuators, extinction, on_host, optical_depth
+from wrf_mi.gaussians.parameters import Gaussians
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.project.extinction_cells import largest_extinction, make_cells, to_device  # noqa: E402
-from wrf_mi.project.optical_depth import attenuators, extinction, on_host, optical_depth  # noqa: E402
-
-from .emitter import GaussianEmitter  # noqa: E402
-from .source import FieldSource, source_from_properties  # noqa: E402
+from .emitter import GaussianEmitter
+from .source import FieldSource, source_from_properties
 
 LEAST_MAJORANT_PER_M = 1e-6
 """Free flights are drawn from at least this, so that Gaussians of no opacity give long ones and no division by zero."""
@@ -60,7 +56,7 @@ class GaussianMedium(mi.Medium):
 
     The stencil may be any closed shape around the Gaussians; how much larger it is costs nothing. A sensor inside needs
     the medium as well. Opacity becomes extinction so that 1 - alpha = exp(-optical depth) along every line through the
-    centre, see `wrf_mi.project.optical_depth`; for that the extinction depends on the ray's direction. Nothing is
+    centre, see `wrf_mi.gaussians.optical_depth`; for that the extinction depends on the ray's direction. Nothing is
     scattered.
 
     Cost: free flights are drawn from one bound for the whole medium, so a ray of length L takes about bound times L

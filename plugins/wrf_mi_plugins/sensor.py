@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
 
-init()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import ArrayLike  # noqa: E402
-
-from wrf_mi.backend.device import to_vectors  # noqa: E402
-from wrf_mi.core import InputError, pixel_directions, rotation_matrix  # noqa: E402
-from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, equirectangular_sphere  # noqa: E402
-from wrf_mi.project.footprint import Pose  # noqa: E402
+from wrf_mi.backend.device import to_vectors
+from wrf_mi.core import InputError, pixel_directions, rotation_matrix
+from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, equirectangular_sphere
+from wrf_mi.gaussians.footprint import Pose
 
 DIRECTIONS = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}
 """Functions of (height, width) that give the unit vector of every pixel."""

@@ -13,16 +13,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
 
-init()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.project.footprint_constants import CUTOFF  # noqa: E402
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.parameters import Gaussians
 
 SIGNAL, OPACITY, ATTENUATION = "signal", "opacity", "attenuation"
 """Attributes of the shape: two floats (re, im), one float (alpha blending), two floats (product blending)."""

@@ -6,21 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
 
-init()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import ArrayLike  # noqa: E402
-
-from wrf_mi.backend.device import to_tensor  # noqa: E402
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.field.gaussians import Gaussians  # noqa: E402
-from wrf_mi.field.models import GEOMETRY  # noqa: E402
-from wrf_mi.report.run_folder import FITTED  # noqa: E402
-from wrf_mi.report.runs import open_run  # noqa: E402
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.fields import GEOMETRY
+from wrf_mi.gaussians.parameters import Gaussians
+from wrf_mi.runs.api import open_run
+from wrf_mi.runs.folder import FITTED
 
 
 @dataclass
@@ -28,7 +24,7 @@ class FieldSource:
     """A field's parameters and a transmitter position; the Gaussians follow from them.
 
     Attributes:
-        field: a model, e.g. ``wrf_mi.field.WrfGsPlus``: any object with its method ``gaussians``.
+        field: a model, e.g. ``wrf_mi.gaussians.WrfGsPlus``: any object with its method ``gaussians``.
         params: the model's parameters by name, ``mi.TensorXf``.
         tx_position: ``mi.Point3f`` of width 1, world frame, metres.
     """

@@ -6,20 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from wrf_mi.backend import init
+import drjit as dr
+import mitsuba as mi
 
-init()
+from wrf_mi.core import InputError
+from wrf_mi.gaussians.blend_rays import Walls
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.tracing.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
+from wrf_mi.tracing.slab import slab
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-
-from wrf_mi.core import InputError  # noqa: E402
-from wrf_mi.project.footprint import Pose  # noqa: E402
-from wrf_mi.splat.rays import Walls  # noqa: E402
-from wrf_mi.trace.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ  # noqa: E402
-from wrf_mi.trace.slab import slab  # noqa: E402
-
-from .shape import interleave  # noqa: E402
+from .shape import interleave
 
 ITU_PREFIX = "mat-itu_"
 """Start of the id of a BSDF that stands for a material of ITU-R P.2040, as in Sionna RT's scene files."""
@@ -112,7 +108,7 @@ def walls_of(
 ) -> Walls | None:
     """The complex transmission along rays, differentiable in the parameters of Sionna RT's radio materials.
 
-    Each wall is one slab (`wrf_mi.trace.slab`, as in Sionna RT), and passes the receiver's polarisation by
+    Each wall is one slab (`wrf_mi.tracing.slab`, as in Sionna RT), and passes the receiver's polarisation by
     T = T_TE s + T_TM (1 - s), where s is the share of it across the plane of incidence.
 
     Args:

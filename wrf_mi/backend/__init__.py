@@ -94,8 +94,8 @@ def set_threads(threads: int) -> None:
     """Change the number of threads that LLVM kernels run on.
 
     What was traced or launched before has room for the sums of as many threads as there were then, and more would
-    write beyond it (Dr.Jit 1.5, ``scatter_reduce``), so it is computed first. `wrf_mi.field.recorded` sees to functions
-    that are recorded.
+    write beyond it (Dr.Jit 1.5, ``scatter_reduce``), so it is computed first. `wrf_mi.backend.recorded` sees to
+    functions that are recorded.
 
     Args:
         threads: 1 or more.

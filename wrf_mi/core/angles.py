@@ -96,3 +96,11 @@ def rotation_matrix(quaternion_xyzw: ArrayLike) -> FloatArray:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def fibonacci_sphere(count: int) -> FloatArray:
+    """Unit vectors [count, 3] spread evenly over the sphere (Gonzalez, 2010)."""
+    number = np.arange(count) + 0.5
+    z = 1 - 2 * number / count
+    turn, radius = np.pi * (1 + np.sqrt(5)) * number, np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

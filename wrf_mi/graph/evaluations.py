@@ -11,12 +11,12 @@ from typing import Any, Protocol
 
 from ..core import InputError
 from ..core.registry import resolve
-from ..field import Gaussians
-from ..hybrid.follow import Complex
-from ..hybrid.learned import learned_field
-from ..project.footprint import Pose
-from ..splat.skip import NOTHING, Skip
-from ..splat.tiles import Plane
+from ..gaussians import Gaussians
+from ..gaussians.footprint import Pose
+from ..gaussians.skip import NOTHING, Skip
+from ..gaussians.tiles import Plane
+from ..tracing.evaluate_paths import Complex
+from .learned import learned_field
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {
@@ -44,7 +44,7 @@ class Evaluation(Protocol):
         params: Mapping[str, Any],
         skip: Skip = NOTHING,
     ) -> Complex:
-        """Real and imaginary part [batch * directions], see `wrf_mi.hybrid.learned.learned_field`.
+        """Real and imaginary part [batch * directions], see `wrf_mi.graph.learned.learned_field`.
 
         Args:
             gaussians: of one field for a batch of transmitters.
@@ -62,7 +62,7 @@ class Evaluation(Protocol):
 
 
 class Splatted:
-    """Gaussians splatted on the plane of directions (`wrf_mi.splat`); walls of a scene are no part of it."""
+    """Gaussians splatted on the plane of directions (`wrf_mi.gaussians`); walls of a scene are no part of it."""
 
     recordable = True
 
@@ -90,7 +90,7 @@ def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluat
 
     Args:
         name: a key of `EVALUATIONS`.
-        scene: from `wrf_mi.trace.open_scene`; None: none.
+        scene: from `wrf_mi.tracing.open_scene`; None: none.
         traced: what of the scene is trained.
 
     Raises:

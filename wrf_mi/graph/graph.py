@@ -4,9 +4,10 @@
                                                                  ├─► receiver model ─► spectrum, dBm, channel
     tx position ─► chains of planes ─► T ────────────────────────┘
 
-Every argument that training changes is a parameter by name: those of the field (`wrf_mi.field`), ``level``, the
+Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
-``receiver.*`` and ``pattern.*`` (`wrf_mi.hybrid.traced.TracedField`). Without a scene the tracer is not imported.
+``receiver.*`` and ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`). Without a scene the tracer is not
+imported.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
-from ..field import Factorised, Gaussians, WrfGs, WrfGsPlus
-from ..field.gaussians import by_component
-from ..hybrid.pose import receiver_pose
-from ..project.footprint import Pose
-from ..splat.skip import NOTHING, Skip
-from ..splat.tiles import Plane
+from ..gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
+from ..gaussians.footprint import Pose
+from ..gaussians.parameters import by_component
+from ..gaussians.skip import NOTHING, Skip
+from ..gaussians.tiles import Plane
+from ..tracing.pose import receiver_pose
 from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form, ReceiverModel
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
 if TYPE_CHECKING:
-    from ..hybrid.traced import TracedField, TracedPaths
+    from ..tracing.traced_field import TracedField, TracedPaths
 
 Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
@@ -78,7 +79,7 @@ class Graph:
         field: the Gaussians; None: the traced paths alone.
         receivers: poses, antennas and arrays.
         form: what observations are made of.
-        scene: from `wrf_mi.trace.open_scene`, at the carrier; None: Gaussians alone.
+        scene: from `wrf_mi.tracing.open_scene`, at the carrier; None: Gaussians alone.
         traced: what is traced, and rates.
         tx_antenna: antenna of the transmitters.
         evaluation: of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
@@ -127,7 +128,7 @@ class Graph:
 
     @cached_property
     def _prepared(self) -> Any:
-        from ..trace.solve import Prepared
+        from ..tracing.solve import Prepared
 
         return Prepared(self.scene)
 
@@ -143,7 +144,7 @@ class Graph:
     def check_polarization(self, tx_pos_m: FloatArray) -> None:
         """Warn of receivers that are polarised across what arrives of transmitters [n, 3]."""
         if self.scene is not None:
-            from ..trace.polarization import check_polarization
+            from ..tracing.polarization import check_polarization
 
             check_polarization(self.scene, tx_pos_m, self.receivers, self.tx_antenna)
 
@@ -151,8 +152,8 @@ class Graph:
         """The traced side of transmitters [n, 3], turned by [n], at one receiver; None without a scene."""
         if self.scene is None:
             return None
-        from ..hybrid.traced import TracedField, TracedOptions
-        from ..trace import TraceOptions
+        from ..tracing import TraceOptions
+        from ..tracing.traced_field import TracedField, TracedOptions
 
         t = self.traced
         what = TraceOptions(

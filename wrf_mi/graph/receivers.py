@@ -1,7 +1,7 @@
 """Receiver models by name, and what of the observations they need to know.
 
 A receiver model is a callable of two sides, the paths of a batch and the learned signal on directions, either of which
-may be None, that gives flat observations (see `wrf_mi.hybrid.combine`). Another package adds one by an entry point of
+may be None, that gives flat observations (see `wrf_mi.graph.combine`). Another package adds one by an entry point of
 the group `ENTRY_POINTS` that names a `ReceiverKind`.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.registry import Registry
-from ..hybrid.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
 """Group of the entry points by which other packages add receiver models."""

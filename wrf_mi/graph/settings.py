@@ -10,7 +10,7 @@ EvaluationName = Literal["splatted", "traced"]
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.")
-"""Beginnings of the traced side's parameters (`wrf_mi.hybrid.traced.TracedField.parameters`)."""
+"""Beginnings of the traced side's parameters (`wrf_mi.tracing.traced_field.TracedField.parameters`)."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TracedConfig:
     tilt: float = 0.0
 
     def rate(self, name: str) -> float:
-        """Learning rate of a parameter of `wrf_mi.hybrid.traced.TracedField.parameters`."""
+        """Learning rate of a parameter of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
         kind, last = name.partition(".")[0], name.rpartition(".")[2]
         if kind == "material":
             return self.material

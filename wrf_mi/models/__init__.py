@@ -4,32 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..baselines.method import Inputs, Method
 from ..core import InputError
 from ..core.registry import Registry
-from ..fit.session import Interrupted
+from ..training.session import Interrupted
+from .method import Inputs, Method
 from .model import Fitted, Model, Problem, Session, model_of
 
 ENTRY_POINTS = "wrf_mi.models"
 """Group of the entry points by which other packages add models."""
 
 _OWN: Mapping[str, Model | Method | str] = {
-    "wrf-gs": "wrf_mi.models.gaussians:WRF_GS",
-    "wrf-gs+": "wrf_mi.models.gaussians:WRF_GS_PLUS",
-    "factorised": "wrf_mi.models.gaussians:FACTORISED",
-    "hybrid": "wrf_mi.models.hybrid:MODEL",
+    "wrf-gs": "wrf_mi.models.gaussian.model:WRF_GS",
+    "wrf-gs+": "wrf_mi.models.gaussian.model:WRF_GS_PLUS",
+    "factorised": "wrf_mi.models.gaussian.model:FACTORISED",
+    "hybrid": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
-    "idw": "wrf_mi.baselines.idw:METHOD",
-    "kriging": "wrf_mi.baselines.kriged:METHOD",
-    "trees": "wrf_mi.baselines.trees:METHOD",
-    "mri": "wrf_mi.baselines.mri:METHOD",
-    "vae": "wrf_mi.baselines.vae:METHOD",
-    "dcgan": "wrf_mi.baselines.dcgan:METHOD",
-    "nerf2": "wrf_mi.baselines.nerf2:METHOD",
-    "linear": "wrf_mi.baselines.linear:METHOD",
-    "fire": "wrf_mi.baselines.fire:METHOD",
-    "r2f2": "wrf_mi.baselines.r2f2:METHOD",
-    "optml": "wrf_mi.baselines.optml:METHOD",
+    "idw": "wrf_mi.models.interpolation.idw:METHOD",
+    "kriging": "wrf_mi.models.interpolation.kriging_model:METHOD",
+    "trees": "wrf_mi.models.interpolation.trees:METHOD",
+    "mri": "wrf_mi.models.interpolation.mri:METHOD",
+    "vae": "wrf_mi.models.networks.vae:METHOD",
+    "dcgan": "wrf_mi.models.networks.dcgan:METHOD",
+    "nerf2": "wrf_mi.models.networks.nerf2:METHOD",
+    "linear": "wrf_mi.models.uplink.linear:METHOD",
+    "fire": "wrf_mi.models.uplink.fire:METHOD",
+    "r2f2": "wrf_mi.models.uplink.r2f2:METHOD",
+    "optml": "wrf_mi.models.uplink.optml:METHOD",
 }
 
 

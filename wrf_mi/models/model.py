@@ -13,13 +13,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..baselines.method import Inputs, Method
 from ..core import AntennaOptions, Prediction, Receiver, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.types import IntArray
-from ..fit.checkpoint import checkpoint_seconds
-from ..fit.session import FitSession
 from ..parallel import Scheduler
+from ..training.checkpoint import checkpoint_seconds
+from ..training.session import FitSession
+from .method import Inputs, Method
 
 Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; leave heading_rad away"
@@ -38,7 +38,7 @@ class Problem:
         material: of a bare mesh, or None.
         antennas: patterns and polarisations in place of what the data state.
         use_rows: whether training rows are used; False: the scene alone predicts.
-        operator: learned fields predict by operator where they can, see `wrf_mi.fit.predictor`.
+        operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
     """
 
     dataset: str | Path | Record
@@ -57,7 +57,7 @@ class Problem:
         Raises:
             InputError: they cannot be read.
         """
-        from ..trace import load_record
+        from ..synthetic import load_record
 
         own = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         return self.antennas.of(own)
@@ -79,7 +79,7 @@ class Problem:
         Raises:
             InputError: it cannot be opened.
         """
-        from ..trace import open_scene  # the tracer is imported where there is a scene
+        from ..tracing import open_scene  # the tracer is imported where there is a scene
 
         return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
 
@@ -141,7 +141,7 @@ class Fitted(ABC):
 class Model:
     """An entry of the registry.
 
-    A model of another package is a `Model`, or a `wrf_mi.baselines.method.Method`, that an entry point of the group
+    A model of another package is a `Model`, or a `wrf_mi.models.method.Method`, that an entry point of the group
     ``wrf_mi.models`` names.
 
     Attributes:

@@ -1,12 +1,12 @@
 """The model ``ray-tracing``: paths of a scene, and what is fitted to make them report as the receivers do.
 
-paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.trace.load_trace`)
+paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.tracing.load_trace`)
 corrected/        where planes were calibrated: the scene with these, a folder that plain Sionna RT opens
 convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all that was tried
 
-Signal strengths are not calibrated: an offset per receiver (`wrf_mi.trace.offsets`) is fitted to the training rows. For
-other tasks nothing is fitted. With ``calibration`` what it names is trained: the graph of `wrf_mi.graph.graph` without
-Gaussians, for every task.
+Signal strengths are not calibrated: an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows.
+For other tasks nothing is fitted. With ``calibration`` what it names is trained: the graph of `wrf_mi.graph.graph`
+without Gaussians, for every task.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..baselines.method import Inputs
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
 from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
-from ..fit.config import calibration_config
-from ..fit.loop_config import LoopOptions
-from ..hybrid.corrected import check_materials, write_corrected_scene
-from ..measure.observations import place_of
+from ..datasets.observations import place_of
 from ..parallel import Scheduler, row_parts
-from ..receive.instruments import Instrument
+from ..receivers.instruments import Instrument
 from ..tasks import instrument_of, task_of
-from ..trace import TraceOptions, TraceResult, load_trace, save_trace
-from ..trace.offsets import Offsets, fit_offsets
-from ..trace.polarization import warn_of_cross_polarization
-from ..trace.result import join_traces
-from ..trace.solve import TARGETS_AT_ONCE
-from ..trace.target import CHOSEN_KINDS, choose_options
-from ..trace.tracer import RayTracer
-from .gaussians import FittedField
-from .gaussians import check as check_field
-from .gaussians import fit as fit_field
+from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
+from ..tracing.convergence import CHOSEN_KINDS, choose_options
+from ..tracing.corrected_scene import check_materials, write_corrected_scene
+from ..tracing.offsets import Offsets, fit_offsets
+from ..tracing.polarization import warn_of_cross_polarization
+from ..tracing.result import join_traces
+from ..tracing.solve import TARGETS_AT_ONCE
+from ..tracing.tracer import RayTracer
+from ..training.config import calibration_config
+from ..training.loop_config import LoopOptions
+from .gaussian.model import FittedField
+from .gaussian.model import check as check_field
+from .gaussian.model import fit as fit_field
+from .method import Inputs
 from .model import Arrays, Fitted, Model, Problem, Session
 
 NAME = "ray-tracing"
@@ -63,7 +63,8 @@ class TracingSettings(LoopOptions, TraceOptions):
         calibration: what is trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
             ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null: nothing.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
-            further kinds of path are chosen by convergence on a sample of the transmitters (`wrf_mi.trace.target`);
+            further kinds of path are chosen by convergence on a sample of the transmitters
+            (`wrf_mi.tracing.convergence`);
             null: none are chosen.
         target_kinds: kinds of path that may then be switched on, separated by commas.
     """

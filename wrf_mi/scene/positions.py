@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..measure.csv_table import read_csv
+from ..datasets.csv_table import read_csv
 from .plan_sources import PlanGrid
 from .register import best_motion, wall_points
 from .surfaces import Surface, moved

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from ..core import InputError, Record
 from ..core.registry import Registry
-from ..receive.instruments import Instrument
+from ..receivers.instruments import Instrument
 from . import csi, rssi, spectrum
 from .task import UPLINK, Task
 

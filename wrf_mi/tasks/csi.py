@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
-from ..receive.instruments import ChannelInstrument
+from ..receivers.instruments import ChannelInstrument
 from .scores import cea_db
 from .task import Task, carrier_hz
 
@@ -35,7 +35,7 @@ class Csi(Task):
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
         """The mean squared difference over what was received."""
-        from ..loss.known import squared_error
+        from .losses import squared_error
 
         return squared_error(prediction, truth)
 

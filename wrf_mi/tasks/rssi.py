@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import Record
 from ..core.angles import FloatArray
-from ..receive.instruments import PowerInstrument
+from ..receivers.instruments import PowerInstrument
 from .scores import abs_error_db
 from .task import Task, carrier_hz
 

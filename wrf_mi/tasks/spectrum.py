@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
-from ..receive.instruments import SpectrumInstrument
+from ..receivers.instruments import SpectrumInstrument
 from .scores import ssim
 from .task import Task, carrier_hz
 
@@ -32,15 +32,15 @@ class Spectrum(Task):
         return ssim(prediction, truth)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
-        """The papers' loss, see `wrf_mi.loss.spectrum.spectrum_loss`."""
-        from ..loss.spectrum import spectrum_loss
+        """The papers' loss, see `wrf_mi.tasks.spectrum_loss.spectrum_loss`."""
+        from .spectrum_loss import spectrum_loss
 
         return spectrum_loss(prediction, truth, batch, shape[0], shape[1], structural_weight)[0]
 
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Structural similarity on the device, equal to scikit-image's."""
         from ..backend.device import to_float
-        from ..loss.ssim import ssim as on_device
+        from .ssim import ssim as on_device
 
         shape = np.shape(truth)
         scores = on_device(to_float(prediction), to_float(truth), shape[0], shape[1], shape[2])

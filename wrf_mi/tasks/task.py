@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
-from ..receive.instruments import Instrument
+from ..receivers.instruments import Instrument
 
 UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
@@ -112,7 +112,7 @@ class Task(ABC):
             shape: of one; complex ones with a last axis of real and imaginary part.
             structural_weight: weight of an image's structure, 0 to 1.
         """
-        from ..loss.known import absolute_error
+        from .losses import absolute_error
 
         return absolute_error(prediction, truth)
 

@@ -1,0 +1,5 @@
+"""Benchmarks of `wrf_mi`, which ``wrf-mi bench`` runs."""
+
+from wrf_mi.backend import init
+
+init()

@@ -1,0 +1,128 @@
+"""Fields at several budgets: size with networks, time of a spectrum and SSIM, against the best field there is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from wrf_mi.core import Record
+from wrf_mi.core.settings import with_settings
+from wrf_mi.datasets import make_splits
+from wrf_mi.runs.api import open_run, train
+from wrf_mi.runs.compressed import compress_run, spectrum_times
+from wrf_mi.runs.fit_key import fit_key, fit_once
+from wrf_mi.runs.folder import FITTED
+from wrf_mi.runs.results import read_run
+from wrf_mi.synthetic import load_record
+from wrf_mi.training.compress import Compression
+from wrf_mi.training.config import TrainConfig
+
+BEST = "WRF-GS+"
+"""The best field: the paper's network, all defaults. The others are compared with it."""
+SCHEDULE = ("steps=15000",)
+"""Of every fit, the best field's too: small ones go on gaining after 9,000."""
+REPEATS = 100
+MOST_LOSS, LEAST_FASTER, LEAST_SMALLER = 0.01, 5.0, 10.0
+"""What a small field is held to: median SSIM that it may lose, and how much faster and smaller it must be."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A field at a budget.
+
+    Attributes:
+        settings: of its fit, beside the defaults.
+        how: what is done to it afterwards; None: nothing.
+        of: the budget by whose fit it starts; "": one of its own.
+    """
+
+    settings: tuple[str, ...]
+    how: Compression | None
+    of: str = ""
+
+
+def _factorised(gaussians: int, terms: int, width: int) -> tuple[str, ...]:
+    sizes = {"initial.gaussians": min(gaussians, 270), "density.most": gaussians}
+    sizes |= {"network.terms": terms, "network.width": width}
+    return ("model=factorised", *(f"{name}={value}" for name, value in sizes.items()))
+
+
+LARGE, HALF, SMALL = "320 Gaussians, 32 terms", "160 of these", "80 Gaussians, 16 terms"
+BUDGETS: Mapping[str, Budget] = {
+    BEST: Budget((), None),
+    LARGE: Budget(_factorised(320, 32, 128), Compression(precision="8bit")),
+    HALF: Budget((), Compression(budget=160, fine_tune=4000, precision="8bit"), of=LARGE),
+    SMALL: Budget(_factorised(80, 16, 64), Compression(precision="8bit")),
+}
+
+
+def _folder_name(name: str) -> str:
+    return name.replace(" ", "-").replace(",", "")
+
+
+def budgets(
+    record: Record, work: Path, schedule: Sequence[str] = (), seed: int = 0, given: Mapping[str, Budget] = BUDGETS
+) -> dict[str, Any]:
+    """Fit a field at each budget on the official split and measure them beside each other.
+
+    Args:
+        record: of spectra, with an official split.
+        work: folder for the runs; a finished one with the same key (`wrf_mi.runs.fit_key`) is used again.
+        schedule: settings of every fit.
+        seed: of every fit.
+        given: by name; the first is what the others are compared with. What another starts by stands before it.
+
+    Returns:
+        By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
+        `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
+    """
+    rows, whole_fits, folders = make_splits(record, "official", seed)[0], dict[str, Path](), dict[str, Path]()
+    for name, budget in given.items():
+        if not budget.of:
+            config = with_settings(TrainConfig(seed=seed), [*schedule, *budget.settings])
+            fitted = work / f"{_folder_name(name)}-{fit_key(record, rows, config)}"
+            whole_fits[name] = fit_once(fitted, partial(train, record, fitted, config.model, settings=config))
+        folders[name] = source = whole_fits[budget.of or name]
+        if budget.how is not None:
+            small = work / f"{_folder_name(name)}-compressed-{fit_key(source.name, budget.how)}"
+            folders[name] = fit_once(small, partial(compress_run, source, small, budget.how, record))
+    first = folders[next(iter(folders))]
+    predictors = {name: open_run(folder, record).predictor() for name, folder in folders.items()}
+    times = spectrum_times(predictors, record.tx_pos_m[rows.all_train], REPEATS)
+    found, whole = {}, read_run(first).metrics["ssim"]["median"]
+    for name, folder in folders.items():
+        metrics, size = read_run(folder).metrics, (folder / FITTED).stat().st_size
+        found[name] = {
+            **{key: metrics[key] for key in ("gaussians", "ssim", "train_seconds")},
+            **times[name],
+            "bytes": size,
+            "times_smaller": (first / FITTED).stat().st_size / size,
+            "ssim_loss": whole - metrics["ssim"]["median"],
+        }
+    return found
+
+
+def rows_of(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Rows of the benchmark's table from what `budgets` returns."""
+    asked = f">= {LEAST_FASTER:.0f} times faster, >= {LEAST_SMALLER:.0f} times smaller, SSIM loss <= {MOST_LOSS}"
+    rows = []
+    for index, (name, one) in enumerate(found.items()):
+        value = f"{one['ssim']['median']:.3f} SSIM, {one['bytes'] / 1e3:.0f} kB, {one['ms']:.2f} ms"
+        if index:
+            ratio, low, high = one["times_faster"]
+            value += f": {ratio:.1f} times faster ({low:.1f} to {high:.1f}), {one['times_smaller']:.0f} times smaller"
+        what = f"{name}, 8 bits a weight" if index else f"{name}, {one['gaussians']} Gaussians"
+        rows.append({"what": what, "value": value, "asked": asked if index else ""})
+    return rows
+
+
+def main() -> dict[str, Any]:
+    """Budgets on rfid-lab's official split, with rows for the table."""
+    record = load_record("rfid-lab")
+    with tempfile.TemporaryDirectory() as work:
+        found = budgets(record, Path(work), SCHEDULE)
+    return {"rows": rows_of(found), "budgets": found}

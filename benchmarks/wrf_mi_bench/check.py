@@ -1,0 +1,32 @@
+"""Runs one check of the benchmark in a process of its own: ``python -m wrf_mi_bench.check MODULE:FUNCTION FILE``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from wrf_mi.core import InputError
+from wrf_mi.core.files import write_atomically
+from wrf_mi.core.registry import resolve
+
+
+def main(function: str, out: str) -> int:
+    """Call ``function`` (``module:name``) and write what it returns as JSON.
+
+    Returns:
+        The exit status: 2 with one line where data are missing, 130 where it was interrupted.
+    """
+    try:
+        figures = resolve(function)()
+    except InputError as error:
+        print(f"wrf-mi: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    write_atomically(Path(out), json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,265 @@
+"""Prediction by operator against direct evaluation: time, memory and difference, and where networks take the time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.recorded import Recorded
+from wrf_mi.core import Receiver
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.gaussians.operator import PixelOperator
+from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.static_signals import FactorisedSignals
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
+from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.operator import ArrayOperator, SectorOperator
+from wrf_mi.receivers import Array
+from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio
+from wrf_mi.training.predictor import Predictor
+from wrf_mi.training.step import DARK, device_pose
+
+GAUSSIANS, HEIGHT, WIDTH, BATCH = 10_000, 90, 360, 64
+SIZE_DEG = 3.0
+"""Standard deviation of each Gaussian as the receiver sees it: 115 weights a pixel."""
+ELEMENTS, CARRIER_HZ = planar_array(4, 4, 0.16), 920e6
+SECTORS = (6, 4)
+SMALL = 270
+"""Gaussians of the default fit, at their default size."""
+REPEATS = 15
+RECEIVER = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def random_field(
+    field: Any, count: int = GAUSSIANS, size_deg: float = SIZE_DEG, seed: int = 0
+) -> dict[str, NDArray[np.float32]]:
+    """Parameters of a field of ``count`` needles and discs of any turn, at random around the receiver."""
+    rng = np.random.default_rng(seed)
+    params = field.init(random_gaussians([RECEIVER], count, rng, size_deg=size_deg), rng)
+    params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
+    params["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
+    return dict(params)
+
+
+def processor_ms(call: Callable[[], Any], repeats: int = REPEATS) -> float:
+    """Time of all processors in one call, median: what others do on the machine hardly counts."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        call()
+        times.append(1e3 * (time.process_time() - start))
+    return float(np.median(times))
+
+
+def relative(found: Any, expected: Any) -> float:
+    """Relative L2 difference."""
+    truth = np.asarray(expected).reshape(np.shape(found))
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
+class Direct:
+    """Direct evaluation of one transmitter, in two recorded halves.
+
+    Args:
+        field: the model.
+        params: its parameters.
+    """
+
+    def __init__(self, field: Any, params: Mapping[str, NDArray[np.float32]]) -> None:
+        self.params = {name: to_tensor(values) for name, values in params.items()}
+        self.pose, self.plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
+        product = field.blending == "product"
+
+        @Recorded
+        def network(params: Any, tx_pos: Any) -> Any:
+            with dr.suspend_grad():
+                g = field.gaussians(params, tx_pos)
+                own = g.attenuation if product else [g.opacity]
+                return g.position, g.scale, g.rotation, g.signal, own
+
+        @Recorded
+        def splatted(parts: Any, pose: Any, plane: Any) -> Any:
+            with dr.suspend_grad():
+                return splat(_gathered(parts, product), pose, plane)
+
+        self.network, self._splatted, self._product = network, splatted, product
+
+    def parts(self, tx_pos_m: NDArray[Any]) -> Any:
+        """Geometry, signals and attenuation at a transmitter [3], evaluated."""
+        return self.network(self.params, to_tensor(np.reshape(tx_pos_m, (3, 1))))
+
+    def gaussians(self, tx_pos_m: NDArray[Any]) -> Gaussians:
+        """The same as Gaussians."""
+        return _gathered(self.parts(tx_pos_m), self._product)
+
+    def splat(self, parts: Any) -> Any:
+        """The complex field on the directions."""
+        return self._splatted(parts, self.pose, self.plane)
+
+    def pixels(self, tx_pos_m: NDArray[Any]) -> NDArray[Any]:
+        """Greys [pixels]."""
+        re, im = self.splat(self.parts(tx_pos_m))
+        return dr.sqrt(re * re + im * im + DARK).numpy()
+
+
+def _gathered(parts: Any, product: bool) -> Gaussians:
+    position, scale, rotation, signal, own = parts
+    alpha, delta = (None, list(own)) if product else (own[0], None)
+    return Gaussians(list(position), list(scale), list(rotation), list(signal), alpha, delta, 1)
+
+
+def differences(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m: NDArray[Any]) -> dict[str, float]:
+    """Relative L2 difference of all three operators from direct evaluation, for one transmitter; sectors in dB."""
+    direct = Direct(field, params)
+    gaussians = direct.gaussians(tx_pos_m)
+    pose, plane = direct.pose, direct.plane
+    signal = (gaussians.signal[0].numpy() + 1j * gaussians.signal[1].numpy())[None]
+    array = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)(None, splat(gaussians, pose, plane)).numpy()
+    power = PowerReceiver(HEIGHT, WIDTH, (CARRIER_HZ,))(None, learned_field(gaussians, pose, plane, True)).numpy()
+    own = ArrayOperator.of(gaussians, pose, plane, Array(ELEMENTS, CARRIER_HZ))
+    return {
+        "array": relative(own.spectrum(signal)[0], array),
+        "pixels": relative(
+            PixelOperator.of(gaussians, pose, plane).magnitude(signal, DARK)[0], direct.pixels(tx_pos_m)
+        ),
+        "rssi_db": float(np.abs(SectorOperator.of(gaussians, pose, plane).power_db(signal) - power).max()),
+    }
+
+
+def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """Where the time of a network-driven prediction goes, ms: network, splatting, both, and by operator."""
+    found = {}
+    tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
+    cases: dict[str, tuple[Any, int, float]] = {
+        "WRF-GS, 270 Gaussians": (WrfGs(), SMALL, 7.0),
+        "WRF-GS, 10,000 Gaussians": (WrfGs(), GAUSSIANS, SIZE_DEG),
+        "WRF-GS+, 270 Gaussians": (WrfGsPlus(), SMALL, 7.0),
+        "factorised, 270 Gaussians": (Factorised(), SMALL, 7.0),
+    }
+    for name, (field, count, size) in cases.items():
+        params = random_field(field, count, size)
+        direct = Direct(field, params)
+        parts = direct.parts(tx[0])
+        calls: dict[str, Callable[[], Any]] = {
+            "network": lambda d=direct: d.parts(tx[0]),  # type: ignore[misc]
+            "splatting": lambda d=direct, p=parts: d.splat(p),  # type: ignore[misc]
+            "both": lambda d=direct: d.pixels(tx[0]),  # type: ignore[misc]
+        }
+        if field.still:
+            predictor = Predictor(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
+            calls["operator"] = lambda p=predictor: p(tx[:1])  # type: ignore[misc]
+            calls[f"operator, {BATCH}"] = lambda p=predictor: p(tx)  # type: ignore[misc]
+        times = interleaved(calls, REPEATS, most_s=30)
+        found[name] = {key: bootstrap(t / (BATCH if key.endswith(str(BATCH)) else 1)) for key, t in times.items()}
+    return found
+
+
+def main() -> dict[str, Any]:
+    """All of it, with rows for the table."""
+    rng = np.random.default_rng(0)
+    field = Factorised()
+    params = random_field(field)
+    direct = Direct(field, params)
+    tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
+    gaussians = direct.gaussians(tx[0])
+    pose, plane, array = direct.pose, direct.plane, Array(ELEMENTS, CARRIER_HZ)
+    model = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)
+    build: dict[str, Callable[[], Any]] = {
+        "array": lambda: ArrayOperator.of(gaussians, pose, plane, array),
+        "pixels": lambda: PixelOperator.of(gaussians, pose, plane),
+        "sectors": lambda: SectorOperator.of(gaussians, pose, plane, *SECTORS),
+    }
+    built = {name: bootstrap(t) for name, t in interleaved(build, 5).items()}
+    memory = {name: memory_mb(call) for name, call in build.items()}
+    by_array, pixels, sectors = build["array"](), build["pixels"](), build["sectors"]()
+    signals = FactorisedSignals(field, params)
+    assert signals.factors is not None
+    factors = signals.factors
+    small, images = by_array.composed(factors), pixels.composed(factors)
+    power = sectors.composed(factors)
+    given = (signals.coefficients(tx) @ factors.T).astype(np.complex64)
+
+    def each(one: Callable[[NDArray[Any]], Any], rows: NDArray[Any]) -> tuple[Callable[[], Any], Callable[[], Any]]:
+        return lambda: one(rows[:1]), lambda: one(rows)
+
+    pairs = {
+        "array": each(lambda at: small.spectrum(signals.coefficients(at)), tx),
+        "array, scaled": each(lambda at: small.spectrum(signals.coefficients(at), scale=True), tx),
+        "array, signals of 10,000 given": each(by_array.spectrum, given),
+        "pixels": each(lambda at: images.magnitude(signals.coefficients(at), DARK), tx),
+        "pixels, signals of 10,000 given": each(lambda s: pixels.magnitude(s, DARK), given),
+        "RSSI of 24 sectors": each(lambda at: power.power_db(signals.coefficients(at)), tx),
+    }
+    calls: dict[str, Callable[[], Any]] = {
+        "direct, array": lambda: model(None, direct.splat(direct.parts(tx[0]))).numpy(),
+        "direct, pixels": lambda: direct.pixels(tx[0]),
+    }
+    for name, (one, many) in pairs.items():
+        calls |= {f"{name}, 1": one, f"{name}, {BATCH}": many}
+    raw = interleaved(calls, REPEATS, most_s=120)
+    per = {name: BATCH if name.endswith(f", {BATCH}") else 1 for name in calls}
+    times = {name: bootstrap(t / per[name]) for name, t in raw.items()}
+    processor = {name: processor_ms(call) / per[name] for name, call in calls.items()}
+    gain = {
+        kind: ratio(raw[f"direct, {kind}"], raw[f"{kind}, {count}"] / per[f"{kind}, {count}"])
+        for kind, count in (("array", 1), ("pixels", 1))
+    }
+    gain |= {f"{kind}, {BATCH}": ratio(raw[f"direct, {kind}"], raw[f"{kind}, {BATCH}"] / BATCH) for kind in gain}
+    product = WrfGs()
+    apart = {
+        "alpha blending": differences(field, params, tx[0]),
+        "product blending": differences(product, random_field(product), tx[0]),
+    }
+    networks = of_networks(rng)
+    size = {
+        "array": by_array.matrix.nbytes / 1e6,
+        "pixels": pixels.nbytes / 1e6,
+        "pixels, composed": images.table.nbytes / 1e6,
+        "sectors": sectors.matrix.nbytes / 1e6,
+    }
+    rows = _rows(times, processor, gain, built, memory, size, apart, networks)
+    return {"rows": rows, "times_ms": {name: str(t) for name, t in times.items()}, "weights": int(pixels.weights.nnz)}
+
+
+def _rows(
+    times: Mapping[str, Interval],
+    processor: Mapping[str, float],
+    gain: Mapping[str, Interval],
+    built: Mapping[str, Interval],
+    memory: Mapping[str, float],
+    size: Mapping[str, float],
+    apart: Mapping[str, Mapping[str, float]],
+    networks: Mapping[str, Mapping[str, Interval]],
+) -> list[dict[str, str]]:
+    rows = []
+
+    def row(what: str, value: str, asked: str = "") -> None:
+        rows.append({"what": what, "value": value, "asked": asked})
+
+    asked = {"array, 1": "1 ms", f"array, {BATCH}": "0.15 ms, aim 0.05"}
+    for name, found in times.items():
+        kind, _, count = name.rpartition(", ")
+        what = {"1": f"{kind}, one transmitter", str(BATCH): f"{kind}, each of {BATCH}"}.get(count, name)
+        row(what, f"{found} ms; processors {processor[name]:.3g} ms", asked.get(name, ""))
+    for name, interval in gain.items():
+        row(f"times faster than direct: {name}", str(interval))
+    for name, interval in built.items():
+        row(f"building: {name}", f"{interval} ms, {memory[name]:.0f} MB beside what it holds")
+    for name, megabytes in size.items():
+        row(f"size: {name}", f"{megabytes:.2g} MB")
+    for name, one in apart.items():
+        text = f"array {one['array']:.1e}, pixels {one['pixels']:.1e}, RSSI {one['rssi_db']:.1e} dB"
+        row(f"relative L2 difference from direct, {name}", text, "1e-4")
+    for name, split in networks.items():
+        row(f"ms of one spectrum, {name}", "; ".join(f"{key} {interval}" for key, interval in split.items()))
+    return rows

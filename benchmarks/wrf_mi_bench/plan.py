@@ -1,0 +1,111 @@
+"""Walls found in a robot's map and LiDAR returns of a furnished flat, against the walls that were measured by hand."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from wrf_mi.core import InputError
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.datasets.registry import locate
+from wrf_mi.scene.plan import read_walls
+from wrf_mi.scene.plan_align import grid_from_scans
+from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_plan
+from wrf_mi.scene.plan_walls import find_walls
+from wrf_mi.scene.register import register_walls
+from wrf_mi.scene.register_search import sample_walls
+
+NEAR_M = 0.2
+"""Walls agree within the blur of the robot's poses."""
+GRID_RESOLUTION_M = 0.04
+"""Of the SLAM map, whose file does not tell: ``size = 20, res = 0.04`` in the notebook of its author
+(github.com/marckolak/graphSLAM, examples/Mapping.ipynb), so 500 cells; registration to the layout finds the same."""
+GRID_ROW_0: Row0 = "top"
+"""Of the same map, which does not tell either: registration to the layout refuses its mirror image."""
+ASKED = "0.85 and 0.85"
+
+
+def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_M) -> tuple[float, float]:
+    """How well made walls agree with true ones.
+
+    Args:
+        made_m: end points [n, 2, 2], metres.
+        true_m: end points [m, 2, 2], metres.
+        near_m: distance within which walls agree.
+
+    Returns:
+        Share of the true walls' length that lies near a made wall, and the reverse.
+    """
+    made, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
+    found = shapely.intersection(true, shapely.buffer(made, near_m)).length / true.length
+    right = shapely.intersection(made, shapely.buffer(true, near_m)).length / made.length
+    return float(found), float(right)
+
+
+def flat_plan(folder: str | Path | None = None) -> dict[str, Any]:
+    """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv`` and compared.
+
+    Beside it stands what no method can exceed that puts walls only where something was seen: the share of the layout
+    within reach of any occupied cell.
+
+    Args:
+        folder: of flat-ble; by default the known data set's.
+
+    Returns:
+        ``rows`` for the table, and per source: shares, what can be seen, walls, scale of the registration, seconds.
+
+    Raises:
+        InputError: the data are not there, or the registration is refused.
+    """
+    home = Path(folder) if folder is not None else locate("flat-ble")
+    if home is None:
+        raise InputError("flat-ble: not on this machine; fetch it or name its folder in WRF_MI_DATA")
+    true = read_walls(home / "layout.csv")
+    lidar = home / "lidar"
+    grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0), read_plan(lidar / "points.npz")
+    if not isinstance(grid, PlanGrid) or not isinstance(returns, PlanPoints) or returns.time_s is None:
+        raise InputError(f"{lidar}: expected log_odds in gridmap.npz, xy_m and time_s in points.npz")
+    begin = time.perf_counter()
+    scans = grid_from_scans(returns.xy_m, returns.time_s)
+    aligning_s = time.perf_counter() - begin
+    figures: dict[str, Any] = {
+        "gridmap": _measured(grid, true),
+        "points": _measured(scans, true) | {"aligning_seconds": aligning_s},
+        # In the layout's frame by the robot's poses; too blurred for a fit to be accepted.
+        "points without alignment": _measured(grid_from_points(returns.xy_m), true, register=False),
+    }
+    rows = [
+        {
+            "what": f"{name}: layout within {NEAR_M} m of a wall made, and the reverse",
+            "value": f"{f['layout_found']:.2f} and {f['walls_right']:.2f} (seen at all: {f['layout_seen']:.2f})",
+            "asked": ASKED if name == "gridmap" else "-",
+        }
+        for name, f in figures.items()
+    ]
+    return {"rows": rows, **figures}
+
+
+def _measured(grid: PlanGrid, true: FloatArray, register: bool = True) -> dict[str, Any]:
+    begin = time.perf_counter()
+    walls, cells = find_walls(grid), grid.centres_m(grid.occupied)
+    seconds = time.perf_counter() - begin
+    scale = None
+    if register:
+        registration = register_walls(sample_walls(walls), true)
+        walls, cells, scale = registration.apply(walls), registration.apply(cells), registration.scale
+    found, right = wall_agreement(walls, true)
+    line = shapely.unary_union(shapely.linestrings(true))
+    seen = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length
+    return {
+        "layout_found": found,
+        "walls_right": right,
+        "layout_seen": float(seen),
+        "walls": len(walls),
+        "length_m": float(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1).sum()),
+        "scale": scale,
+        "seconds": seconds,
+    }

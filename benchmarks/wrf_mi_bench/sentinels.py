@@ -1,0 +1,272 @@
+"""Sentinels: stored figures of every task and family of models, measured again and compared with what is stored.
+
+They show within three quarters of an hour on two cores whether a change of the code made a figure worse; the tables
+take many hours. Each figure has an interval in which a second measurement counts as equal:
+
+| figures | interval |
+| --- | --- |
+| medians of the tables (all training rows, seed 0) | 95 % interval of the stored median over its test rows |
+| paths that MATLAB's image method has, found again | 95 % Wilson interval of the stored share over these paths |
+| worst errors of `stress` and of the Mitsuba integrator, fewer of the same cases | up to the bound of that benchmark |
+
+Results are kept by the content of this package's files (`wrf_mi.runs.fit_key.source_files`): a call that was stopped
+goes on, and changed code is measured anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest, quantile_test
+
+from wrf_mi.core import InputError
+from wrf_mi.core.files import one_line, write_atomically
+from wrf_mi.runs.fit_key import dataset_files, fit_key, source_files
+from wrf_mi.tasks import TASKS
+
+from .bench import CONFERENCE, FLAT, OFFICE, RFID, BenchFailed
+from .stress_summary import stages
+from .table_plan import Row, available, plan
+from .tables import FOLDER, measure
+
+STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
+TABLE_ROWS = (
+    *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "hybrid", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
+    *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
+    *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "hybrid", "wrf-gs", "nerf2")),
+    *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "r2f2", "optml", "wrf-gs")),
+    *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "hybrid", "wrf-gs+")),
+    *(f"csi-{OFFICE}-official-{name}" for name in ("hybrid", "wrf-gs")),
+)
+"""Rows of the tables that take at most five minutes each, at all training rows and seed 0."""
+CONFIDENCE = 0.95
+FIELDS = 5
+"""Random fields of the integrator's comparison with splatting, of the 20 that are stored."""
+EQUAL, BETTER, WORSE, FAILED, ABSENT = "equal", "better", "worse", "failed", "not on this machine"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A stored figure.
+
+    Attributes:
+        name: what it is, with its unit.
+        stored: its value.
+        low: lower end of the interval in which a second measurement counts as equal.
+        high: upper end.
+        higher_is_better: whether it is an accuracy or an error.
+    """
+
+    name: str
+    stored: float
+    low: float
+    high: float
+    higher_is_better: bool
+
+    def verdict(self, measured: float) -> str:
+        """``equal`` inside the interval, else ``better`` or ``worse``; what is not a number is worse."""
+        if self.low <= measured <= self.high:
+            return EQUAL
+        return BETTER if (measured > self.high if self.higher_is_better else measured < self.low) else WORSE
+
+    def row(self, measured: float | None, verdict: str, why: str = "") -> dict[str, Any]:
+        """As a row of the benchmark's table.
+
+        Args:
+            measured: None where it was not.
+            verdict: of it.
+            why: it was not measured.
+        """
+        value = verdict if measured is None else f"{measured:.4g}, {verdict}"
+        return {
+            "what": self.name,
+            "value": f"{value}: {why}" if why else value,
+            "asked": f"{self.stored:.4g} ({self.low:.4g} to {self.high:.4g}), or better",
+            **{"stored": self.stored, "low": self.low, "high": self.high, "measured": measured, "verdict": verdict},
+        }
+
+
+@dataclass(frozen=True)
+class Group:
+    """Figures that are measured together.
+
+    Attributes:
+        name: for files and progress.
+        figures: with what is stored of them.
+        measure: takes the folder for runs and gives the figures' values in their order.
+        present: whether the data are on this machine or are made here.
+    """
+
+    name: str
+    figures: tuple[Figure, ...]
+    measure: Callable[[Path], Sequence[float]]
+    present: bool = True
+
+
+def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float]:
+    """Distribution-free 95 % interval of a median over test rows.
+
+    Args:
+        quantiles: of the rows' scores, equally spaced shares from 0 to 1.
+        rows: number of test rows.
+
+    Source: order statistics and the binomial distribution, Conover, "Practical Nonparametric Statistics" (1999),
+    section 3.2; `scipy.stats.quantile_test`.
+    """
+    scores = np.interp(np.linspace(0, 1, rows), np.linspace(0, 1, len(quantiles)), quantiles)
+    found = quantile_test(scores, p=0.5).confidence_interval(CONFIDENCE)
+    return float(found.low), float(found.high)
+
+
+def _stored(name: str) -> dict[str, Any]:
+    path = STORED / f"{name}.json"
+    if not path.exists():
+        raise InputError(f"{path}: stored figures are not on this machine; call it in a checkout that has them")
+    result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return result
+
+
+def _of_table(row: Row) -> Group:
+    stored, task = _stored(f"{FOLDER}/{row.name}"), TASKS[row.part.task]
+    if stored["command"] != row.command:
+        raise InputError(f"{row.name}: the tables plan it otherwise than it is stored; run wrf-mi bench tables first")
+    low, high = median_interval(stored["quantiles"], stored["n_test"])
+    name = f"{row.part.dataset}, {row.part.split}: {row.method}, median {task.label}"
+    figure = Figure(name, stored["score"]["median"], low, high, task.higher_is_better)
+
+    def again(runs: Path) -> list[float]:
+        found = measure(runs, row)
+        if found["data"] != stored.get("data", found["data"]):
+            raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it anew")
+        return [found["score"]["median"]]
+
+    return Group(row.name, (figure,), again, available(row.part))
+
+
+def _stress() -> Group:
+    def again(_: Path) -> list[float]:
+        from .stress import QUICK
+
+        return [one.worst for one in stages([row for part in QUICK for row in part()])]
+
+    known = stages(_stored("stress")["figures"]["rows"])
+    figures = [Figure(f"stress, {one.name}: worst error", one.worst, 0.0, one.bound, False) for one in known]
+    return Group("stress", tuple(figures), again)
+
+
+def _integrator() -> Group:
+    from .traced import LARGEST_ERROR, LOWEST_SSIM, against_splatted, worst
+
+    def again(_: Path) -> list[float]:
+        found = worst(against_splatted(FIELDS))
+        return [found["lowest_ssim"], found["largest_complex_error"]]
+
+    stored = _stored("traced-and-splatted")["figures"]["small"]
+    words = "Mitsuba integrator against splatting"
+    ssim = Figure(f"{words}, lowest SSIM", stored["lowest_ssim"], LOWEST_SSIM, 1.0, True)
+    error = Figure(f"{words}, largest L2 error", stored["largest_complex_error"], 0.0, LARGEST_ERROR, False)
+    return Group("traced-and-splatted", (ssim, error), again)
+
+
+def _image_method(room: str, stored: Mapping[str, Any]) -> Group:
+    def again(_: Path) -> list[float]:
+        from .trace import image_method_agreement, room_file
+
+        return [image_method_agreement(room_file(room))["share_found"]]
+
+    interval = binomtest(stored["paths_found"], stored["paths_matlab"]).proportion_ci(CONFIDENCE, "wilson")
+    words = f"image method, {room}: share of MATLAB's paths found"
+    figure = Figure(words, stored["share_found"], float(interval.low), float(interval.high), True)
+    return Group(f"image-method-{room}", (figure,), again, bool(dataset_files(f"newrf-{room}")))
+
+
+def groups() -> list[Group]:
+    """All sentinels, with what is stored of them.
+
+    Raises:
+        InputError: a stored figure that is missing, or that the tables plan otherwise by now.
+    """
+    planned = {row.name: row for row in plan()}
+    if gone := [name for name in TABLE_ROWS if f"{name}-100-seed0" not in planned]:
+        raise InputError(f"sentinel {gone[0]}: no row of the tables any more; choose another")
+    rooms = _stored("image-method")["figures"]["rooms"]
+    return [
+        *(_image_method(room, stored) for room, stored in rooms.items()),
+        _integrator(),
+        _stress(),
+        *(_of_table(planned[f"{name}-100-seed0"]) for name in TABLE_ROWS),
+    ]
+
+
+def main() -> dict[str, Any]:
+    """Measure all sentinels whose data are on this machine, but for those that this code was measured with before.
+
+    Returns:
+        ``rows``: of each figure ``what``, ``stored``, ``low`` and ``high`` of its interval, ``measured`` (None where it
+        was not), ``verdict``, and ``date`` and ``seconds`` of the measurement, the seconds those of all figures that
+        are measured together; ``failed``: a line, where a figure got worse or could not be measured.
+
+    Raises:
+        InputError: stored figures are not on this machine.
+    """
+    known = groups()
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    begun = time.perf_counter()
+    for count, group in enumerate(known, 1):
+        minutes = (time.perf_counter() - begun) / 60
+        _say(f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
+        found = _rows(group, place)
+        rows += found
+        for row in found:
+            _say(f"{row['what']}: {row['value']}; stored {row['asked']}")
+    return {"rows": rows, **_failure(rows)}
+
+
+def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
+    """Rows of a group, measured unless they were before."""
+    if not group.present:
+        return [figure.row(None, ABSENT) for figure in group.figures]
+    kept = place / f"{group.name}.json"
+    try:
+        if not kept.exists():
+            begun = time.perf_counter()
+            values = [float(value) for value in group.measure(place)]
+            measured = {"values": values, "date": time.strftime("%Y-%m-%d"), "seconds": time.perf_counter() - begun}
+            write_atomically(kept, json.dumps(measured))
+        content = json.loads(kept.read_text())
+        more = {"date": content["date"], "seconds": content["seconds"]}
+        pairs = zip(group.figures, content["values"], strict=True)
+        return [figure.row(value, figure.verdict(value)) | more for figure, value in pairs]
+    except (InputError, BenchFailed, OSError, RuntimeError, ValueError, KeyError) as error:
+        return [figure.row(None, FAILED, one_line(error)) for figure in group.figures]
+
+
+def _failure(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    lost = [row for row in rows if row["verdict"] in (WORSE, FAILED)]
+    if not lost:
+        return {}
+    first = f"{lost[0]['what']}: {lost[0]['value']}, stored {lost[0]['asked']}"
+    return {"failed": f"{len(lost)} of {len(rows)} figures got worse or were not measured, first {first}"}
+
+
+def _say(text: str) -> None:
+    print(f"sentinels: {text}", file=sys.stderr, flush=True)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table of stored and measured figures."""
+    lines = ["| figure | stored | equal within | measured | verdict |", "| --- | --- | --- | --- | --- |"]
+    for row in rows:
+        measured = "" if row["measured"] is None else f"{row['measured']:.4g}"
+        interval = f"{row['low']:.4g} to {row['high']:.4g}"
+        lines.append(f"| {row['what']} | {row['stored']:.4g} | {interval} | {measured} | {row['verdict']} |")
+    return "\n".join(lines)

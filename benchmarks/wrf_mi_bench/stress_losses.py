@@ -1,0 +1,142 @@
+"""Losses under stress: in float32 against float64, forwards and backwards, and against what others compute."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from wrf_mi.backend.device import on_device, to_float
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.models.physics.spectrum_loss import Grid
+from wrf_mi.tasks.losses import absolute_error
+from wrf_mi.tasks.spectrum_loss import SSIM_WEIGHT, spectrum_loss
+
+from .stress_rows import EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst
+
+SIZE = (30, 60)
+DOUBLE: Any = dr.float64_array_t(mi.Float)
+UNFELT_SLOPE = UNFELT / np.sqrt(SIZE[0] * SIZE[1])
+"""Derivatives below a thousandth of the mean absolute error's, in norm, count as that large."""
+Pair = tuple[FloatArray, FloatArray]
+Rng = np.random.Generator
+LARGEST = 1e15
+"""Of a pixel; squares of its squares must not overflow float32."""
+
+
+def _around(rng: Rng, contrast: float, shift: float = 0.0) -> Pair:
+    level = rng.uniform(0.1, 0.9)
+    truth = level + contrast * rng.normal(size=SIZE)
+    return truth + shift + contrast * rng.normal(size=SIZE), truth
+
+
+KINDS: Mapping[str, Callable[[Rng], Pair]] = {
+    "random": lambda r: (r.uniform(size=SIZE), r.uniform(size=SIZE)),
+    "flat": lambda r: (np.full(SIZE, r.uniform()), np.full(SIZE, r.uniform())),
+    "flat and the same": lambda r: (np.full(SIZE, 0.7), np.full(SIZE, 0.7)),
+    "nearly flat, 1e-4": lambda r: _around(r, 1e-4, 0.1),
+    "nearly flat, 1e-6": lambda r: _around(r, 1e-6, 0.1),
+    "nearly the same, 1e-4": lambda r: _around(r, 1e-4),
+    "nearly the same, 1e-6": lambda r: _around(r, 1e-6),
+    "zero": lambda r: (np.zeros(SIZE), np.zeros(SIZE)),
+    "zero against random": lambda r: (np.zeros(SIZE), r.uniform(size=SIZE)),
+    "of 0 to 1000": lambda r: (1e3 * r.uniform(size=SIZE), 1e3 * r.uniform(size=SIZE)),
+    "of 0 to 1e15 against 0 to 1": lambda r: (LARGEST * r.uniform(size=SIZE), r.uniform(size=SIZE)),
+}
+"""Prediction and truth."""
+
+
+def losses(count: int) -> list[Row]:
+    """All losses, ``count`` cases of each kind of images."""
+    cases = f"{count * len(KINDS)} cases"
+    likeness, loss, received = Worst(), Worst(), Worst()
+    slope, alone = GradientWorst(), GradientWorst()
+    for name, make in KINDS.items():
+        for seed in range(count):
+            one, other = (v.astype(np.float32).astype(float) for v in make(np.random.default_rng(seed)))
+            structure = structural_similarity(other, one, data_range=1)
+            truth = (1 - SSIM_WEIGHT) * np.abs(one - other).mean() + SSIM_WEIGHT * (1 - structure)
+            values = {"prediction": np.ones(one.size)}
+            found = {kind: _both(kind, one, other, SSIM_WEIGHT) for kind in (mi.Float, DOUBLE)}
+            likeness.add(abs(found[mi.Float][1] - structure), name)
+            loss.add(abs(found[mi.Float][0] - truth) / max(truth, 1.0), name)
+            slope.add(found[mi.Float][2], found[DOUBLE][2], values, name, UNFELT_SLOPE)
+            structural = {kind: _both(kind, one, other, 1.0)[2] for kind in (mi.Float, DOUBLE)}
+            alone.add(structural[mi.Float], structural[DOUBLE], values, name, UNFELT_SLOPE)
+            received.add(_absolute(one, other, np.random.default_rng(seed)), name)
+    return [
+        likeness.row(f"loss: similarity against scikit-image's, {cases}", IMAGE),
+        loss.row(f"loss: of spectra against NumPy, {cases}", IMAGE),
+        slope.row(f"loss: derivatives of that of spectra, {cases}"),
+        alone.row(f"loss: derivatives of the similarity alone, {cases}"),
+        received.row(f"loss: absolute error of what was received, and derivatives, {cases}", GRADIENT),
+        _differences(count),
+        _searches(max(count, 9)),
+    ]
+
+
+def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[float, float, dict[str, FloatArray]]:
+    """Loss, similarity and derivative of the loss."""
+    prediction = on_device(one, kind)
+    dr.enable_grad(prediction)
+    value, structure = spectrum_loss(prediction, on_device(other, kind), 1, *SIZE, eta=eta)
+    dr.backward(value)
+    slope = {"prediction": dr.grad(prediction).numpy().astype(float)}
+    return float(dr.detach(value)[0]), float(dr.detach(structure)[0]), slope
+
+
+def _absolute(one: FloatArray, other: FloatArray, rng: Rng) -> float:
+    """Error of the absolute error and of its derivatives, with a third of the rows not received."""
+    known = rng.random(one.size) > 1 / 3
+    prediction = to_float(one)
+    dr.enable_grad(prediction)
+    value = absolute_error(prediction, to_float(np.where(known, other.ravel(), np.nan)))
+    dr.backward(value)
+    truth = np.abs(one - other).ravel()[known].mean()
+    slope = np.where(known, np.sign(one - other).ravel(), 0) / known.sum()
+    off = np.linalg.norm(dr.grad(prediction).numpy() - slope) / (np.linalg.norm(slope) or 1.0)
+    return max(abs(float(dr.detach(value)[0]) - truth) / max(truth, 1.0), float(off))
+
+
+def _differences(count: int) -> Row:
+    """Derivatives of the similarity in float64 against central differences of scikit-image's."""
+    errors, step = [], 1e-5
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        one, other = rng.uniform(size=SIZE), rng.uniform(size=SIZE)
+        way = rng.normal(size=SIZE)
+        slope = float(-_both(DOUBLE, one, other, 1.0)[2]["prediction"] @ way.ravel())
+        ends = [structural_similarity(other, one + s * step * way, data_range=1) for s in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        errors.append(abs(slope - difference) / abs(difference))
+    worst = Worst()
+    worst.add(np.median(errors))
+    return worst.row(f"loss: derivatives of the similarity against scikit-image's differences, {count} cases", EXACT)
+
+
+def _searches(count: int) -> Row:
+    """The loss of the hybrid's searches, NumPy in float64, and its derivative, against central differences."""
+    of = Grid.of(30, 60, planar_array(4, 4, 0.16), 920e6)
+    worst, cases = Worst(), 0
+    for size in (1e-12, 1.0, 1e12):
+        errors = []
+        for seed in range(count):
+            rng = np.random.default_rng(seed)
+            shapes = of.shapes(rng.uniform(size=(3, 30, 60)).astype(np.float32) * np.array([1, 1, 0])[:, None, None])
+            parts = size * rng.normal(size=(4, 3, 16))
+            h, way = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
+            slope = 2 * (of.loss(h, shapes)[1].conj() * way).sum(axis=1).real
+            ends = [of.loss(h + s * 1e-6 * way, shapes)[0] for s in (1, -1)]
+            difference = (ends[0] - ends[1]) / 2e-6
+            # The last of the three spectra is dark: nothing is like it, whatever is predicted.
+            errors.append(np.abs(slope - difference) / np.maximum(np.abs(difference), 1.0))
+            cases += 3
+        worst.add(np.median(np.array(errors).max(axis=1)), f"signals of {size:g}")
+    dark, zero = of.loss(np.zeros((1, 16), complex), of.shapes(np.ones((1, 30, 60), np.float32)))
+    worst.add(0.0 if np.isfinite(dark).all() and np.isfinite(zero).all() else np.nan, "no signal")
+    return worst.row(f"loss: derivatives of that of the hybrid's searches against differences, {cases} cases", EXACT)

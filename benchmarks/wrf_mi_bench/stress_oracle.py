@@ -1,0 +1,207 @@
+"""The traced side of the joint graph in NumPy, complex128: what the stress rows compare
+`wrf_mi.tracing.evaluate_paths` with.
+
+It shares the chains of planes and the stated constants with the graph, no device code: planes move by `Walls.moved`,
+antennas are `wrf_mi.core.Antenna`. The receiver is mirrored backwards as the transmitter is forwards, so each leg's
+direction is that from an image of the one to an image of the other; slabs are sums of multiple reflections between two
+Fresnel interfaces, patterns are SciPy's spherical harmonics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import epsilon_0, speed_of_light
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
+
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.tracing.material_parameters import SURFACE, name_of
+from wrf_mi.tracing.traced_field import TX_PATTERN, TracedField
+from wrf_mi.tracing.walls import Walls, walls_of
+
+ComplexArray = NDArray[np.complex128]
+Values = Mapping[str, FloatArray]
+ACROSS = 1e-6
+"""Sine of the angle to a wall's normal below which any direction across the wave will do."""
+
+
+@dataclass(frozen=True)
+class OraclePaths:
+    """p paths of a batch of transmitters, the transmitter's number slowest.
+
+    Attributes:
+        gain: without the phase exp(-j k length), 0 for a place holder, [p].
+        length_m: [p].
+        arrival: unit vectors towards where waves come from, receiver's frame, [p, 3].
+        each: paths of each transmitter.
+    """
+
+    gain: ComplexArray
+    length_m: FloatArray
+    arrival: FloatArray
+    each: int
+
+    def at(self, offset_m: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
+        """Sums [batch, m] of the paths at ports [m, 3], each at its own frequency [m]; see `combine.path_sum`."""
+        away = (self.arrival * self.length_m[:, None])[:, None] - offset_m
+        distance = np.linalg.norm(away, axis=-1)
+        wave = np.exp(-2j * np.pi / speed_of_light * frequency_hz * distance)
+        terms = self.gain[:, None] * self.length_m[:, None] / distance * wave
+        return terms.reshape(-1, self.each, len(offset_m)).sum(axis=1)
+
+
+class TracedOracle:
+    """The paths of a traced side as a function of its parameters.
+
+    Args:
+        traced: whose chains are followed.
+    """
+
+    def __init__(self, traced: TracedField) -> None:
+        self._traced, self._walls = traced, walls_of(traced.surfaces)
+        chains = traced.chains
+        self._source = np.stack([c.numpy() for c in chains.source_m], axis=-1)
+        self._heading = np.stack([c.numpy() for c in chains.heading], axis=-1)
+        self._exists = chains.exists.numpy()
+        self._levels = [
+            (level.plane.numpy(), level.material.numpy(), level.reflects.numpy(), level.transmits.numpy())
+            for level in chains.levels
+        ]
+
+    def __call__(self, values: Values) -> OraclePaths:
+        """Paths with parameters ``values``; what is missing stays as stated."""
+        traced, walls = self._traced, self._moved(values)
+        receiver = traced.receiver
+        turn = values.get(f"receiver.{receiver.name}.turn", np.zeros(3))
+        to_world = receiver.to_world @ Rotation.from_quat([*(0.5 * turn), 1.0]).as_matrix()
+        position = receiver.position_m + values.get(f"receiver.{receiver.name}.position", np.zeros(3))
+
+        images, mirrored = [self._source], [np.broadcast_to(position, self._source.shape)]
+        for plane, _, reflects, _ in self._levels:
+            images.append(_mirror(walls, plane, reflects, images[-1]))
+        for plane, _, reflects, _ in reversed(self._levels):
+            mirrored.insert(0, _mirror(walls, plane, reflects, mirrored[0]))
+        length = np.linalg.norm(mirrored[-1] - images[-1], axis=-1)
+        ways = [(end - start) / length[:, None] for start, end in zip(images, mirrored, strict=True)]
+
+        cosine, sine = self._heading.T
+        none, one = np.zeros_like(cosine), np.ones_like(cosine)
+        turned = np.array([[cosine, sine, none], [-sine, cosine, none], [none, none, one]])
+        departure = np.einsum("ijp,pj->pi", turned, ways[0])
+        sent = np.einsum("ijp,pi->pj", turned, traced.options.tx_antenna.field(departure)).astype(complex)
+        for level, before, after in zip(self._levels, ways, ways[1:], strict=False):
+            sent = self._interact(walls, level, before, after, sent, values)
+        own = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
+        taken = receiver.antenna.field(-ways[-1] @ own) @ own.T
+        loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
+        gain = (taken * sent).sum(axis=-1) * loss
+        amplitude, phase = values.get(traced.gain_name, np.array([np.log(traced.options.gain), 0.0]))
+        gain = gain * np.exp(amplitude + 1j * phase)
+        arrival = -ways[-1] @ to_world
+        for name, direction in ((traced.pattern_name, arrival), (TX_PATTERN, departure)):
+            if name in values:
+                gain = gain * pattern(values[name], direction)
+        return OraclePaths(gain, length, arrival, len(length) // len(traced))
+
+    def _moved(self, values: Values) -> Walls:
+        count = len(self._walls)
+        shift, tilt = values.get("plane.shift", np.zeros(count)), values.get("plane.tilt", np.zeros((count, 2)))
+        return self._walls.moved(np.column_stack([shift, tilt]))
+
+    def _constant(self, quantity: str, stated: FloatArray, least: float, values: Values) -> FloatArray:
+        slabs = self._traced.slabs
+        if slabs.of == "surface":
+            whole = values.get(name_of(SURFACE, quantity))
+            return stated if whole is None else least + np.exp(whole)
+        entries = [values.get(name_of(name, quantity)) for name in slabs.names]
+        return np.array(
+            [s if own is None else least + np.exp(own[0]) for s, own in zip(stated, entries, strict=True)], float
+        )
+
+    def _interact(
+        self, walls: Walls, level: Any, before: FloatArray, after: FloatArray, sent: ComplexArray, values: Values
+    ) -> ComplexArray:
+        plane, material, reflects, transmits = level
+        slabs, met = self._traced.slabs, reflects | transmits
+        normal = walls.normal[plane]
+        permittivity = self._constant("permittivity", slabs.permittivity, 1.0, values)[material]
+        conductivity = self._constant("conductivity", slabs.conductivity, 0.0, values)[material]
+        hz = self._traced.frequency_hz
+        eta = permittivity - 1j * conductivity / (2 * np.pi * hz * epsilon_0)
+        cosine = np.where(met, np.abs((before * normal).sum(axis=-1)), 1)
+        through = slab(cosine, eta, slabs.thickness_m[material], hz)
+        share = slabs.reflected[material]
+        te, tm = (np.where(reflects, r * share, t) for r, t in through)
+        across = np.cross(before, normal)
+        size = np.linalg.norm(across, axis=-1, keepdims=True)
+        other = np.cross(before, np.eye(3)[np.abs(before).argmin(axis=-1)])
+        other /= np.linalg.norm(other, axis=-1, keepdims=True)
+        across = np.where(size > ACROSS, across / np.where(size > ACROSS, size, 1), other)
+        along = np.cross(across, before), np.cross(across, after)
+        s, p = ((sent * one).sum(axis=-1, keepdims=True) for one in (across, along[0]))
+        return np.where(met[:, None], te[:, None] * s * across + tm[:, None] * p * along[1], sent)
+
+
+def _mirror(walls: Walls, plane: NDArray[Any], reflects: NDArray[np.bool_], points: FloatArray) -> FloatArray:
+    """Points [p, 3] mirrored in planes [p] where they reflect."""
+    height = (points * walls.normal[plane]).sum(axis=-1) - walls.offset_m[plane]
+    return points - 2 * np.where(reflects, height, 0)[:, None] * walls.normal[plane]
+
+
+def slab(
+    cosine: FloatArray, eta: ComplexArray, thickness_m: FloatArray, frequency_hz: float
+) -> tuple[tuple[ComplexArray, ComplexArray], tuple[ComplexArray, ComplexArray]]:
+    """Reflected and transmitted share [p] of TE, then of TM waves: an Airy sum over both interfaces of a slab in air.
+
+    Source: Born and Wolf, "Principles of Optics" (1999), section 1.6.4; the sign of TM is that of ITU-R P.2040.
+    """
+    inside = np.sqrt(eta - 1 + cosine**2)
+    phase = np.exp(-2j * np.pi * frequency_hz / speed_of_light * thickness_m * inside)
+    result = []
+    for first, second in ((cosine, inside), (cosine, inside / eta)):
+        into, out = 2 * first / (first + second), 2 * second / (first + second)
+        back = (first - second) / (first + second)
+        series = 1 / (1 - (back * phase) ** 2)
+        result.append((back - into * out * back * phase**2 * series, into * out * phase * series))
+    return result[0], result[1]
+
+
+def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
+    """Factor [p] of an antenna pattern in directions [p, 3], see `wrf_mi.tracing.pattern_parameters`."""
+    polar, azimuth = np.arccos(np.clip(direction[:, 2], -1, 1)), np.arctan2(direction[:, 1], direction[:, 0])
+    series, weights = np.zeros(len(direction), complex), coefficients[0] + 1j * coefficients[1]
+    index = 0
+    for degree in range(1, int(np.sqrt(len(weights) + 1))):
+        for order in range(-degree, degree + 1):
+            harmonic = sph_harm_y(degree, abs(order), polar, azimuth)
+            part = harmonic.real if order >= 0 else harmonic.imag
+            series = series + weights[index] * part * (np.sqrt(2) if order else 1)
+            index += 1
+    return np.exp(series)
+
+
+def slopes(
+    of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float], weight: FloatArray
+) -> dict[str, FloatArray]:
+    """Derivatives of ``weight . of(values)`` by every number of the parameters in ``steps``, by central differences.
+
+    Two steps, h and h / 2, make them of the fourth order.
+    """
+    found = {}
+    for name, step in steps.items():
+        slope = np.zeros(values[name].shape)
+        for k in np.ndindex(*slope.shape):
+            way = np.zeros(slope.shape)
+            way[k] = 1
+            near, far = (
+                (of({**values, name: values[name] + h * way}) - of({**values, name: values[name] - h * way})) / (2 * h)
+                for h in (step / 2, step)
+            )
+            slope[k] = ((4 * near - far) / 3) @ weight
+        found[name] = slope
+    return found

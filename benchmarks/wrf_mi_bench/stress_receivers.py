@@ -1,0 +1,170 @@
+"""Receivers under stress: what they report of random and of hard fields, float32 against NumPy in float64.
+
+Pixels on the edge of a footprint are left out on both sides, see `stress_fields.ON_THE_EDGE`.
+
+Waves that cancel leave the roundings of what they cancelled. Where a receiver reports a single sum over directions
+(RSSI and CSI) its error is therefore counted in shares of the sum of the waves' magnitudes; that of element signals and
+spectra, which are many such sums, in shares of their own norm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from wrf_mi.backend.device import on_device as to_device
+from wrf_mi.core import pixel_directions
+from wrf_mi.core.angles import solid_angles
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.gaussians.parameters import Gaussians
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.graph.combine import DARK, LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.graph.learned import hemisphere_pair, learned_field
+from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
+from wrf_mi.receivers import Array, Pattern, array_response, bartlett_spectrum, minmax_scale
+
+from .stress_fields import BLENDINGS, HARD, ComplexArray, Field, felt_values, gradient, made, on_device, pose, reference
+from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
+
+SIZE = (30, 60)
+CARRIER_HZ = 920e6
+TONES_HZ = (CARRIER_HZ, 1.02 * CARRIER_HZ)
+ELEMENTS_M = planar_array(4, 4, 0.16)
+MODELS: dict[str, Any] = {
+    "pixels": PixelReceiver(*SIZE, ELEMENTS_M, CARRIER_HZ),
+    "spectrum": ArrayReceiver(*SIZE, ELEMENTS_M, CARRIER_HZ),
+    "scaled spectrum": ArrayReceiver(*SIZE, ELEMENTS_M, CARRIER_HZ, instrument_scale=True),
+    "RSSI": PowerReceiver(*SIZE, TONES_HZ),
+    "CSI": CsiReceiver(*SIZE, TONES_HZ),
+}
+"""Of the hybrid, in Dr.Jit: the ones that are trained through."""
+DOUBLE: Any = dr.float64_array_t(mi.Float)
+
+
+@cache
+def _array() -> Array:
+    """Elements that differ, with a pattern, on a mount: everything that `Array` knows."""
+    rng = np.random.default_rng(0)
+    gain = np.exp(rng.normal(0, 0.2, 16) + 1j * rng.uniform(-0.5, 0.5, 16))
+    turn = np.array([0.02, -0.03, 0.05, 1.0])
+    return Array(ELEMENTS_M, CARRIER_HZ, gain, Pattern(1.2), turn / np.linalg.norm(turn))
+
+
+def _ordinary(rng: np.random.Generator) -> Field:
+    return made(int(rng.integers(1, 100)), rng)
+
+
+def _fields(random: int, of_each: int) -> Iterable[tuple[str, Field, str, int]]:
+    """Family, field, blending and seed of each case."""
+    for name, family, count in [("random", _ordinary, random), *((n, f, of_each) for n, f in HARD.items())]:
+        for seed in range(count):
+            field = family(np.random.default_rng(seed))
+            for blending in BLENDINGS:
+                yield name, field, blending, seed
+
+
+def of_fields(random: int, of_each: int, families: Iterable[str] | None = None) -> list[Row]:
+    """What each receiver reports of an image, float32 against float64.
+
+    Args:
+        random: ordinary fields.
+        of_each: fields of each hard family.
+        families: ``random`` and names of `HARD`; None: all.
+    """
+    chosen = None if families is None else set(families)
+    worst: dict[str, Worst] = {}
+    cases = 0
+    for name, field, blending, _ in _fields(random, of_each):
+        if chosen is not None and name not in chosen:
+            continue
+        cases += 1
+        truth, clear = reference(field, blending, SIZE, sphere=True)
+        seen = (truth * clear).reshape(-1)
+        gaussians = on_device(field, blending, mi.Float)[0]
+        for what, error in {**_by_model(gaussians, clear, seen), **_by_operator(gaussians, clear, seen, field)}.items():
+            worst.setdefault(what, Worst()).add(error, name)
+    return [one.row(f"receiver: {what}, {cases} cases", IMAGE) for what, one in worst.items()]
+
+
+def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray) -> dict[str, float]:
+    """Errors of `MODELS`."""
+    plane, half = perception_plane(*SIZE, mi.Float), seen.size // 2
+    mask = to_device(clear.reshape(-1).astype(np.float32), mi.Float)
+    re, im = (part * mask for part in learned_field(gaussians, pose(mi.Float), plane, sphere=True))
+    upper = dr.arange(mi.UInt32, half)
+    learned = {True: (re, im), False: tuple(dr.gather(mi.Float, part, upper) for part in (re, im))}
+    found = {name: model(None, learned[model.sphere]).numpy().astype(float) for name, model in MODELS.items()}
+    weight = np.tile(solid_angles(*SIZE), 2)
+    wave, waves = (weight * seen).sum(), float((weight * np.abs(seen)).sum()) or 1.0
+    directions = pixel_directions(*SIZE).reshape(-1, 3)
+    h = (weight * seen)[:half] @ array_response(ELEMENTS_M, directions, CARRIER_HZ)
+    spectrum = np.sqrt(bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE) ** 2 + DARK)
+    channel = np.tile([wave.real, wave.imag], len(TONES_HZ))
+    amplitude = np.sqrt(np.abs(wave) ** 2 + LEAST_POWER)
+    return {
+        "pixels": relative(found["pixels"] - (pixels := np.sqrt(np.abs(seen[:half]) ** 2 + DARK)), pixels),
+        "Bartlett spectrum": relative(found["spectrum"] - spectrum.ravel(), spectrum),
+        "Bartlett spectrum, scaled": relative(
+            found["scaled spectrum"] - (scaled := minmax_scale(spectrum).ravel()), scaled
+        ),
+        "RSSI": abs(float(10 ** (found["RSSI"][0] / 20)) - amplitude) / max(waves, amplitude),
+        "CSI": float(np.abs(found["CSI"] - channel).max()) / waves,
+    }
+
+
+def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray, field: Field) -> dict[str, float]:
+    """Errors of the operators, built once and applied to the signals."""
+    plane, half, array = perception_plane(*SIZE, mi.Float), seen.size // 2, _array()
+    directions, weight = hemisphere_pair(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
+    ports = array.response(directions[:half]).T * weight[:half]
+    operator = ArrayOperator(port_matrix(gaussians, pose(mi.Float), plane, ports), array, *SIZE)
+    h = ports @ seen[:half]
+    spectrum = array.image(h, *SIZE)
+    signal = field.signal[None]
+    sectors = SectorOperator(port_matrix(gaussians, pose(mi.Float), plane, weight[None], sphere=True))
+    waves, wave = float((weight * np.abs(seen)).sum()) or 1.0, (weight * seen).sum()
+    amplitude = np.sqrt(np.abs(wave) ** 2 + LEAST_POWER)
+    return {
+        "element signals by the operator": relative(operator.signals(signal)[0] - h, h),
+        "Bartlett spectrum by the operator": relative(operator.spectrum(signal)[0] - spectrum, spectrum),
+        "RSSI by the operator": abs(float(10 ** (sectors.power_db(signal)[0] / 20)) - amplitude)
+        / max(waves, amplitude),
+    }
+
+
+def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: Iterable[str] | None = None) -> list[Row]:
+    """Derivatives of what receivers report by the Gaussians, float32 against float64.
+
+    Args:
+        of_each: fields of each family.
+        names: of `MODELS`.
+        families: ``random`` and names of `HARD`; None: all.
+    """
+    chosen = None if families is None else set(families)
+    rows = []
+    for name in names:
+        worst, cases, model = GradientWorst(), 0, MODELS[name]
+
+        def report(gaussians: Gaussians, at: Pose, model: Any = model) -> list[Any]:
+            kind: Any = type(gaussians.position[0])
+            plane = perception_plane(*SIZE, kind)
+            return [model(None, learned_field(gaussians, at, plane, model.sphere))]
+
+        for family, field, blending, seed in _fields(of_each, of_each):
+            if chosen is not None and family not in chosen:
+                continue
+            # Scaling takes out nearly all that the parameters of a single Gaussian do; what is left is rounding.
+            if len(field.signal) <= (name == "scaled spectrum"):
+                continue
+            single, double = (gradient(field, blending, SIZE, kind, seed, report) for kind in (mi.Float, DOUBLE))
+            worst.add(single, double, felt_values(field, blending), family)
+            cases += 1
+        rows.append(worst.row(f"receiver: derivatives of {name}, {cases} cases", GRADIENT))
+    return rows

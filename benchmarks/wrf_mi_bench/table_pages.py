@@ -1,0 +1,166 @@
+"""Pages and pictures of the tables of all methods, from the rows that are stored."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import InputError
+from wrf_mi.core.files import one_line, write_atomically
+from wrf_mi.runs.figures import save, score_cdf
+from wrf_mi.tasks import TASKS
+
+from .table_plan import PARTS, SHARES, Part, Row, plan
+
+
+def read_rows(place: Path) -> list[dict[str, Any]]:
+    """All rows stored in a folder.
+
+    Raises:
+        InputError: a file that is no JSON.
+    """
+    rows = []
+    for path in sorted(place.glob("*-seed*.json")):
+        try:
+            rows.append(json.loads(path.read_text(encoding="utf-8")))
+        except ValueError as error:
+            raise InputError(f"{path}: not readable ({one_line(error)}); restore it, or delete it") from None
+    return rows
+
+
+def write_tables(place: Path, quick: bool = False) -> None:
+    """Tables as Markdown in ``README.md`` and a picture of the distributions of each part, from what is stored."""
+    stored = {row["row"]: row for row in read_rows(place)}
+    text = ["# Every method, task by task", NOTE]
+    for name, heading in OVERVIEWS.items():
+        if shown := overview(name, stored, quick):
+            text += [f"## {heading.capitalize()}: medians", shown]
+    for part in PARTS:
+        own = [row for row in plan(quick) if row.part == part and row.name in stored]
+        if not own:
+            continue
+        title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
+        text += [f"## {title}", part_table(part, own, stored)]
+        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
+        picture = f"{part.task}-{part.dataset}-{part.split}.png"
+        figure = score_cdf(
+            {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
+        )
+        save(figure, place / picture)
+        text.append(f"![Distribution of the scores of each method]({picture})")
+    write_atomically(place / "README.md", "\n\n".join(text) + "\n")
+
+
+OVERVIEWS = {
+    "spectrum": TASKS["spectrum"].heading,
+    "rssi": TASKS["rssi"].heading,
+    "uplink": "downlink channels from the uplink",
+    "positions": "channels from positions",
+}
+"""Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
+NOTE = (
+    "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
+    "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "
+    "better when larger, errors in dB when smaller. With several seeds median, mean, p10 and p90 are means over "
+    "them and the medians' range stands in brackets; with fewer rows the seed draws the rows too. Errors of signal "
+    "strength are pooled over receivers and rows; fields have one offset a receiver. *Paper* is what the WRF-GS+ "
+    "paper states **on other data**, NeRF2's and Argos's, for signal strength as means over twelve receivers: "
+    "compare orders, not figures. Networks of blocked splits are fitted in five folds, all but the VAE with a fifth "
+    "to a half of their steps; in the traced room NeRF2, VAE and DCGAN take the steps of the ten times smaller "
+    "laboratory, WRF-GS and WRF-GS+ 18,000. Times are of the machine in each file, which others may have used too, "
+    "with as many threads as `worker_threads` says there, or else all: read ratios."
+)
+
+
+def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> str:
+    """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
+
+    With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
+
+    Args:
+        name: of `OVERVIEWS`.
+        stored: rows by name.
+        quick: of the small version.
+    """
+    found: dict[Part, dict[str, list[float]]] = {}
+    for row in plan(quick):
+        if row.part.table == name and row.name in stored and (quick or row.share == SHARES[0]):
+            found.setdefault(row.part, {}).setdefault(row.method, []).append(stored[row.name]["score"]["median"])
+    if not found:
+        return ""
+    columns = {part: {key: float(np.mean(each)) for key, each in methods.items()} for part, methods in found.items()}
+    task = next(iter(columns)).task
+    sign = -1 if TASKS[task].higher_is_better else 1
+    ranks: dict[str, list[float]] = {}
+    for medians in columns.values():
+        ordered = sorted(medians, key=lambda method: sign * medians[method])
+        for place, method in enumerate(ordered):
+            ranks.setdefault(method, []).append(place / max(len(ordered) - 1, 1))
+    entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
+    heads = [TASKS[task].label, *(_title(part) for part in columns), "paper, other data"]
+    lines = ["| " + " | ".join(heads) + " |", "| " + " | ".join(["---"] * len(heads)) + " |"]
+    digits = TASKS[task].digits
+    for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
+        cells = [f"{medians[method]:.{digits}f}" if method in medians else "" for medians in columns.values()]
+        best = [method == min(medians, key=lambda name: sign * medians[name]) for medians in columns.values()]
+        cells = [f"**{cell}**" if first else cell for cell, first in zip(cells, best, strict=True)]
+        # What a method is given may differ from column to column: then its plain name stands for all.
+        labels = {entry.label for entry in entries[method]}
+        label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
+        lines.append("| " + " | ".join([label, *cells, entries[method][0].published]) + " |")
+    return "\n".join(lines)
+
+
+def _title(part: Part) -> str:
+    return part.dataset if part.split == "official" else f"{part.dataset}, {part.split}"
+
+
+def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
+    """Markdown table of one data set under one split: best median first, fewer rows below."""
+    task = TASKS[part.task]
+    sign = -1 if task.higher_is_better else 1
+    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row.share, row.method), []).append(stored[row.name])
+
+    def median(key: tuple[float, str]) -> float:
+        return float(np.mean([one["score"]["median"] for one in groups[key]]))
+
+    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
+    lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
+    digits = TASKS[part.task].digits
+    for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
+        found = groups[share, method]
+        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
+        medians = [one["score"]["median"] for one in found]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
+        cells = [
+            str(found[0]["n_train"]),
+            part.entries[method].label,
+            f"**{each['median']:.{digits}f}**{spread}",
+            *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
+            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
+            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
+            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
+            part.entries[method].published if share == max(row.share for row in rows) else "",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += _reference_rows(part, groups)
+    return "\n".join(lines)
+
+
+def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
+    """What every run is held against where no row of its own measures it."""
+    if "idw" in part.entries:
+        return []
+    digits, share = 2, max(share for share, _ in groups)
+    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
+    words, lines = TASKS[part.task].references, []
+    for key, block in one["reference"].items():
+        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
+        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
+    return lines

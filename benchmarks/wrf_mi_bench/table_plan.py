@@ -1,0 +1,259 @@
+"""Which runs the tables of all methods are made of: tasks, data sets, splits, methods, shares of the rows, seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from wrf_mi.datasets.registry import locate
+
+SEEDS = (0, 1, 2)
+ONE = SEEDS[:1]
+SHARES = (1.0, 0.3, 0.1)
+"""Of the training rows; less than all for the methods of `FEW` alone, on the official split."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method as a table has it.
+
+    Attributes:
+        label: for the table.
+        arguments: of ``wrf-mi train`` beside data set, split, rows and seed.
+        quick: the same of a small version that takes half a minute.
+        seeds: more than one where a run takes less than three minutes on two cores and something is drawn.
+        few_seeds: the same with fewer rows, which are drawn themselves.
+        published: median (and what else is known) that the paper states, on other data; "" for none.
+    """
+
+    label: str
+    arguments: tuple[str, ...]
+    quick: tuple[str, ...] = ()
+    seeds: Sequence[int] = ONE
+    few_seeds: Sequence[int] = SEEDS
+    published: str = ""
+
+
+def _set(*settings: str) -> tuple[str, ...]:
+    return tuple(word for one in settings for word in ("--set", one))
+
+
+def _model(name: str, *more: str) -> tuple[str, ...]:
+    return ("--model", name, *more)
+
+
+NAMED = "{scene}"
+"""In arguments: in whose place a scene's come."""
+IN_A_FLAT = (
+    *("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2"),
+    *("--calibrate", "gain,patterns"),
+)
+"""Walls are two surfaces each and let waves through; strengths are not calibrated."""
+ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
+"""As the channels were traced, but for what the rough surfaces scatter, which no mesh tells."""
+FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
+"""Of every network in the small version; of those with long steps."""
+SHORT = _set("steps=400", "validate_every=200")
+"""Of every field of Gaussians in the small version."""
+SPECTRUM: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
+    "hybrid": Entry("hybrid", _model("hybrid"), (), SEEDS),
+    "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
+    "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
+    "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
+    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
+    "kriging": Entry("kriging", _model("kriging")),
+    "idw": Entry("blend", _model("idw")),
+}
+ROOM = _set("steps=18000")
+"""Where transmitters are anywhere in a room: 0.770 on validation rows, 0.754 after a third of the steps."""
+FURNISHED = {
+    **SPECTRUM,
+    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
+    "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
+    "hybrid": Entry("hybrid, knows the bare walls", _model("hybrid", "--scene", NAMED), (), SEEDS),
+}
+UNSEEN = {
+    **SPECTRUM,
+    "ray-tracing": Entry(
+        "ray tracing, line of sight alone",
+        _model("ray-tracing", "--scene", NAMED),
+        few_seeds=ONE,
+        published="0.38, p90 0.61",
+    ),
+}
+"""Where nobody has a mesh: all that can be traced is the direct path."""
+RSSI: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
+    "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
+    "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
+    "ray-tracing": Entry(
+        "ray tracing, calibrated, knows walls and heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+    ),
+    "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
+    "kriging": Entry("kriging, knows the heading", _model("kriging")),
+    "idw": Entry("blend", _model("idw")),
+    "mri": Entry("MRI", _model("mri"), published="8.3"),
+}
+POSITION: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
+    "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
+    "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
+    "kriging": Entry("kriging", _model("kriging")),
+    "idw": Entry("blend", _model("idw")),
+}
+UPLINK: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="23.91, p10 20.85, p90 25.52"),
+    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="22.98, p10 20.82, p90 24.33"),
+    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
+    "fire": Entry("FIRE", _model("fire"), FEWER, SEEDS, published="15.29"),
+    "r2f2": Entry("R2F2", _model("r2f2"), (), SEEDS, published="8.57"),
+    "optml": Entry("OptML", _model("optml"), FEWER, SEEDS, published="8.47"),
+    "linear": Entry("linear map", _model("linear"), (), SEEDS),
+    "kriging": Entry("kriging, from positions", _model("kriging")),
+    "ray-tracing": Entry(
+        "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
+    ),
+}
+CHEAP = ("hybrid", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
+"""Measured first: seconds to a minute each."""
+FEW = ("wrf-gs+", "hybrid", "nerf2", "linear", "kriging", "idw", "ray-tracing")
+"""Measured with fewer rows too."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One data set under one split.
+
+    Attributes:
+        task: of the data set.
+        table: which overview it belongs to: the task, or what channels are predicted from.
+        dataset: name.
+        split: name.
+        entries: methods.
+        few: whether fewer rows are measured too.
+        scene: name of what `wrf_mi_bench.tables.scene_of` makes; "" where no method needs one.
+        once: methods whose run takes more than three minutes here on one thread: one seed.
+    """
+
+    task: str
+    table: str
+    dataset: str
+    split: str
+    entries: Mapping[str, Entry] = field(hash=False)
+    few: bool = False
+    scene: str = ""
+    once: Collection[str] = ()
+
+
+PARTS = (
+    Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
+    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
+    Part(
+        "spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room", once=("wrf-gs+", "wrf-gs", "hybrid")
+    ),
+    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
+    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
+    Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
+    Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
+    Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
+)
+QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
+BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    **{("spectrum", name): _set("steps=3000", "hold_out=0") for name in ("wrf-gs", "wrf-gs+")},
+    ("spectrum", "dcgan"): _set("steps=750", "validate_every=75"),
+    ("spectrum", "nerf2"): _set("steps=2500", "validate_every=250"),
+}
+"""Of the five folds of a blocked split, by task and method: they are fitted in turn, ten minutes for all of them."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run of the tables.
+
+    Attributes:
+        part: where.
+        method: key of the part's entries.
+        share: of the training rows.
+        seed: of subset and fit.
+        quick: the small version.
+    """
+
+    part: Part
+    method: str
+    share: float
+    seed: int
+    quick: bool = False
+
+    @property
+    def entry(self) -> Entry:
+        """The method."""
+        return self.part.entries[self.method]
+
+    @property
+    def name(self) -> str:
+        """For files."""
+        p = self.part
+        return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
+
+    @property
+    def command(self) -> str:
+        """What makes it, whatever the scene's place on a machine: a row that another one made is an old row."""
+        return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}}}"])])
+
+    def arguments(self, scene: Sequence[str]) -> list[str]:
+        """Of ``wrf-mi``, without ``--out``.
+
+        Args:
+            scene: arguments that take the place of ``--scene {scene}``.
+        """
+        words: list[str] = []
+        for word in self.entry.arguments:
+            if word == NAMED:
+                words[-1:] = scene
+            else:
+                words.append(word)
+        if self.quick:
+            words += self.entry.quick
+        elif self.part.split == "blocked":
+            words += BLOCKED_SETTINGS.get((self.part.task, self.method), ())
+        few = [] if self.share == 1 else ["--n-train", str(self.share)]
+        return ["train", self.part.dataset, *words, "--split", self.part.split, "--seed", str(self.seed), *few]
+
+
+def plan(quick: bool = False) -> list[Row]:
+    """All rows: first one seed of every method at all rows, cheap ones first, then fewer rows, then other seeds.
+
+    So tables are whole early, and what an interruption leaves out is what is least needed.
+    """
+    if quick:
+        return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
+    first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
+    first.sort(key=lambda row: row.method not in CHEAP)
+    few = [
+        Row(part, name, share, 0)
+        for part in PARTS
+        if part.few
+        for share in SHARES[1:]
+        for name in part.entries
+        if name in FEW
+    ]
+    few.sort(key=lambda row: row.method not in CHEAP)
+    again = [
+        Row(row.part, row.method, row.share, seed)
+        for row in first
+        if row.method not in row.part.once
+        for seed in row.entry.seeds[1:]
+    ]
+    again += [Row(row.part, row.method, row.share, seed) for row in few for seed in row.entry.few_seeds[1:]]
+    return [*first, *few, *again]
+
+
+def available(part: Part) -> bool:
+    """Whether the data of a part are on this machine or are made here."""
+    return part.dataset.startswith("traced-") or locate(part.dataset) is not None

@@ -1,0 +1,90 @@
+"""What comes from NumPy is Dr.Jit's own: nothing is read beyond its end, nothing is wrapped elsewhere."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from wrf_mi.backend.device import PACKET, on_device, to_tensor, to_vectors, with_room
+
+SIZES = (0, 1, 5, 16, 1000, 70_001)
+ROOT = Path(__file__).parents[2]
+PACKAGES = (ROOT / "wrf_mi", ROOT / "plugins" / "wrf_mi_plugins")
+OWN = "device.py"
+AT_THE_END = """
+import ctypes, mmap
+import numpy as np
+import wrf_mi.backend
+wrf_mi.backend.init("llvm")
+import drjit as dr, mitsuba as mi
+from wrf_mi.backend.device import on_device
+
+# The last numbers of a page before one that nobody may read.
+memory = mmap.mmap(-1, 2 * mmap.PAGESIZE)
+place = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(place + mmap.PAGESIZE), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+values = np.frombuffer(memory, np.float32, 5, mmap.PAGESIZE - 20)
+values[:] = range(5)
+print(*on_device(values, mi.Float).numpy())
+"""
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("kind", [mi.Float, mi.UInt32, mi.Int32, mi.Bool, mi.Float64])
+def test_values_are_copied(size: int, kind: Any) -> None:
+    values = np.arange(size) % 7 - (3 if kind in (mi.Float, mi.Int32, mi.Float64) else 0)
+    found = on_device(values, kind)
+    expected = values.astype(found.numpy().dtype)
+    values[:] = 0
+    np.testing.assert_array_equal(found.numpy(), expected)
+    assert found.state in (dr.VarState.Evaluated, dr.VarState.Invalid)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_there_is_room_behind_what_is_wrapped(size: int) -> None:
+    room = with_room(np.ones(size), np.float32)
+    assert room.base is not None
+    assert room.base.size == size + PACKET
+    assert room.ctypes.data == room.base.ctypes.data
+
+
+def test_shapes_and_columns() -> None:
+    values = np.arange(12.0).reshape(4, 3)
+    np.testing.assert_array_equal(to_tensor(values).numpy(), values)
+    np.testing.assert_array_equal(to_vectors(values, mi.Point3f).numpy(), values.T)
+    np.testing.assert_array_equal(to_vectors(values[::2, :2], mi.Vector2f).numpy(), values[::2, :2].T)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="protects a page by Linux's C library")
+def test_nothing_beyond_the_end_is_read() -> None:
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (0, ["0.0", "1.0", "2.0", "3.0", "4.0"]), done.stderr
+
+
+ARRAYS = re.compile(r"(mi\.(Float|U?Int|Bool|Mask|Tensor|Point|Vector|Normal)\w*|kind|\w+_type)\(")
+"""Beginnings of calls that make a Dr.Jit array."""
+NUMPY = re.compile(r"\bnp\.(ascontiguousarray|asarray|array|arange|where|stack|concatenate|ravel|repeat)\(|\.astype\(")
+
+
+def wraps(code: str) -> bool:
+    """Whether a call makes a Dr.Jit array straight from NumPy's; lists are copied."""
+    return bool(ARRAYS.match(code) and NUMPY.search(code)) and ".tolist()" not in code
+
+
+def test_numpy_comes_in_by_one_way() -> None:
+    assert wraps("mi.Float(x.astype(np.float32))")
+    assert not wraps("mi.UInt32(np.asarray(rows).tolist())")
+    found = []
+    for path in (path for package in PACKAGES for path in package.rglob("*.py") if path.name != OWN):
+        calls = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call))
+        found += [f"{path.name}:{call.lineno}: {code}" for call in calls if wraps(code := ast.unparse(call))]
+    assert not found

@@ -1,0 +1,57 @@
+"""Recorded functions and waiting sums where the number of threads changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from wrf_mi.backend import set_threads
+from wrf_mi.backend.recorded import Recorded
+
+TERMS, SUMS = 1 << 20, 4096
+CALLS = 30
+"""On four threads, most calls went wrong while sums had room for one."""
+
+
+def sums(value: Any) -> Any:
+    """[SUMS] sums of TERMS / SUMS equal terms."""
+    found = dr.zeros(mi.Float, SUMS)
+    dr.scatter_reduce(
+        dr.ReduceOp.Add, found, value + dr.zeros(mi.Float, TERMS), dr.arange(mi.UInt32, TERMS) & (SUMS - 1)
+    )
+    return found
+
+
+def always(call: Callable[[], Any]) -> None:
+    """Each call gives the sums of ones."""
+    for _ in range(CALLS):
+        np.testing.assert_array_equal(call().numpy(), TERMS / SUMS)
+
+
+def test_more_threads_record_anew() -> None:
+    recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
+    set_threads(1)
+    always(lambda: recorded(one))
+    assert recorded.n_recordings == 1
+    set_threads(4)
+    always(lambda: recorded(one))
+    assert recorded.n_recordings == 2
+    set_threads(2)
+    always(lambda: recorded(one))
+    assert recorded.n_recordings == 2
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
+def test_waiting_sums_are_computed_first(before: int, after: int) -> None:
+    def waited() -> Any:
+        set_threads(before)
+        found = sums(mi.Float(1))
+        set_threads(after)
+        return found
+
+    always(waited)

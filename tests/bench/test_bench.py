@@ -1,0 +1,140 @@
+"""The benchmark's table, and that README and stored results say the same."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from wrf_mi_bench import plan as bench_plan
+from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
+from wrf_mi_bench.check import main
+from wrf_mi_bench.pareto_front import full_table
+from wrf_mi_bench.stress_summary import STAGES, summary_table
+
+from wrf_mi.core import InputError
+from wrf_mi.core.registry import resolve
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+RESULTS = CHECKOUT / "benchmarks" / "results"
+NEEDS_NO_DATA = (
+    "traced-and-splatted",
+    "hybrid-room",
+    "hybrid-starts",
+    "pareto",
+    "scaling",
+    "operator",
+    "stress",
+    "determinism",
+    "sentinels",
+)
+"""Checks on what is made here, and on stored figures; the traced room takes minutes."""
+ON_PAGE = {
+    "pareto": "speed.md",
+    "scaling": "speed.md",
+    "operator": "speed.md",
+    "budgets": "speed.md",
+    "training": "speed.md",
+    "stress": "numerics.md",
+    "determinism": "numerics.md",
+    "sentinels": "results.md",
+}
+"""Pages that show a check's table; those of hybrids have their own, and all others are in the README."""
+
+
+def result(case: str, median: float) -> dict[str, object]:
+    metrics = {
+        "ssim": {"median": median, "mean": 0.8, "p10": 0.7, "p90": 0.95},
+        "reference": {"idw4": {"median": 0.978}},
+        "steps": 1234,
+        "train_seconds": 90.0,
+        "ms_per_sample": 8.5,
+        "peak_memory_mb": 345.6,
+    }
+    return {"case": case, "title": CASES[case].title, "metrics": metrics}
+
+
+def test_table_has_a_line_for_each_result() -> None:
+    text = table([result("wrf-gs-official", 0.91), result("demo", 0.97)])
+    assert len(text.splitlines()) == 4
+    assert (
+        "| WRF-GS, authors' split | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB |"
+        in text
+    )
+
+
+def test_results_come_in_the_order_of_the_cases(tmp_path: Path) -> None:
+    for case in ("demo", "wrf-gs-official"):
+        (tmp_path / f"{case}.json").write_text(json.dumps(result(case, 0.9)))
+    assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs-official", "demo"]
+
+
+def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown; choose from"):
+        bench(["no-such-case"], tmp_path / "out", tmp_path / "runs")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_checks_say_what_data_they_lack(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The function is there; without data it is one line, exit status 2 and no file."""
+    assert callable(resolve(CHECKS[name].function))
+    if name in NEEDS_NO_DATA:
+        return
+    monkeypatch.setenv("WRF_MI_DATA", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(CHECKS[name].function, str(tmp_path / "out.json")) == 2
+    assert "not on this machine" in capsys.readouterr().err
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
+    monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
+    assert main("wrf_mi_bench.plan:flat_plan", str(tmp_path / "out.json")) == 0
+    assert json.loads((tmp_path / "out.json").read_text()) == figures
+    line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
+    assert line == "| mesh: walls | **0.9** | 0.8 |"
+
+
+def test_readme_shows_the_stored_results() -> None:
+    readme = (CHECKOUT / "README.md").read_text()
+    trained, checked = read_results(RESULTS)
+    hybrids = [one for one in checked if one["case"].startswith("hybrid-")]
+    others = [one for one in checked if one not in hybrids and one["case"] not in ON_PAGE]
+    page = (CHECKOUT / "docs" / "hybrid_models.md").read_text()
+    assert f"<!-- hybrids -->\n{check_table(hybrids)}\n<!-- /hybrids -->" in page
+    for one in checked:
+        name = one["case"]
+        if name in ON_PAGE:
+            shown = full_table(one["figures"]["points"]) if name == "pareto" else own_table(one)
+            page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
+            assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
+    for name, text in (("figures", table(trained)), ("checks", check_table(others))):
+        assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+
+
+def test_readme_shows_the_worst_of_each_stage() -> None:
+    rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
+    shown = (CHECKOUT / "README.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
+    assert shown.strip() == summary_table(rows)
+    stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
+    assert set(stages) >= {words for words, _ in STAGES}
+    worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
+    assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
+
+
+def test_stored_results_are_complete() -> None:
+    trained, checked = read_results(RESULTS)
+    assert [r["case"] for r in trained] == list(CASES)
+    # What compares this code with stored figures holds for this code alone, so it may not be measured yet.
+    measured = {r["case"] for r in checked}
+    needed = [name for name, check in CHECKS.items() if name in measured or not check.resumes]
+    assert [r["case"] for r in checked] == needed
+    for r in [*trained, *checked]:
+        assert r["command"].startswith("wrf-mi ")
+        assert {"machine", "versions", "date"} <= set(r)
+        assert "metrics" in r or r["figures"]["rows"]

@@ -1,0 +1,144 @@
+"""The quick benchmark's rule, on made-up timings, and its stored ratios."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from wrf_mi_bench import quick as bench_quick
+from wrf_mi_bench.bench import BenchFailed
+from wrf_mi_bench.quick import FILE, PAIRS, Pair, measure_pairs, quick, ratio_table, read_stored, worse
+from wrf_mi_bench.stock import StockRenderer
+from wrf_mi_bench.traced import difference, random_field, splatted
+
+from wrf_mi.cli.main import main as cli
+from wrf_mi.core import InputError
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+STORED = CHECKOUT / "benchmarks" / "results" / FILE
+SAME_SSIM, SAME_L2 = 0.99, 0.06
+"""Of Gaussians of 2 degrees: projection differs from rays by 1.4 % (`wrf_mi.gaussians.ray_response`), and Mitsuba's
+integrator makes those of low opacity smaller and stops early."""
+
+Ratios = dict[str, dict[str, float]]
+
+
+def made_up(value: float, spread: float = 1.1, name: str = "splatting") -> Ratios:
+    times = {"ours_ms": value, "theirs_ms": 1.0}
+    return {name: {"value": value, "low": value / spread, "high": value * spread} | times}
+
+
+@pytest.mark.parametrize(
+    ("measured", "fails"),
+    [
+        (made_up(0.5), False),
+        (made_up(0.9), False),
+        (made_up(1.05), False),  # the value above twice the stored one, its interval not
+        (made_up(1.5, spread=2.0), False),
+        (made_up(1.2), True),
+        (made_up(0.01), False),  # better is no failure
+        (made_up(9.0, name="new"), False),  # not stored yet
+    ],
+)
+def test_only_a_whole_interval_above_twice_the_stored_ratio_fails(measured: Ratios, fails: bool) -> None:
+    lines = worse(measured, made_up(0.5))
+    assert bool(lines) == fails
+    assert all("splatting 1.2 (1.09 to 1.32) is above 2 times the stored 0.5" in line for line in lines)
+
+
+def with_ratios(monkeypatch: pytest.MonkeyPatch, ratios: Ratios) -> None:
+    monkeypatch.setattr(bench_quick, "measure_pairs", lambda pairs: ratios)
+
+
+def test_what_is_stored_is_held_against(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="no stored ratios; measure them with `wrf-mi bench --quick --store`"):
+        quick(tmp_path / "out", store=False)
+    with_ratios(monkeypatch, made_up(0.5))
+    stored = quick(tmp_path / "out", store=True)
+    assert json.loads((tmp_path / "out" / FILE).read_text()) == stored
+    assert {"machine", "versions", "date", "command"} <= set(stored)
+    with_ratios(monkeypatch, made_up(0.8))
+    assert quick(tmp_path / "out", store=False)["figures"]["ratios"] == made_up(0.8)
+    assert read_stored(tmp_path / "out" / FILE) == made_up(0.5)  # only --store writes
+    with_ratios(monkeypatch, made_up(2.0))
+    with pytest.raises(BenchFailed, match="above 2 times the stored"):
+        quick(tmp_path / "out", store=False)
+
+
+def test_the_command_fails_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_ratios(monkeypatch, made_up(0.5))
+    assert cli.main(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
+    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    with_ratios(monkeypatch, made_up(2.0))
+    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "wrf-mi: bench --quick: splatting 2 (1.82 to 2.2) is above 2 times the stored 0.5"
+
+
+@pytest.mark.parametrize("arguments", [["--store"], ["--quick", "demo"]])
+def test_what_does_not_belong_to_quick_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", *arguments]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_ratios_of_another_backend_or_a_damaged_file_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_ratios(monkeypatch, made_up(0.5))
+    stored = quick(tmp_path, store=True)
+    stored["versions"]["backend"] = "abacus 1.0"
+    (tmp_path / FILE).write_text(json.dumps(stored))
+    with pytest.raises(InputError, match="ratios of the backend abacus"):
+        read_stored(tmp_path / FILE)
+    for damaged in ("{", "[]", '{"figures": {"ratios": {}}}'):
+        (tmp_path / FILE).write_text(damaged)
+        with pytest.raises(InputError, match="not readable"):
+            read_stored(tmp_path / FILE)
+
+
+def test_a_pair_gives_ours_over_theirs() -> None:
+    calls: list[str] = []
+
+    def busy(name: str, size: int) -> None:
+        calls.append(name)
+        np.sort(np.random.default_rng(0).random(size))
+
+    pair = Pair("made-up", "little over much", lambda: (lambda: busy("a", 20_000), lambda: busy("b", 2_000_000)))
+    found = measure_pairs([pair], repeats=5)["made-up"]
+    assert found["value"] < 0.5
+    assert calls.count("a") == calls.count("b") >= 5
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_stock_integrator_sees_the_same_field(seed: int) -> None:
+    """So that its time and ours are for the same job; complex and signed signals go through colours."""
+    gaussians, receiver = random_field(seed, "alpha", 100, 2.0)
+    stock = StockRenderer(receiver, 90, 360)
+    found = difference(stock.field(gaussians), splatted(gaussians, receiver))
+    assert found["ssim"] > SAME_SSIM
+    assert found["complex_error"] < SAME_L2
+    # Other Gaussians take the place of the first.
+    other, _ = random_field(seed + 10, "alpha", 100, 2.0)
+    assert difference(stock.field(other), splatted(other, receiver))["complex_error"] < SAME_L2
+
+
+def test_the_stock_integrator_cannot_blend_by_attenuation() -> None:
+    gaussians, receiver = random_field(0, "product", 5)
+    with pytest.raises(ValueError, match="opacity"):
+        StockRenderer(receiver, 9, 36).field(gaussians)
+
+
+def test_readme_shows_the_stored_ratios() -> None:
+    stored = json.loads(STORED.read_text())
+    assert set(stored["figures"]["ratios"]) == {pair.name for pair in PAIRS}
+    assert stored["wall_seconds"] < 120
+    readme = (CHECKOUT / "README.md").read_text()
+    block = re.search(r"<!-- ratios -->\n(.*?)\n<!-- /ratios -->", readme, re.DOTALL)
+    assert block is not None
+    assert block[1] == ratio_table(stored["figures"]["ratios"])

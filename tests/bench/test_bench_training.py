@@ -1,0 +1,89 @@
+"""What the benchmark of training counts and says."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from small_fits import official, settings
+from wrf_mi_bench import training as bench_training
+from wrf_mi_bench.training import (
+    BACKWARD,
+    FITS,
+    FORWARD,
+    SHARED_BACKWARD,
+    SHARED_FORWARD,
+    TITLES,
+    Work,
+    product_call,
+    rows,
+    shares,
+    some_steps,
+    stream_call,
+    work_of,
+)
+
+from wrf_mi.core import Record
+from wrf_mi.training.trainer import Trainer
+
+SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
+
+
+def test_operations_are_those_of_the_shapes(one_gateway: Record) -> None:
+    """WRF-GS+ of 8 Gaussians, two layers of 16 that both see 12 and 18 numbers, nine outputs."""
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
+    n, width = 8, 16
+    encoded = 2 * (2 * width * 12 * n + 2 * width * 18)  # twice: encodings have no derivative
+    hidden, heads = 3 * 2 * width * width * n, 3 * 2 * 9 * width * n
+    assert work_of(trainer).network_gflop * 1e9 == pytest.approx(2 * encoded + hidden + heads, rel=1e-12)
+
+
+@pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
+def test_what_stands_still_is_walked_once(model: str, one_gateway: Record) -> None:
+    one, four = (
+        work_of(Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model)))
+        for batch in (1, 4)
+    )
+    once = FORWARD + BACKWARD
+    expected = 4 * once if model == "wrf-gs+" else once + 3 * (SHARED_FORWARD + SHARED_BACKWARD)
+    assert four.splat_gflop / one.splat_gflop == pytest.approx(expected / once)
+    assert one.splat_gflop > 0
+    assert one.moved_gb < four.moved_gb < 4 * one.moved_gb
+
+
+def test_shares_of_a_step_are_all_of_it(one_gateway: Record) -> None:
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
+    found = shares(some_steps(trainer, 3))
+    assert trainer.state.step == 6
+    assert sum(found.values()) >= 1 - 1e-9
+    assert min(found.values()) >= 0
+    assert found[bench_training.KINDS["BatchedGemm"]] > 0
+    assert found[bench_training.WALKS] > 0
+
+
+def test_the_machines_best_computes_what_it_says() -> None:
+    rng = np.random.default_rng(0)
+    a, b = (rng.standard_normal((32, 32)) for _ in range(2))
+    np.testing.assert_allclose(product_call(32)().numpy(), a @ b, atol=1e-4)
+    assert dr.width(stream_call(1000)()) == 1000
+
+
+def test_every_model_has_a_process_of_its_own() -> None:
+    for model, name in FITS.items():
+        assert getattr(bench_training, name).args == (model,)
+    assert list(FITS) == list(TITLES)
+
+
+def test_lines_say_how_far_from_the_limit() -> None:
+    fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
+    work = {"network_gflop": 0.9, "splat_gflop": 0.1, "moved_gb": 0.02}
+    step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "work": work, "shares": {"products of networks": 0.6}}
+    machine = {"product_gflop_s": 200.0, "stream_gb_s": 20.0}
+    lines = {line["what"]: line for line in rows({"wrf-gs+": fit}, {"WRF-GS+, 1": step}, machine)}
+    whole = lines["WRF-GS+, fit to its final accuracy"]
+    assert whole["value"] == "90 s, of processors 170 s; 380 MB; median SSIM 0.973"
+    assert whole["asked"] == "180 s, 2048 MB"
+    # 1 GFLOP at 200 GFLOP/s are 5 ms, 20 MB at 20 GB/s one.
+    assert lines["WRF-GS+, a step of 1 transmitter"]["value"].endswith("at least 5.00 ms, 50 %")
+    assert Work(**work).gflop == 1.0
+    assert lines["WRF-GS+, a step of 1 transmitter: where its time goes"]["value"] == "products of networks 60 %"

@@ -1,0 +1,189 @@
+"""Sentinels: which stored figures they are, when a figure counts as kept, and that a stopped call goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call
+from wrf_mi_bench import bench, check
+from wrf_mi_bench import sentinels as bench_sentinels
+from wrf_mi_bench.bench import CHECKS
+from wrf_mi_bench.sentinels import STORED, TABLE_ROWS, Figure, Group, groups, main, median_interval
+from wrf_mi_bench.tables import FOLDER
+
+from wrf_mi.core import InputError
+from wrf_mi.runs.fit_key import source_files
+from wrf_mi.tasks import TASKS
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+SSIM = Figure("room: field, median SSIM", 0.90, 0.88, 0.92, True)
+ERROR = Figure("flat: field, median absolute error (dB)", 3.0, 2.8, 3.2, False)
+OTHERS_S = 300
+"""Image method, integrator and stress: 30 s, 30 s and 75 s were seen while another process had half of the cores."""
+
+
+def stored_rows() -> list[dict]:
+    return [json.loads((CHECKOUT / STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
+
+
+def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(CHECKOUT)
+    known = groups()
+    figures = [figure for group in known for figure in group.figures]
+    assert 30 <= len(figures) == len({figure.name for figure in figures})
+    assert len(known) == len({group.name for group in known})
+    assert all(figure.low <= figure.stored <= figure.high for figure in figures)
+    assert {name.partition("-")[0] for name in TABLE_ROWS} == set(TASKS)
+    assert OTHERS_S + sum(row["wall_seconds"] for row in stored_rows()) < 40 * 60
+
+
+@pytest.mark.parametrize("count", [40, 400])
+def test_interval_of_a_median_covers_it_as_often_as_it_says(count: int) -> None:
+    rng = np.random.default_rng(1)
+    inside = 0
+    for _ in range(400):
+        low, high = median_interval(list(np.quantile(rng.normal(size=count), np.linspace(0, 1, 101))), count)
+        inside += low <= 0 <= high
+    # 400 draws of 95 % have a standard deviation of 1.1 %; the exact interval of 40 rows covers 96 %.
+    assert 0.92 < inside / 400 < 0.99
+
+
+@pytest.mark.parametrize(
+    ("figure", "measured", "verdict"),
+    [
+        (SSIM, 0.88, "equal"),
+        (SSIM, 0.93, "better"),
+        (SSIM, 0.87, "worse"),
+        (SSIM, float("nan"), "worse"),
+        (ERROR, 3.2, "equal"),
+        (ERROR, 2.7, "better"),
+        (ERROR, 3.3, "worse"),
+        (ERROR, float("inf"), "worse"),
+    ],
+)
+def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure: Figure, measured: float, verdict: str) -> None:
+    assert figure.verdict(measured) == verdict
+
+
+class Made:
+    """Three groups that take no time: a good figure, one as it is asked for, and one without data."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
+        self.asked: list[str] = []
+        self.error: float | Exception | type[BaseException] = 3.0
+        known = [
+            Group("good", (SSIM,), self.values("good", lambda: [0.9])),
+            Group("other", (ERROR,), self.values("other", self.other)),
+            Group("far", (ERROR,), self.values("far", lambda: [3.0]), present=False),
+        ]
+        monkeypatch.setattr(bench_sentinels, "groups", lambda: known)
+        monkeypatch.setattr(bench_sentinels, "RUNS", runs)
+
+    def values(self, name: str, found: Callable[[], Sequence[float]]) -> Callable[[Path], Sequence[float]]:
+        def measure(_: Path) -> Sequence[float]:
+            self.asked.append(name)
+            return found()
+
+        return measure
+
+    def other(self) -> list[float]:
+        if isinstance(self.error, float):
+            return [self.error]
+        raise self.error
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Made:
+    return Made(monkeypatch, tmp_path / "sentinels")
+
+
+def test_kept_figures_pass_and_data_elsewhere_are_said(made: Made) -> None:
+    found = main()
+    assert "failed" not in found
+    assert [row["verdict"] for row in found["rows"]] == ["equal", "equal", "not on this machine"]
+    lines = bench_sentinels.table(found["rows"]).splitlines()
+    assert lines[2] == "| room: field, median SSIM | 0.9 | 0.88 to 0.92 | 0.9 | equal |"
+    assert lines[4] == "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 |  | not on this machine |"
+
+
+def test_a_call_that_was_stopped_goes_on_from_what_is_measured(made: Made, tmp_path: Path) -> None:
+    made.error = KeyboardInterrupt
+    assert check.main(CHECKS["sentinels"].function, str(tmp_path / "out.json")) == 130
+    assert not (tmp_path / "out.json").exists()
+    made.error = 3.0
+    assert "failed" not in main()
+    assert made.asked == ["good", "other", "other"]
+
+
+def test_other_code_is_measured_anew(made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    first = main()
+    assert main() == first  # nothing was measured, dates and seconds are those of the measurement
+    changed = tmp_path / "changed.py"
+    changed.write_text("x = 1\n")
+    monkeypatch.setattr(bench_sentinels, "source_files", lambda: source_files() | {"wrf_mi/changed.py": changed})
+    main()
+    assert made.asked == ["good", "other"] * 2
+
+
+def test_source_files_are_the_packages_without_compiled_files() -> None:
+    found = source_files()
+    assert {"wrf_mi/runs/fit_key.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
+    assert not [name for name in found if name.endswith(".pyc")]
+
+
+@pytest.mark.parametrize(
+    ("error", "value"), [(3.3, "3.3, worse"), (InputError("no\nscene"), "failed: no scene"), (OSError(), "failed")]
+)
+def test_what_got_worse_or_failed_is_named_after_all_were_measured(
+    made: Made, error: float | Exception, value: str
+) -> None:
+    made.error = error
+    found = main()
+    assert made.asked == ["good", "other"]
+    begin = f"1 of 3 figures got worse or were not measured, first {ERROR.name}: {value}"
+    assert found["failed"].startswith(begin)
+
+
+def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The check runs in a process of its own, which is left out here."""
+    figures = {"rows": [ERROR.row(3.3, "worse"), SSIM.row(0.9, "equal")], "failed": "1 of 2 figures got worse"}
+    calls = []
+
+    def run_module(module: str, arguments: Sequence[str]) -> tuple[int, str]:
+        calls.append(arguments[0])
+        Path(arguments[1]).write_text(json.dumps(figures))
+        return 0, ""
+
+    monkeypatch.setattr(bench, "run_module", run_module)
+    asked = ["bench", "sentinels", "--out", tmp_path / "out", "--runs", tmp_path / "runs"]
+    status, out, err = call(asked, capsys)
+    assert status == 1
+    assert "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 | 3.3 | worse |" in out.splitlines()
+    assert err.splitlines()[-1] == "wrf-mi: bench sentinels: 1 of 2 figures got worse"
+    result = json.loads((tmp_path / "out" / "sentinels.json").read_text())
+    assert {"machine", "versions", "date"} <= set(result)
+    assert result["figures"] == figures
+    assert "3.3, worse" in (tmp_path / "out" / "README.md").read_text()
+    # Every call compares with what is stored then.
+    del figures["failed"]
+    status, _, err = call(asked, capsys)
+    assert status == 0
+    assert "finished before" not in err
+    assert calls == [CHECKS["sentinels"].function] * 2
+
+
+def test_without_stored_figures_it_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The command, with the process that it starts."""
+    monkeypatch.chdir(tmp_path)
+    status, out, err = call(["bench", "sentinels", "--out", "out", "--runs", "runs"], capfd)
+    assert (status, out, err.count("\n")) == (2, "", 1), err
+    assert "stored figures are not on this machine; call it in a checkout" in err
+    assert not (tmp_path / "out" / "sentinels.json").exists()

@@ -1,0 +1,193 @@
+"""What `wrf-mi bench stress` runs at full size, here with a case or two of each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from wrf_mi_bench import stress as bench_stress
+from wrf_mi_bench import stress_fields, stress_joint, stress_plugins, stress_receivers, stress_rows
+from wrf_mi_bench.stress import held, worst_of
+from wrf_mi_bench.stress_fields import HARD, Field, image, made, reference
+from wrf_mi_bench.stress_joint import joint
+from wrf_mi_bench.stress_losses import losses
+from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
+from wrf_mi_bench.stress_receivers import derivatives, of_fields
+from wrf_mi_bench.stress_traced import traced_gradients
+from wrf_mi_bench.stress_twins import twins
+
+from wrf_mi.cli.main import main as cli
+from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_images_of_hard_fields(name: str) -> None:
+    for seed in range(2):
+        field = HARD[name](np.random.default_rng(seed))
+        for blending in stress_fields.BLENDINGS:
+            truth, clear = reference(field, blending, (30, 60))
+            found = image(field, blending, (30, 60))
+            assert np.isfinite(found).all()
+            assert np.linalg.norm((found - truth)[clear]) <= bench_stress.IMAGE * np.linalg.norm(truth)
+            assert clear.mean() > 0.9
+
+
+def test_derivatives_of_hard_fields() -> None:
+    names = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in depth", "opacity 0, 1 and 1 - 1e-7")
+    for row in bench_stress.gradients(1, names):
+        worst, bound = worst_of(row)
+        assert worst <= bound, row
+
+
+def test_ties_are_ties_in_both() -> None:
+    """Permuted and mirrored offsets have the same distance; which is in front is settled by position alone."""
+    field = HARD["exact ties in depth"](np.random.default_rng(5))
+    opaque = replace(field, opacity=np.ones(len(field.opacity)), scale_m=0 * field.scale_m + 0.5)
+    truth, clear = reference(opaque, "alpha", (30, 60))
+    assert len(np.unique(np.abs(truth[clear]).round(3))) > 10
+    np.testing.assert_allclose(image(opaque, "alpha", (30, 60))[clear], truth[clear], atol=1e-5)
+
+
+def test_an_image_of_nothing_is_dark() -> None:
+    for blending in stress_fields.BLENDINGS:
+        found = image(made(0, np.random.default_rng(0)), blending, (3, 5))
+        assert found.shape == (3, 5)
+        assert not found.any()
+
+
+def test_one_pixel() -> None:
+    for seed in range(5):
+        field = made(40, np.random.default_rng(seed))
+        for blending in stress_fields.BLENDINGS:
+            truth, clear = reference(field, blending, (1, 1))
+            np.testing.assert_allclose(image(field, blending, (1, 1))[clear], truth[clear], rtol=1e-4)
+
+
+def test_phases_and_losses() -> None:
+    for row in [*bench_stress.phases(), *losses(2)]:
+        assert held(row), row
+    # The same lengths in float32 would miss the bound: it is one that can be missed.
+    assert float(bench_stress.phases()[0]["value"].split()[-2]) > stress_rows.PHASE
+
+
+def test_fits_end_finite_or_say_where_not() -> None:
+    value = bench_stress.fits(4)["value"]
+    assert value.endswith(" 0 did neither")
+    assert "4 ended finite" not in value
+
+
+def test_receivers() -> None:
+    hard = ("random", "needles, 1e6 to 1", "signals of 1e-15 to 1e15", "none")
+    for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), *twins(1)]:
+        assert held(row), row
+
+
+def test_derivatives_of_what_is_traced() -> None:
+    for row in traced_gradients(1):
+        assert held(row), row
+
+
+def test_the_joint_graph() -> None:
+    """Values and derivatives of all receiver models."""
+    rows = joint(2)
+    assert len(rows) == 2 * len(stress_joint.cases())
+    for row in rows:
+        assert held(row), row
+
+
+def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values see a shift that the graph forgets, derivatives a tilt that it holds."""
+    moved = PlaneTables.moved
+
+    def unshifted(self: PlaneTables, parameters: Any) -> Any:
+        return moved(self, {name: value for name, value in parameters.items() if name != SHIFT})
+
+    monkeypatch.setattr(PlaneTables, "moved", unshifted)
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
+    assert not held(value)
+    assert not held(slope)
+
+    def untilted(self: PlaneTables, parameters: Any) -> Any:
+        return moved(self, {**parameters, TILT: dr.detach(parameters[TILT])})
+
+    monkeypatch.setattr(PlaneTables, "moved", untilted)
+    value, slope = joint(1, [stress_joint.COPLANAR], ["CSI"])
+    assert held(value)
+    assert not held(slope)
+    assert "plane.tilt" in slope["value"]
+
+
+def test_the_integrator_of_the_plugins() -> None:
+    for row in [*plugin_images(2, 1, many=0), *plugin_gradients(1, bench_stress.HARDEST[:1])]:
+        assert held(row), row
+
+
+def test_a_receiver_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    off = replace(stress_receivers.MODELS["spectrum"], frequency_hz=1.001 * stress_receivers.CARRIER_HZ)
+    monkeypatch.setitem(stress_receivers.MODELS, "spectrum", off)
+    missed = [row["what"] for row in of_fields(1, 1, ("random",)) if not held(row)]
+    assert missed == ["receiver: Bartlett spectrum, 2 cases"]
+
+
+def test_slim_gaussians_are_met_by_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mitsuba's ellipsoids lose rays where they are small against its unit of length."""
+    from wrf_mi_plugins import acceleration
+
+    for name, value in {"NEAREST": 1.0, "FARTHEST": 4.0, "STEP": 1e-4, "SIZE": 12.0, "SPACING": 24.0004}.items():
+        monkeypatch.setattr(acceleration, name, value)
+    lost = stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60))
+    assert worst_of(lost)[0] > 0.01
+    monkeypatch.undo()
+    assert held(stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60)))
+
+
+def test_what_is_not_a_number_is_the_worst() -> None:
+    worst = stress_rows.Worst()
+    for error, where in ((1e-6, "first"), (np.nan, "second"), (1.0, "third")):
+        worst.add(error, where)
+    row = worst.row("made up", 1.0)
+    assert not held(row)
+    assert "second" in row["value"]
+    slopes = {"a": np.array([[1.0, 2.0], [-3.0, 1e-9]])}
+    known = stress_rows.GradientWorst()
+    known.add({"a": slopes["a"] * [[1, 1], [-1, 1]]}, slopes, {"a": np.ones((2, 2))})
+    assert (known.signs, known.compared) == (1, 3)
+    assert known.cosine.error == pytest.approx(1 - (1 + 4 - 9) / 14)
+    assert known.norm.error == pytest.approx(0)
+    known.add({"a": slopes["a"] + np.nan}, slopes, slopes)
+    assert not held(known.row("made up"))
+
+
+def test_the_quick_form_by_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def few() -> list[dict[str, str]]:
+        return [bench_stress._images("ordinary", lambda rng: made(20, rng), 1, bench_stress.IMAGE)]
+
+    monkeypatch.setattr(bench_stress, "QUICK", (few, lambda: losses(1), lambda: [bench_stress.fits(1)]))
+    assert cli.main(["bench", "stress", "--quick"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 1 + 7 + 1
+    assert lines[2].startswith("| numbers under stress: image, ordinary, 2 cases | **worst ")
+    monkeypatch.setattr(bench_stress, "IMAGE", 1e-12)
+    assert cli.main(["bench", "stress", "--quick"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("wrf-mi: bench stress --quick: image, ordinary, 2 cases: worst ")
+
+
+@pytest.mark.parametrize("names", [["operator"], ["stress", "demo"], ["nowhere"], ["stress", "--store"]])
+def test_what_has_no_quick_form_is_refused(names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", *names, "--quick"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "stress" in line
+
+
+def test_an_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def off(field: Field, blending: str, size: tuple[int, int]) -> np.ndarray:
+        return image(field, blending, size) * 1.001
+
+    monkeypatch.setattr(bench_stress, "image", off)
+    worst, bound = worst_of(bench_stress._images("random", lambda rng: made(20, rng), 2, bench_stress.IMAGE))
+    assert worst == pytest.approx(1e-3, rel=0.05)
+    assert worst > bound

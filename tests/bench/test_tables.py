@@ -1,0 +1,204 @@
+"""Tables of every method: what is planned, that rows are stored one by one, and what the tables say."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from wrf_mi_bench import table_pages, tables
+from wrf_mi_bench.bench import BenchFailed
+from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, plan
+
+from wrf_mi.core import InputError
+from wrf_mi.models import MODELS
+from wrf_mi.tracing import open_scene
+
+CHECKOUT = Path(__file__).parents[2]
+PAPER = {
+    "spectrum": {"wrf-gs+", "wrf-gs", "nerf2", "vae", "dcgan", "ray-tracing"},
+    "rssi": {"wrf-gs+", "wrf-gs", "nerf2", "mri"},
+    "csi": {"wrf-gs+", "wrf-gs", "nerf2", "fire", "r2f2", "optml"},
+}
+
+
+def made_row(row: Row, median: float) -> dict:
+    block = {"median": median, "mean": median, "p10": median - 1, "p90": median + 1}
+    return {
+        "row": row.name,
+        "label": row.entry.label,
+        "share": row.share,
+        "seed": row.seed,
+        "command": row.command,
+        "versions": tables.package_versions(),
+        "n_train": 10,
+        "n_test": 5,
+        "train_seconds": 3.0,
+        "ms_per_sample": 1.25,
+        "peak_memory_mb": 400.0,
+        "reference": {"uplink": block | {"median": -7.0}},
+        "score": block,
+        "quantiles": [median - 1 + 0.02 * i for i in range(tables.QUANTILES)],
+    }
+
+
+def test_every_method_of_the_paper_is_planned_for_its_task():
+    for task, names in PAPER.items():
+        assert names <= {row.method for row in plan() if row.part.task == task and row.share == 1}
+    for row in plan():
+        model = row.entry.arguments[row.entry.arguments.index("--model") + 1]
+        assert model in MODELS
+
+
+def test_names_are_unique_and_whole_tables_come_first():
+    rows = plan()
+    assert max(Counter(row.name for row in rows).values()) == 1
+    first = [row.share == 1 and row.seed == 0 for row in rows]
+    assert first == sorted(first, reverse=True)
+    assert {row.part.dataset for row in plan(quick=True)} == {part.dataset for part in QUICK_PARTS}
+
+
+def test_arguments_are_those_of_a_run_of_that_kind():
+    part = next(part for part in PARTS if part.dataset == "flat-ble")
+    words = Row(part, "ray-tracing", 0.3, 2).arguments(["--scene", "x", "--material", "y"])
+    assert words[:2] == ["train", "flat-ble"]
+    assert words[words.index("--scene") : words.index("--scene") + 4] == ["--scene", "x", "--material", "y"]
+    assert words[words.index("--n-train") + 1] == "0.3"
+    assert words[words.index("--seed") + 1] == "2"
+    assert "--n-train" not in Row(part, "mri", 1.0, 0).arguments([])
+
+
+@pytest.fixture
+def short_plan(monkeypatch):
+    part = next(part for part in PARTS if part.dataset == "traced-csi-flat")
+    rows = [Row(part, "fire", 1.0, 0), Row(part, "r2f2", 1.0, 0), Row(part, "fire", 0.1, 0)]
+    for module in (tables, table_pages):
+        monkeypatch.setattr(module, "plan", lambda quick=False: rows)
+    return rows
+
+
+def test_a_row_is_stored_when_it_is_done_and_never_measured_twice(short_plan, monkeypatch, tmp_path):
+    asked = []
+
+    def measure(runs, row):
+        asked.append(row.name)
+        if row.method == "r2f2" and len(asked) < 4:
+            raise BenchFailed("r2f2 stumbled")
+        return made_row(row, 5.0 if row.share == 1 else 4.0)
+
+    monkeypatch.setattr(tables, "measure", measure)
+    with pytest.raises(BenchFailed, match=r"1 rows did not finish: .*: r2f2 stumbled"):
+        tables.tables(tmp_path, tmp_path / "runs")
+    stored = {path.stem for path in (tmp_path / "tables").glob("*.json")}
+    assert stored == {row.name for row in short_plan if row.method == "fire"}
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert asked == [row.name for row in short_plan] + [short_plan[1].name]
+    assert len(tables.tables(tmp_path, tmp_path / "runs")) == 3
+    assert len(asked) == 4
+
+
+def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "measure", lambda runs, row: made_row(row, 5.0))
+    tables.tables(tmp_path, tmp_path / "runs")
+    asked = []
+    monkeypatch.setattr(tables, "measure", lambda runs, row: asked.append(row.name) or made_row(row, 6.0))
+    path = tmp_path / "tables" / f"{short_plan[0].name}.json"
+    path.write_text(path.read_text().replace("--model fire", "--model fire --set steps=1"))
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert asked == [short_plan[0].name]
+
+
+def test_a_row_of_other_data_is_measured_again_and_one_of_other_versions_is_told(
+    short_plan, monkeypatch, tmp_path, capsys
+):
+    data = tmp_path / "data"
+    data.mkdir()
+    monkeypatch.setattr(tables, "dataset_files", lambda name: [data])
+    asked = []
+
+    def measure(runs, row):
+        asked.append(row.name)
+        return made_row(row, 5.0) | {"data": tables.content_digest([data]), "versions": tables.package_versions()}
+
+    monkeypatch.setattr(tables, "measure", measure)
+    tables.tables(tmp_path, tmp_path / "runs")
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert len(asked) == 3
+    assert "stored rows" not in capsys.readouterr().err
+    for row, change in zip(short_plan, ({"data": "other"}, {"versions": {"numpy": "0.1"}}, {}), strict=True):
+        path = tmp_path / "tables" / f"{row.name}.json"
+        stored = json.loads(path.read_text()) | change
+        if not change:
+            del stored["data"]
+        path.write_text(json.dumps(stored))
+    tables.tables(tmp_path, tmp_path / "runs")
+    assert asked[3:] == [short_plan[0].name]
+    err = capsys.readouterr().err
+    assert "1 of 2 stored rows were measured by other versions of packages and are kept" in err
+    assert "1 of 2 stored rows do not state their data and are kept" in err
+
+
+def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "locate", lambda name: flat_folder)
+    for name in ("flat-ble", "rfid-lab"):
+        part = next(part for part in PARTS if part.dataset == name)
+        (flag, path) = tables.scene_of(part, tmp_path)
+        assert flag == "--scene"
+        assert len(open_scene(path, 2.4e9).objects) > 0
+        before = {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")}
+        assert tables.scene_of(part, tmp_path) == [flag, path]
+        assert {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")} == before
+
+
+def test_no_row_is_begun_after_the_time_is_up(short_plan, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "measure", lambda runs, row: pytest.fail("begun"))
+    assert tables.tables(tmp_path, tmp_path / "runs", most_s=-1.0) == []
+
+
+def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path):
+    fire, r2f2, few = short_plan
+    for row, median in ((fire, 5.0), (r2f2, 6.5), (few, 9.0)):
+        (tmp_path / f"{row.name}.json").write_text(json.dumps(made_row(row, median)))
+    table_pages.write_tables(tmp_path)
+    text = (tmp_path / "README.md").read_text()
+    order = [text.index(cell) for cell in ("| R2F2 | **6.50**", "| FIRE | **5.00**", "| FIRE | **9.00**", "**-7.00**")]
+    assert order == sorted(order)
+    assert "8.57" in text  # the paper's figure, in a column of its own that says so
+    assert (tmp_path / "csi-traced-csi-flat-official.png").stat().st_size > 5000
+
+
+def test_a_damaged_row_is_told(tmp_path):
+    (tmp_path / "a-seed0.json").write_text('{"row": ')
+    with pytest.raises(InputError, match=r"a-seed0\.json: not readable .*restore it, or delete it"):
+        table_pages.read_rows(tmp_path)
+
+
+def test_data_that_are_not_here_are_left_out(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tables, "available", lambda part: False)
+    assert tables.tables(tmp_path, tmp_path / "runs") == []
+    assert "flat-ble is not on this machine" in capsys.readouterr().err
+
+
+def test_an_overview_has_a_line_a_method_and_the_mean_over_seeds(monkeypatch):
+    flat, office = (part for part in PARTS if part.dataset.startswith("traced-csi-"))
+    rows = [
+        Row(flat, "fire", 1.0, 0),
+        Row(flat, "fire", 1.0, 1),
+        Row(flat, "fire", 0.1, 0),
+        Row(office, "fire", 1.0, 0),
+    ]
+    rows += [Row(flat, "r2f2", 1.0, 0)]
+    monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
+    medians = (5.0, 7.0, 100.0, 3.0, 9.5)
+    stored = {row.name: made_row(row, median) for row, median in zip(rows, medians, strict=True)}
+    lines = table_pages.overview("uplink", stored).splitlines()
+    assert lines[0] == "| CEA (dB) | traced-csi-flat | traced-csi-office | paper, other data |"
+    assert lines[2:] == ["| R2F2 | **9.50** |  | 8.57 |", "| FIRE | 6.00 | **3.00** | 15.29 |"]
+    assert table_pages.overview("rssi", stored) == ""
+
+
+@pytest.mark.parametrize("name", table_pages.OVERVIEWS)
+def test_readme_shows_what_is_stored(name):
+    stored = table_pages.read_rows(CHECKOUT / "benchmarks" / "results" / "tables")
+    shown = (CHECKOUT / "README.md").read_text(encoding="utf-8").split(f"<!-- {name} -->")[1]
+    overview = table_pages.overview(name, {row["row"]: row for row in stored})
+    assert shown.split(f"<!-- /{name} -->")[0].strip() == overview

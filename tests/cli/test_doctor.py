@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from wrf_mi import backend
+from wrf_mi.backend import cache, libraries, remedy
+from wrf_mi.cli import doctor
+from wrf_mi.core import BackendError
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Other tests may have initialised the backend in this process, which sets the variable.
+    monkeypatch.delenv(libraries.LLVM_VARIABLE, raising=False)
+    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
+
+
+class System:
+    """A system whose only commands are stand-ins that write down how they were called."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.bin = folder / "bin"
+        self.log = folder / "calls"
+        self.bin.mkdir()
+        self.log.touch()
+        monkeypatch.setenv("PATH", str(self.bin))
+
+    def command(self, name: str, body: str = "exit 0") -> None:
+        file = self.bin / name
+        file.write_text(f'#!/bin/sh\necho "{name} $*" >>"{self.log}"\n{body}\n')
+        file.chmod(0o755)
+
+    def calls(self) -> list[str]:
+        return self.log.read_text().splitlines()
+
+
+@pytest.fixture
+def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    return System(tmp_path, monkeypatch)
+
+
+def works_after(monkeypatch: pytest.MonkeyPatch, system: System, call: str) -> None:
+    """No backend works until ``call`` was made."""
+
+    def choose(name: str = "auto", *, fresh: bool = False) -> None:
+        if not any(line.startswith(call) for line in system.calls()):
+            raise BackendError("no usable LLVM (none was found): install one")
+
+    monkeypatch.setattr(doctor, "choose", choose)
+
+
+PACKAGES = """cat <<'END'
+libllvm14 - runtime library
+libllvm19 - runtime library
+libllvm22t64 - runtime library
+libllvmlibc-19-dev - LLVM C Library
+libllvm-19-ocaml-dev - bindings
+END"""
+
+INSTALL = "apt-get install -y --no-install-recommends"
+
+
+def test_report_of_this_machine() -> None:
+    found = json.loads(json.dumps(doctor.report()))
+    expected = backend.choose()
+    assert found["ok"]
+    assert found["backend"] == vars(expected)
+    if expected.llvm_path:
+        (used,) = [library for library in found["llvm"] if library["path"] == expected.llvm_path]
+        assert used["usable"]
+        assert used["version"] == expected.llvm_version
+    assert found["threads"] >= 1
+    assert found["versions"]["drjit"] == "1.5.0"
+    text = doctor.render(found)
+    assert expected.variant in text
+    assert all(library["path"] in text for library in found["llvm"])
+
+
+def test_report_without_any_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(libraries, "_library_folders", lambda: [])
+    monkeypatch.setattr(libraries, "_linker_cache", lambda start: [])
+    monkeypatch.setattr(backend, "find_cuda", lambda: None)
+    monkeypatch.setattr(doctor, "find_cuda", lambda: None)
+    found = doctor.report()
+    assert not found["ok"]
+    assert found["backend"] is None
+    assert {"problem": "no usable LLVM (none was found)", "remedy": remedy.install_line()} in found["problems"]
+    assert f"remedy: {remedy.install_line()}" in doctor.render(found)
+
+
+def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "data"))
+    monkeypatch.setattr("wrf_mi.datasets.registry.user_cache", lambda: tmp_path / "none")
+    found = doctor.report()
+    remedies = [entry["remedy"] for entry in found["problems"]]
+    assert "unset WRF_MI_DATA" in remedies
+    assert "wrf-mi data fetch rfid-lab" in remedies
+    (tmp_path / "data" / "rfid-lab").mkdir(parents=True)
+    found = doctor.report()
+    folders = {entry["name"]: entry["folder"] for entry in found["data"]["sets"]}
+    assert folders["rfid-lab"] == str(tmp_path / "data" / "rfid-lab")
+    assert "wrf-mi data fetch rfid-lab" not in [entry["remedy"] for entry in found["problems"]]
+
+
+def test_nothing_is_installed_where_a_backend_works(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.command("apt-get")
+    works_after(monkeypatch, system, "")
+    system.log.write_text("\n")
+    doctor.install_llvm()
+    assert system.calls() == [""]
+
+
+def test_apt_installs_the_newest_that_works(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.command("apt-get")
+    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
+    works_after(monkeypatch, system, f"{INSTALL} libllvm19")
+    doctor.install_llvm()
+    changes = [call for call in system.calls() if call.startswith("apt-get")]
+    assert changes == [f"{INSTALL} libllvm22t64 libatomic1", f"{INSTALL} libllvm19 libatomic1"]
+
+
+def test_line_for_a_system_without_package_lists(system: System) -> None:
+    system.command("apt-get")
+    system.command("apt-cache")
+    assert remedy.install_line() == f"apt-get update && {INSTALL} libllvm19 libatomic1"
+
+
+def test_apt_fetches_missing_lists(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    lists = system.bin / "lists"
+    system.command("apt-get", f'[ "$1" = update ] && : >"{lists}"; [ -e "{lists}" ]')
+    system.command("apt-cache", f'[ -e "{lists}" ] && {PACKAGES.replace("cat", "/bin/cat")}')
+    works_after(monkeypatch, system, f"{INSTALL} libllvm22t64")
+    doctor.install_llvm()
+    assert "apt-get update" in system.calls()
+
+
+def test_an_install_that_does_not_help_is_an_error(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.command("dnf")
+    works_after(monkeypatch, system, "never")
+    with pytest.raises(BackendError, match=r"did not help: no usable LLVM \(none was found\)"):
+        doctor.install_llvm()
+    assert "dnf install -y llvm-libs libatomic" in system.calls()
+
+
+def test_without_rights_the_error_is_the_line_to_run(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    system.command("apt-get")
+    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
+    works_after(monkeypatch, system, "never")
+    assert remedy.install_line() == f"sudo {INSTALL} libllvm22t64 libatomic1"
+    with pytest.raises(BackendError, match="no usable LLVM"):
+        doctor.install_llvm()
+    system.command("sudo", "exit 1")  # asks for a password
+    with pytest.raises(BackendError, match="no usable LLVM"):
+        doctor.install_llvm()
+    assert not [call for call in system.calls() if call.startswith("apt-get")]
+
+
+def test_with_sudo_that_asks_nothing(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    system.command("sudo", 'shift; [ "$1" = true ] || "$@"')
+    system.command("apt-get")
+    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
+    works_after(monkeypatch, system, f"{INSTALL} libllvm22t64")
+    doctor.install_llvm()
+    assert f"sudo -n {INSTALL} libllvm22t64 libatomic1" in system.calls()
+
+
+def test_brew_needs_no_root(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(os, "geteuid", lambda: 501)
+    system.command("brew")
+    works_after(monkeypatch, system, "brew install llvm")
+    doctor.install_llvm()
+    assert system.calls() == ["brew install llvm"]
+
+
+def test_unknown_system_gets_advice(system: System) -> None:
+    assert remedy.install_commands() == []
+    assert "DRJIT_LIBLLVM_PATH" in remedy.install_line()
+
+
+def test_a_named_library_is_not_replaced(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.command("apt-get")
+    works_after(monkeypatch, system, "never")
+    monkeypatch.setenv(libraries.LLVM_VARIABLE, "/nowhere/libLLVM.so")
+    with pytest.raises(BackendError, match="no usable LLVM"):
+        doctor.install_llvm()
+    assert system.calls() == []
+
+
+def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.main(["--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ok"]
+
+    def refuse() -> None:
+        raise BackendError("LLVM is missing: run this")
+
+    monkeypatch.setattr(doctor, "install_llvm", refuse)
+    assert doctor.main(["--install-llvm"]) == 1
+    assert capsys.readouterr().err == "LLVM is missing: run this\n"

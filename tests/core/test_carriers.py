@@ -1,0 +1,278 @@
+"""Rows of several carriers: refused by models of one, blended by carrier, traced at the carrier of each row."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call
+from made_channels import channels
+from scipy.constants import speed_of_light
+
+from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.carriers import by_carrier
+from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
+from wrf_mi.models import MODELS
+from wrf_mi.runs.api import open_run, plan_run, train
+from wrf_mi.runs.references import reference_predictions
+from wrf_mi.runs.results import read_run
+from wrf_mi.scene.make import make_scene
+from wrf_mi.tasks import TASKS, instrument_of
+from wrf_mi.tracing import TraceOptions, load_trace
+from wrf_mi.tracing.polarization import cross_polarized
+from wrf_mi.tracing.result import join_traces, recompute
+from wrf_mi.tracing.tracer import RayTracer
+
+LOW, HIGH = 1.1e9, 5.1e9
+FLOAT32_DB = 1e-4
+"""Predictions are stored as float32; gains come from float32 amplitudes."""
+GREY = 2e-4
+"""Of spectra in 0..1 from float32 gains, in which weak paths nearly cancel."""
+
+
+def test_rows_keep_their_order_by_carrier() -> None:
+    carriers = np.array([3.0, 1.0, 3.0, 2.0, 1.0])
+    found = by_carrier(carriers, lambda hz, rows: np.stack([rows, np.full(len(rows), hz)]), axis=1)
+    np.testing.assert_array_equal(found, [np.arange(5), carriers])
+
+
+@pytest.fixture(scope="module")
+def flat(flat_folder: Path) -> Record:
+    """Signal strengths at two carriers in turn."""
+    record = load(flat_folder)
+    return record.at_carriers(np.where(np.arange(len(record)) % 3 > 0, HIGH, LOW))
+
+
+def of(record: Record, carrier_hz: float) -> tuple[Record, Split]:
+    """The rows of one carrier alone, with their official split."""
+    assert record.carriers_hz is not None
+    assert record.official is not None
+    rows = np.flatnonzero(record.carriers_hz == carrier_hz)
+    train_rows, test = (np.flatnonzero(np.isin(rows, part)) for part in record.official)
+    heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
+    own = replace(record.at_carrier(carrier_hz), tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, official=None)
+    own = replace(own, observation=record.observation[:, rows])
+    return own, Split("own", 0, train_rows, train_rows[:0], test)
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if not MODELS[name].several_carriers])
+def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gateway: Record, tmp_path: Path) -> None:
+    several = one_gateway.at_carriers(np.arange(len(one_gateway)) % 2 + 1.0)
+    for record in (flat, several):
+        model = MODELS[name]
+        if model.serves(record.task) and not model.needs_uplink:
+            with pytest.raises(InputError, match=rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"):
+                train(record, tmp_path / "run", name, seed=1)
+            assert not (tmp_path / "run").exists()
+
+
+def test_models_of_several_carriers_are_named(flat: Record) -> None:
+    with pytest.raises(
+        InputError, match=r"so choose another model \(idw, kriging, trees, mri\) or give the rows of ea"
+    ):
+        plan_run(flat, "wrf-gs+")
+
+
+def test_carriers_that_do_not_fit_are_refused(flat: Record) -> None:
+    for change, message in (
+        ({"carriers_hz": np.ones(3)}, r"carriers_hz \[3\]; give 30 positive"),
+        ({"carriers_hz": np.zeros(len(flat))}, r"carriers_hz \[30\]; give 30 positive"),
+        ({"frequencies_hz": np.ones(1)}, "set one of the two to None"),
+    ):
+        with pytest.raises(InputError, match=message):
+            plan_run(replace(flat, **change), "idw")
+    record = channels()
+    with pytest.raises(InputError, match="carriers_hz belongs to spectra and signal strengths"):
+        plan_run(replace(record, frequencies_hz=None, carriers_hz=np.ones(len(record))), "linear")
+
+
+@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+def test_each_carrier_is_interpolated_by_itself(name: str, flat: Record, tmp_path: Path) -> None:
+    settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
+    run = train(flat, tmp_path / "run", name, settings=settings)
+    read = read_run(run.folder)
+    assert flat.carriers_hz is not None
+    carriers = flat.carriers_hz[read.row]
+    for carrier in (LOW, HIGH):
+        record, split = of(flat, carrier)
+        alone = read_run(train(record, tmp_path / f"{carrier}", name, split=split, settings=settings).folder)
+        np.testing.assert_array_equal(read.prediction[:, carriers == carrier], alone.prediction)
+        for key in alone.references:
+            np.testing.assert_array_equal(read.references[key][:, carriers == carrier], alone.references[key])
+    again = open_run(run.folder, flat)
+    heading = None if name in ("idw", "mri") or flat.tx_heading_rad is None else flat.tx_heading_rad[read.row]
+    found = again.predict(flat.tx_pos_m[read.row], 1, heading, carriers_hz=carriers).mean
+    np.testing.assert_array_equal(found.astype(np.float32), read.prediction[1])
+
+
+def test_carriers_are_asked_for_where_there_are_several(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
+    run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
+    with pytest.raises(
+        InputError, match=r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position"
+    ):
+        run.predict(place)
+    with pytest.raises(InputError, match="row 2: no training row at 2000000000 Hz; trained on rows at 2 carriers"):
+        run.predict(place, carriers_hz=[LOW, 2e9])
+    with pytest.raises(InputError, match=r"2 positions and carriers \(1,\); give one positive frequency_hz for each"):
+        run.predict(place, carriers_hz=LOW)
+    one = train(flat_folder, tmp_path / "one", "idw")
+    with pytest.raises(InputError, match="its data have one carrier; leave frequency_hz away"):
+        one.predict(place, carriers_hz=[LOW, LOW])
+
+
+def test_a_carrier_without_training_rows_is_refused_before_the_fit(flat: Record, tmp_path: Path) -> None:
+    assert flat.carriers_hz is not None
+    low = flat.carriers_hz == LOW
+    split = Split("band", 0, np.flatnonzero(~low), np.zeros(0, np.int64), np.flatnonzero(low))
+    with pytest.raises(InputError, match="anchor1: received none of 0 training rows at 1100000000 Hz; leave that carr"):
+        train(flat, tmp_path / "run", "idw", split=split)
+
+
+def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_ble_folder(tmp_path / "flat", flat)
+    run = train(folder, tmp_path / "run", "idw")
+    table = np.column_stack([flat.tx_pos_m[:4], [LOW, HIGH, HIGH, LOW]])
+    np.savetxt(tmp_path / "tx.csv", table, "%.17g", ",", header="x,y,z,frequency_hz", comments="")
+    np.savez(tmp_path / "tx.npz", tx_pos=table[:, :3], frequency_hz=table[:, 3])
+    expected = [run.predict(table[:, :3], r, carriers_hz=table[:, 3]).mean for r in (0, 1)]
+    for option, given, out in (("--tx", "tx.csv", "out.csv"), ("--input", "tx.npz", "out.npz")):
+        status, _, err = call(["predict", run.folder, option, tmp_path / given, "--out", tmp_path / out], capsys)
+        assert status == 0, err
+    written = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    assert written.dtype.names == ("x", "y", "z", "frequency_hz", "anchor1_dbm", "anchor2_dbm")
+    np.testing.assert_array_equal(written["frequency_hz"], table[:, 3])
+    np.testing.assert_allclose(written["anchor2_dbm"], expected[1], atol=FLOAT32_DB)
+    with np.load(tmp_path / "out.npz") as stored:
+        np.testing.assert_array_equal(stored["frequency_hz"], table[:, 3])
+        np.testing.assert_allclose(stored["prediction"], expected, atol=FLOAT32_DB)
+    with np.load(run.folder / "predictions.npz") as stored:
+        assert flat.carriers_hz is not None
+        np.testing.assert_array_equal(stored["frequency_hz"], flat.carriers_hz[stored["row"]])
+
+
+@pytest.fixture(scope="module")
+def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flat's plan, extruded: concrete and boards, whose conductivity goes with frequency."""
+    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+def test_rays_alone_bring_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:
+    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(reflection=False, max_depth=0))
+    rx = np.stack([receiver.position_m for receiver in flat.receivers])
+    distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
+    loss = 20 * np.log10(speed_of_light / flat.carriers_hz / (4 * np.pi * distance))
+    assert flat.official is not None
+    known = flat.official[0]
+    expected = loss + np.median((flat.observation - loss)[:, known], axis=1, keepdims=True)
+    read = read_run(run.folder)
+    assert read.prediction == pytest.approx(expected[:, read.row], abs=FLOAT32_DB)
+    # Traced anew at another carrier than any row had.
+    shifted = open_run(run.folder, flat).predict(flat.tx_pos_m[:3], 0, carriers_hz=np.full(3, 2e9)).mean
+    assert shifted == pytest.approx(expected[0, :3] + 20 * np.log10(flat.carriers_hz[:3] / 2e9), abs=FLOAT32_DB)
+
+
+def spectra_of(record: Record) -> Record:
+    """A record of spectra by arrays at the same receivers."""
+    grey = np.zeros((len(record.receivers), len(record), 9, 24), np.float32)
+    own = replace(record, task="spectrum", observation=grey, tx_heading_rad=None)
+    return own.with_array(planar_array(3, 3, 0.05))
+
+
+@pytest.mark.parametrize("make", [lambda record: record, spectra_of])
+def test_reflections_are_those_of_a_trace_at_the_rows_carrier(
+    make: Callable[[Record], Record], flat: Record, room: Path, tmp_path: Path
+) -> None:
+    record = make(flat)
+    options, rows = TraceOptions(max_depth=2, transmission=True, rays=20000), np.arange(9)
+    assert record.carriers_hz is not None
+    carriers, tx = record.carriers_hz[rows], record.tx_pos_m[rows]
+    tracer = RayTracer(room, instrument_of(record.at_carrier(2.4e9)), options)
+    traced = tracer.trace(tx, carriers_hz=carriers)
+    found = tracer.observe(traced)
+    halves = [tracer.trace(tx[part], carriers_hz=carriers[part]) for part in (slice(4), slice(4, None))]
+    np.testing.assert_allclose(tracer.observe(join_traces(halves)), found, atol=FLOAT32_DB)
+    for carrier in (LOW, HIGH):
+        alone = RayTracer(room, instrument_of(record.at_carrier(carrier)), options)(tx)
+        own = carriers == carrier
+        np.testing.assert_allclose(found[:, own], alone[:, own], atol=GREY if record.task == "spectrum" else FLOAT32_DB)
+        assert not np.allclose(found[:, ~own], alone[:, ~own], atol=0.05)
+
+
+def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -> None:
+    tracer = RayTracer(room, instrument_of(flat.at_carrier(LOW)), TraceOptions(max_depth=2, rays=20000))
+    traced = tracer.trace(flat.tx_pos_m, carriers_hz=np.full(len(flat), 100 * LOW))
+    here = recompute(traced, tracer.scene)
+    assert here.carriers_hz is None
+    direct = here.paths.bounces == 0
+    np.testing.assert_allclose(np.abs(here.paths.gain / traced.paths.gain)[direct], 100, rtol=1e-4)
+    # The turned antenna brings at LOW about what the stated one, which nothing is wrong with, brings at 100 LOW.
+    assert cross_polarized(traced, tracer.scene) == {}
+
+
+def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
+    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["max_depth=1", "rays=20000"])
+    stored = load_trace(run.folder / "paths.npz")
+    np.testing.assert_array_equal(stored.carriers_hz, flat.carriers_hz)
+    read, again = read_run(run.folder), open_run(run.folder, flat)
+    assert flat.carriers_hz is not None
+    anew = again.predict(flat.tx_pos_m[read.row], 0, carriers_hz=flat.carriers_hz[read.row]).mean
+    assert read.prediction[0] == pytest.approx(anew, abs=FLOAT32_DB)
+
+
+@pytest.mark.parametrize("setting", ["calibration=gain", "target_error_db=1"])
+def test_what_serves_one_carrier_alone_is_refused(setting: str, flat: Record, room: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"rows at 2 carriers, .* calibration and target_error_db serve one carrier"):
+        train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=[setting])
+
+
+def test_a_material_that_is_unknown_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:
+    far = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
+    with pytest.raises(InputError, match=r"not known at 0\.1 GHz"):
+        train(far, tmp_path / "run", "ray-tracing", scene=room)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_reference_blends_rows_of_one_carrier(flat: Record) -> None:
+    assert flat.official is not None
+    known, rows = flat.official
+    key = TASKS["rssi"].reference
+    found = reference_predictions(flat, known, rows)[key]
+    shifted = replace(flat, observation=flat.observation + np.where(flat.carriers_hz == LOW, 30, 0).astype(np.float32))
+    moved = reference_predictions(shifted, known, rows)[key] - found
+    np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
+
+
+def test_the_command_shows_carriers_readings_and_noise(
+    flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = flat.observation.shape
+    readings = np.ones(shape, np.int64)
+    readings[:, ::2] = 5
+    own = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
+    folder = write_ble_folder(tmp_path / "flat", own)
+    status, out, _ = call(["data", "info", folder, "--json"], capsys)
+    found = json.loads(out)
+    assert status == 0
+    assert found["carriers_hz"] == {str(LOW): 10, str(HIGH): 20}
+    assert (found["n_readings"], found["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
+    assert (found["receivers"], found["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
+    status, out, _ = call(["data", "info", folder], capsys)
+    assert status == 0
+    assert "carrier:          1100000000 Hz in 10 rows, 5100000000 Hz in 20 rows\n" in out
+    assert "readings per row: 1 to 5, median 3\nnoise:            1 to 3 dB, median 2 dB\n" in out
+    status, _, err = call(["data", "info", tmp_path / "nothing"], capsys)
+    assert (status, err.count("\n")) == (2, 1)
+
+
+def test_the_command_shows_what_channels_are_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_nerf2_csi(tmp_path / "stations", channels())
+    status, out, _ = call(["data", "info", folder], capsys)
+    assert status == 0
+    assert "carrier:          2400000000 to 2403000000 Hz, 4 subcarriers\n" in out
+    assert "known:            positions, uplink\n" in out

@@ -1,0 +1,140 @@
+"""What must not change, or must change in a known way, whatever the field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from wrf_mi_bench.stress_fields import BLENDINGS, RECEIVER, Field, made
+
+from wrf_mi.core import Receiver
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import Gaussians
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.gaussians.optical_depth import attenuators, optical_depth
+from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.receivers.array import array_response, bartlett_spectrum
+
+Float64: Any = dr.float64_array_t(mi.Float)
+ROUNDING = 1e-9
+"""Float64 through some tens of operations; pixels on the edge of a footprint may fall to either side."""
+SIZE = (20, 40)
+FIELDS = st.builds(
+    lambda seed, count: made(count, np.random.default_rng(seed)), st.integers(0, 10**6), st.integers(1, 40)
+)
+FEW = settings(max_examples=12, deadline=None)
+
+
+def render(field: Field, blending: str, receiver: Receiver = RECEIVER) -> np.ndarray:
+    """In float64, [height, width]."""
+    parts = {k: [Float64(np.ascontiguousarray(c)) for c in v.T] for k, v in field.groups(blending).items()}
+    gaussians = Gaussians(
+        position=parts["position"],
+        scale=parts["scale"],
+        rotation=parts["rotation"],
+        signal=parts["signal"],
+        opacity=parts["opacity"][0] if blending == "alpha" else None,
+        attenuation=parts.get("attenuation"),
+        batch=1,
+    )
+    pose = Pose([Float64(x) for x in receiver.position_m], [[Float64(x) for x in row] for row in receiver.to_world])
+    re, im = splat(gaussians, pose, perception_plane(*SIZE, Float64))
+    return (re.numpy() + 1j * im.numpy()).reshape(SIZE)
+
+
+def alike(one: np.ndarray, other: np.ndarray) -> None:
+    """Equal but for pixels on edges."""
+    scale = max(np.abs(one).max(), 1e-3)
+    assert (np.abs(one - other) > ROUNDING * scale).mean() < 0.01
+
+
+def turned(receiver: Receiver, by: Rotation, origin: np.ndarray) -> Receiver:
+    own = by * Rotation.from_quat(receiver.orientation_xyzw)
+    return replace(receiver, position_m=origin + by.apply(receiver.position_m), orientation_xyzw=own.as_quat())
+
+
+@FEW
+@given(FIELDS, st.sampled_from(BLENDINGS), st.integers(0, 10**6))
+def test_the_world_may_be_turned_and_moved(field: Field, blending: str, seed: int) -> None:
+    by, origin = Rotation.random(rng=np.random.default_rng(seed)), np.random.default_rng(seed).normal(size=3)
+    moved = replace(
+        field,
+        position_m=origin + by.apply(field.position_m),
+        rotation=(by * Rotation.from_quat(field.rotation)).as_quat(),
+    )
+    alike(render(field, blending), render(moved, blending, turned(RECEIVER, by, origin)))
+
+
+@FEW
+@given(FIELDS, st.sampled_from(BLENDINGS), st.integers(-40, 40))
+def test_a_turn_of_the_receiver_shifts_azimuths(field: Field, blending: str, columns: int) -> None:
+    spin = Rotation.from_rotvec([0, 0, 2 * np.pi * columns / SIZE[1]])
+    own = Rotation.from_quat(RECEIVER.orientation_xyzw) * spin
+    shifted = render(field, blending, replace(RECEIVER, orientation_xyzw=own.as_quat()))
+    alike(np.roll(render(field, blending), -columns, axis=1), shifted)
+
+
+@FEW
+@given(FIELDS, st.sampled_from(BLENDINGS), st.randoms(use_true_random=False))
+def test_gaussians_may_be_stored_in_any_order(field: Field, blending: str, random: Any) -> None:
+    order = list(range(len(field.signal)))
+    random.shuffle(order)
+    mixed = Field(**{name: getattr(field, name)[order] for name in Field.__dataclass_fields__})
+    alike(render(field, blending), render(mixed, blending))
+
+
+@FEW
+@given(FIELDS, st.sampled_from(BLENDINGS), st.complex_numbers(max_magnitude=1e3), st.integers(0, 10**6))
+def test_images_are_linear_in_signals(field: Field, blending: str, factor: complex, seed: int) -> None:
+    other = np.random.default_rng(seed).normal(size=(len(field.signal), 2)) @ [1, 1j]
+    both = render(replace(field, signal=factor * field.signal + other), blending)
+    alike(both, factor * render(field, blending) + render(replace(field, signal=other), blending))
+
+
+@FEW
+@given(st.integers(0, 10**6), st.randoms(use_true_random=False), st.floats(0.1, 10))
+def test_elements_may_be_stored_in_any_order_and_power_scales(seed: int, random: Any, amplitude: float) -> None:
+    rng = np.random.default_rng(seed)
+    elements, direction = planar_array(4, 4, 0.16), rng.normal(size=3)
+    h = array_response(elements, direction / np.linalg.norm(direction), 920e6) + 0.1 * rng.normal(size=16)
+    order = list(range(16))
+    random.shuffle(order)
+    spectrum = bartlett_spectrum(h, elements, 920e6, *SIZE)
+    np.testing.assert_allclose(bartlett_spectrum(h[order], elements[order], 920e6, *SIZE), spectrum, atol=1e-9)
+    scaled = bartlett_spectrum(amplitude * h, elements, 920e6, *SIZE)
+    np.testing.assert_allclose(scaled**2, amplitude**2 * spectrum**2, rtol=1e-9, atol=1e-9)
+
+
+@FEW
+@given(FIELDS, st.floats(0.05, 0.95))
+def test_optical_depth_may_be_split(field: Field, share: float) -> None:
+    """Two Gaussians in one place, whose transmittances multiply to that of one."""
+    opaque = np.clip(field.opacity, 0, 0.999)
+    parts = [1 - (1 - opaque) ** share, 1 - (1 - opaque) ** (1 - share)]
+    twice = Field(**{name: np.concatenate([getattr(field, name)] * 2) for name in Field.__dataclass_fields__})
+    np.testing.assert_allclose(
+        _depth(replace(twice, opacity=np.concatenate(parts))),
+        _depth(replace(field, opacity=opaque)),
+        rtol=1e-6,
+        atol=1e-9,
+    )
+
+
+def _depth(field: Field) -> np.ndarray:
+    """Of rays from the receiver through all Gaussians' centres."""
+    parts = {k: [Float64(np.ascontiguousarray(c)) for c in v.T] for k, v in field.groups("alpha").items()}
+    own = attenuators(
+        Gaussians(parts["position"], parts["scale"], parts["rotation"], parts["signal"], parts["opacity"][0], None, 1)
+    )
+    away = np.unique(field.position_m, axis=0) - RECEIVER.position_m
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    origin = [Float64(np.full(len(away), x)) for x in RECEIVER.position_m]
+    direction = [Float64(np.ascontiguousarray(c)) for c in away.T]
+    return np.asarray(optical_depth(own, origin, direction, Float64(0.0), Float64(1e3)).numpy())

@@ -1,0 +1,83 @@
+"""A receiver is given by its name or its number, wherever one is asked for."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wrf_mi.core import InputError, Receiver, receivers
+from wrf_mi.core.receivers import receiver_index
+
+NAMES = ("kitchen", "1", "anchor2", "0")
+MADE = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in NAMES]
+
+
+@pytest.mark.parametrize(
+    ("receiver", "index"),
+    [*((name, k) for k, name in enumerate(NAMES)), *((k, k) for k in range(4)), (np.int64(2), 2)],
+)
+def test_strings_are_names_and_integers_are_numbers(receiver: int | str, index: int) -> None:
+    assert receiver_index(MADE, receiver) == index
+
+
+@pytest.mark.parametrize(
+    "receiver",
+    ["sensor10", "", "2", "4", True, "-1", "1.0", "1_0", " 2", "9" * 5000, "Kitchen", 4, -1, 1.0, None, "a\nb"],
+)
+def test_unknown_receivers_are_refused_in_one_line_with_the_names(receiver: Any) -> None:
+    with pytest.raises(InputError, match=r"no receiver .*; give one of kitchen, 1, anchor2, 0, or its number") as error:
+        receiver_index(MADE, receiver)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_of_several_is_refused_and_long_lists_are_cut() -> None:
+    with pytest.raises(InputError, match=r"'1': name of several; give one's number, of 1, 4$"):
+        receiver_index([*MADE, MADE[1]], "1")
+    with pytest.raises(InputError, match=r"1, kitchen, \.\.\., or its number from 0 to 39$"):
+        receiver_index(MADE[::-1] * 10, "sensor10")
+
+
+def test_example() -> None:
+    assert doctest.testmod(receivers).failed == 0
+
+
+def public_functions() -> dict[str, Callable[..., Any]]:
+    """Functions of the library that take a receiver from a user."""
+    from wrf_mi.models.physics.csi import CsiHybrid
+    from wrf_mi.models.physics.measured_spectrum import MeasuredSpectrumHybrid
+    from wrf_mi.models.physics.rssi import RssiHybrid
+    from wrf_mi.models.physics.selection import HybridModel
+    from wrf_mi.models.physics.spectrum import SpectrumHybrid
+    from wrf_mi.receivers.calibrate import fit_array
+    from wrf_mi.runs.api import Run
+    from wrf_mi.training.predictor import Predictor
+
+    models = (CsiHybrid, MeasuredSpectrumHybrid, RssiHybrid, SpectrumHybrid, HybridModel, Run)
+    found = {model.__name__: model.predict for model in models}
+    return {**found, "Predictor": Predictor.__call__, "fit_array": fit_array}
+
+
+def test_functions_say_that_they_take_names() -> None:
+    for name, function in public_functions().items():
+        assert inspect.signature(function).parameters["receiver"].annotation == "int | str", name
+
+
+def test_runs_predict_for_a_receiver_by_name(plain_flat_folder: Path, tmp_path: Path) -> None:
+    import wrf_mi
+
+    at = [[1.0, 2.0, 0.5]]
+    baseline = wrf_mi.train(plain_flat_folder, tmp_path / "mri", "mri")
+    hybrid = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, tmp_path / "hybrid", "hybrid").folder)
+    np.testing.assert_array_equal(baseline.predict(at, "hall $_$").mean, baseline.predict(at, 1).mean)
+    np.testing.assert_array_equal(hybrid.predict(at, "hall $_$").mean, hybrid.predict(at, 1).mean)
+    assert hybrid.predict(at, "hall $_$").mean != hybrid.predict(at, "kitchen").mean
+    for model in (baseline, hybrid):
+        for wrong in ("sensor10", 2, -1):
+            with pytest.raises(InputError, match=r"no receiver .*; give one of kitchen, hall"):
+                model.predict(at, wrong)

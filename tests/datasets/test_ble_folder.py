@@ -1,0 +1,382 @@
+"""The layout of the BLE signal-strength data: what is read, and every way in which a folder can be wrong."""
+
+import logging
+import os
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_flat import write_flat
+
+from wrf_mi.core import Antenna, InputError, Record
+from wrf_mi.datasets import load, make_splits, read_ble_folder, write_ble_folder
+
+DATA = os.environ.get("WRF_MI_DATA")
+needs_data = pytest.mark.skipif(
+    not DATA or not Path(DATA, "flat-ble").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/"
+)
+FLOAT32 = 1e-5
+"""Rounding of powers of tens of dBm to float32."""
+
+ANCHORS = "id,x,y,z\n3,1.5,2,2.5\n1,0,-1,2\n"
+TRAINING = """,ts,x,heading,y,rssi_1,rssi_3
+0,1.6e18,0.5,3.1,1.5,-54.25,-60
+1,1.6e18,0.25,-40.5,1.75,,-61.5
+2,1.6e18,1,0,2,,
+3,1.6e18,1.25,0,2,-70,nan
+"""
+TEST = """ts,x,y,heading,rssi_3,rssi_1
+1.6e18,2,3,0.5,-80,-81
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "anchors.csv").write_text(ANCHORS)
+    (tmp_path / "calibration_df.csv").write_text(TRAINING)
+    (tmp_path / "test_robot_df.csv").write_text(TEST)
+    return tmp_path
+
+
+def test_reads_a_folder(folder: Path):
+    record = read_ble_folder(folder, "made-up")
+    assert (record.name, record.task, record.source) == ("made-up", "rssi", str(folder))
+    assert [r.name for r in record.receivers] == ["anchor3", "anchor1"]
+    np.testing.assert_array_equal(record.receivers[0].position_m, [1.5, 2, 2.5])
+    np.testing.assert_array_equal(record.receivers[0].to_world, np.eye(3))
+    np.testing.assert_array_equal(
+        record.tx_pos_m, [[0.5, 1.5, 1.3], [0.25, 1.75, 1.3], [1, 2, 1.3], [1.25, 2, 1.3], [2, 3, 1.3]]
+    )
+    assert record.observation.dtype == np.float32
+    np.testing.assert_array_equal(
+        record.observation, [[-60, -61.5, np.nan, np.nan, -80], [-54.25, np.nan, np.nan, -70, -81]]
+    )
+    np.testing.assert_array_equal(record.tx_heading_rad, [3.1, -40.5, 0, 0, 0.5])
+    assert record.official is not None
+    assert [part.tolist() for part in record.official] == [[0, 1, 2, 3], [4]]
+    np.testing.assert_array_equal(record.frequencies_hz, [2.44e9])
+    assert load(folder).task == "rssi"
+
+
+def test_heights_are_those_of_the_rows(folder: Path):
+    heights("0.25", "2.5")(folder)
+    record = read_ble_folder(folder)
+    np.testing.assert_array_equal(record.tx_pos_m[:, 2], [0.25, 0.25, 0.25, 0.25, 2.5])
+    np.testing.assert_array_equal(record.tx_pos_m[:, :2], [[0.5, 1.5], [0.25, 1.75], [1, 2], [1.25, 2], [2, 3]])
+
+
+def test_the_default_height_is_logged(folder: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO, "wrf_mi"):
+        read_ble_folder(folder)
+        assert caplog.messages == [f"{folder}: no column z; all transmitters are taken to be 1.3 m above the floor"]
+        caplog.clear()
+        heights("1", "1")(folder)
+        read_ble_folder(folder)
+        assert caplog.messages == []
+
+
+def test_headings_are_optional(folder: Path):
+    for name in (TRAIN_FILE, TEST_FILE):
+        text(name, "heading", "yaw")(folder)
+    assert read_ble_folder(folder).tx_heading_rad is None
+
+
+def test_anchors_have_numbers_or_names(folder: Path):
+    (folder / "anchors.csv").write_text('id,x,y,z\n"hall, upper",1,2,2.5\n4e10,0,-1,2\n07,3,3,3\nKüche,0,0,1\n')
+    header = 'rssi_4e10, rssi_Küche ,y,x,rssi_7.0,"rssi_hall, upper"'
+    (folder / TRAIN_FILE).write_text(f"{header}\n-1,-2,0,0,-3,-4\n")
+    (folder / TEST_FILE).write_text(f"{header}\n-5,-6,0,0,-7,-8\n")
+    record = read_ble_folder(folder)
+    assert [r.name for r in record.receivers] == ["hall, upper", "4e10", "anchor7", "Küche"]
+    np.testing.assert_array_equal(record.observation, [[-4, -8], [-1, -5], [-3, -7], [-2, -6]])
+
+
+def test_rows_that_no_anchor_received_are_in_no_split(folder: Path):
+    (split,) = make_splits(read_ble_folder(folder), "official")
+    assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1, 3], [4])
+
+
+def text(name: str, old: str, new: str):
+    """Replace the first match of a pattern in a text file."""
+
+    def change(folder: Path) -> None:
+        path = folder / name
+        changed = re.sub(old, new, path.read_text(), count=1, flags=re.MULTILINE)
+        assert changed != path.read_text()
+        path.write_text(changed)
+
+    return change
+
+
+def write(name: str, content: str | bytes):
+    def change(folder: Path) -> None:
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def heights(training: str, test: str):
+    """Add a column z with one text for each file."""
+
+    def change(folder: Path) -> None:
+        for name, value in ((TRAIN_FILE, training), (TEST_FILE, test)):
+            header, *rows = (folder / name).read_text().splitlines()
+            (folder / name).write_text("\n".join([f"z,{header}", *(f"{value},{row}" for row in rows)]) + "\n")
+
+    return change
+
+
+def remove(name: str):
+    return lambda folder: (folder / name).unlink()
+
+
+TRAIN_FILE, TEST_FILE = "calibration_df.csv", "test_robot_df.csv"
+
+
+def deaf(folder: Path) -> None:
+    """Take all that anchor 3 received away."""
+    (folder / TRAIN_FILE).write_text("x,y,heading,rssi_1,rssi_3\n0,0,0,-50,\n1,1,0,-51,nan\n")
+    (folder / TEST_FILE).write_text("x,y,heading,rssi_1,rssi_3\n0,0,0,-50,\n")
+
+
+WRONG = {
+    "deaf anchor": (deaf, TRAIN_FILE, r"rssi_3 is empty in every row, in test_robot_df\.csv too; remove the anchor"),
+    "no anchors file": (remove("anchors.csv"), "anchors.csv", "missing"),
+    "no training rows file": (remove(TRAIN_FILE), TRAIN_FILE, "missing"),
+    "no test rows file": (remove(TEST_FILE), TEST_FILE, "missing"),
+    "empty file": (write(TEST_FILE, ""), TEST_FILE, "empty"),
+    "empty anchors": (write("anchors.csv", ""), "anchors.csv", "empty"),
+    "header alone": (write(TRAIN_FILE, TRAINING.splitlines()[0]), TRAIN_FILE, "no rows below the header"),
+    "not text": (write(TRAIN_FILE, b"\xff\xfe\x00"), TRAIN_FILE, "cannot be read"),
+    "no header": (text(TEST_FILE, r"^ts.*\n", "1,2,3,4,5,6\n"), TEST_FILE, "line 1: header '1,2,3,4,5,6' has no col"),
+    "no column x": (text(TRAIN_FILE, ",x,", ",X,"), TRAIN_FILE, "line 1: header .* has no column x;"),
+    "heading for the test rows alone": (
+        text(TRAIN_FILE, "heading", "yaw"),
+        TRAIN_FILE,
+        r"line 1: no column heading, but test_robot_df\.csv has one; give it in both files or in neither",
+    ),
+    "heading for the training rows alone": (text(TEST_FILE, "heading", "yaw"), TEST_FILE, "no column heading, but cal"),
+    "height of the training rows alone": (text(TRAIN_FILE, "ts", "z"), TEST_FILE, "no column z, but calibration_df"),
+    "NaN height": (heights("0.4", "nan"), TEST_FILE, "row 1: z is 'nan'"),
+    "empty height": (heights("", "1"), TRAIN_FILE, "row 1: z is ''"),
+    "column twice": (text(TRAIN_FILE, "ts", "x"), TRAIN_FILE, "has twice the column x"),
+    "no z of anchors": (text("anchors.csv", "z", "height"), "anchors.csv", "no column z"),
+    "position of words": (text(TRAIN_FILE, "0.25", "here"), TRAIN_FILE, "row 2: x is 'here'; give a finite number"),
+    "NaN position": (text(TRAIN_FILE, "0.25", "nan"), TRAIN_FILE, "row 2: x is 'nan'; give a finite number$"),
+    "empty position": (text(TRAIN_FILE, "0.25", ""), TRAIN_FILE, "row 2: x is ''"),
+    "infinite position": (text(TEST_FILE, ",2,", ",inf,"), TEST_FILE, "row 1: x is 'inf'"),
+    "NaN heading": (text(TRAIN_FILE, "-40.5", "nan"), TRAIN_FILE, "row 2: heading is 'nan'"),
+    "power of words": (text(TRAIN_FILE, "-54.25", "weak"), TRAIN_FILE, "row 1: rssi_1 is 'weak'; .*leave it empty"),
+    "infinite power": (text(TRAIN_FILE, "-54.25", "-inf"), TRAIN_FILE, "row 1: rssi_1 is '-inf'"),
+    "field missing": (text(TRAIN_FILE, ",-60$", ""), TRAIN_FILE, "row 1: 6 fields, but the header has 7"),
+    "field too many": (text(TEST_FILE, ",-81$", ",-81,0"), TEST_FILE, "row 1: 7 fields, but the header has 6"),
+    "blank row": (text(TRAIN_FILE, "^1,", "\n1,"), TRAIN_FILE, "row 2: 0 fields"),
+    "quote left open": (text(TRAIN_FILE, "^1,", '"1,'), TRAIN_FILE, "not a CSV file"),
+    "anchor too few": (
+        text("anchors.csv", "^1,.*\n", ""),
+        TRAIN_FILE,
+        r"2 columns rssi_\*, but anchors.csv has 1 anchors \(rssi_1 belongs to none\)",
+    ),
+    "anchor too many": (
+        text("anchors.csv", "^1", "7,0,0,0\n1"),
+        TRAIN_FILE,
+        r"2 columns rssi_\*, but anchors.csv has 3 anchors \(rssi_7 is missing\)",
+    ),
+    "anchor with another id": (text(TEST_FILE, "rssi_3", "rssi_2"), TEST_FILE, r"rssi_2 belongs to none"),
+    "column of an anchor twice": (text(TRAIN_FILE, "^,ts", "rssi_01,ts"), TRAIN_FILE, "rssi_01 and rssi_1 name one"),
+    "anchor twice": (text("anchors.csv", "^1", "3"), "anchors.csv", "row 2: id '3' gives the name anchor3, as row 1"),
+    "anchor twice in another form": (text("anchors.csv", "^1", "03.0"), "anchors.csv", "row 2: id '03.0' gives the na"),
+    "anchor with the name of a number": (text("anchors.csv", "^1", "anchor3"), "anchors.csv", "row 2: id 'anchor3' gi"),
+    "anchor with half a number": (text("anchors.csv", "^1", "1.5"), "anchors.csv", "row 2: id '1.5' is neither a who"),
+    "anchor without an id": (text("anchors.csv", "^1", " "), "anchors.csv", "row 2: id ' ' is empty"),
+    "anchor of pandas without an id": (text("anchors.csv", "^1", "nan"), "anchors.csv", "row 2: id 'nan' is neither"),
+    "anchor named like a path": (text("anchors.csv", "^1", "../up"), "anchors.csv", r"row 2: id '\.\./up' cannot name"),
+    "anchor named like a Windows path": (text("anchors.csv", "^1", r"a\\b"), "anchors.csv", "row 2: id .* cannot name"),
+    "anchor named like a folder": (text("anchors.csv", "^1", ".."), "anchors.csv", r"row 2: id '\.\.' cannot name a"),
+    "anchor with a tab in it": (text("anchors.csv", "^1", "a\tb"), "anchors.csv", "row 2: id .* does not go into one"),
+    "no ids": (text("anchors.csv", "id", "number"), "anchors.csv", "has no column id"),
+    "NaN anchor": (text("anchors.csv", "-1", "nan"), "anchors.csv", "row 2: y is 'nan'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_line_with_file_and_row(folder: Path, case: str):
+    change, file, message = WRONG[case]
+    change(folder)
+    with pytest.raises(InputError, match=message) as error:
+        read_ble_folder(folder)
+    line = str(error.value)
+    assert "\n" not in line
+    assert str(folder / file) in line
+    assert ";" in line, "no remedy"
+
+
+def test_not_a_folder(tmp_path: Path):
+    with pytest.raises(InputError, match=r"not a folder; give one that holds anchors\.csv"):
+        read_ble_folder(tmp_path / "nothing")
+
+
+@needs_data
+def test_the_real_data():
+    record = load("flat-ble")
+    assert record.observation.shape == (6, 4823)
+    assert record.official is not None
+    assert [len(part) for part in record.official] == [4104, 719]
+    # As NumPy reads the file.
+    table = np.genfromtxt(Path(DATA or "", "flat-ble", TRAIN_FILE), delimiter=",", skip_header=1)
+    np.testing.assert_allclose(record.observation[:, :4104], table[:, 5:].T, atol=FLOAT32)
+    np.testing.assert_array_equal(record.tx_pos_m[:4104, :2], table[:, [2, 4]])
+    missing = np.isnan(record.observation)
+    assert missing.sum(axis=1).tolist() == [162, 267, 253, 444, 591, 630]
+    assert not missing.all(axis=0).any()
+    for split in make_splits(record, "blocked"):
+        assert len(split.test) > 400
+
+
+def with_columns(folder: Path, **columns: list[str]) -> Path:
+    """Add columns to ``anchors.csv``."""
+    lines = (folder / "anchors.csv").read_text().splitlines()
+    rows = [",".join([line, *words]) for line, *words in zip(lines[1:], *columns.values(), strict=True)]
+    (folder / "anchors.csv").write_text("\n".join([",".join([lines[0], *columns]), *rows]) + "\n")
+    return folder
+
+
+def test_antennas_are_read(tmp_path: Path):
+    plain = read_ble_folder(write_flat(tmp_path / "plain"))
+    assert {one.antenna for one in plain.receivers} | {plain.tx_antenna} == {Antenna()}
+    own: dict[str, list[str]] = {"pattern": ["dipole", ""], "polarization": ["", "H"], "tx_polarization": ["H", "H"]}
+    record = read_ble_folder(with_columns(write_flat(tmp_path / "own"), **own))
+    assert [one.antenna for one in record.receivers] == [Antenna("dipole"), Antenna("iso", "H")]
+    assert record.tx_antenna == Antenna("iso", "H")
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"pattern": ["iso", "horn"]}, "row 2: antenna: pattern is 'horn'; choose from"),
+        ({"polarization": ["vertical", "V"]}, "row 1: antenna: polarization is 'vertical'; choose from V, H"),
+        ({"tx_pattern": ["dipole", "iso"]}, "row 2: tx_pattern or tx_polarization differs from row 1"),
+    ],
+)
+def test_wrong_antennas_are_refused(tmp_path: Path, columns: dict[str, list[str]], message: str):
+    with pytest.raises(InputError, match=rf"anchors\.csv: {message}"):
+        read_ble_folder(with_columns(write_flat(tmp_path / "flat"), **columns))
+
+
+def with_noise(folder: Path) -> Path:
+    """State readings and noise of all that the anchors of ``folder`` received."""
+    counts = {TRAIN_FILE: ["4,2", ",1", "0,", "9,nan"], TEST_FILE: ["3,16"]}
+    stds = {TRAIN_FILE: ["0.5,1.5", ",2", ",", "0.25,"], TEST_FILE: ["1,1"]}
+    for name in counts:
+        header, *rows = (folder / name).read_text().splitlines()
+        rows = [",".join(parts) for parts in zip(rows, counts[name], stds[name], strict=True)]
+        (folder / name).write_text("\n".join([f"{header},count_1,count_3,std_1,std_3", *rows]) + "\n")
+    return folder
+
+
+def test_readings_and_noise_are_read_where_something_was_received(folder: Path):
+    plain = read_ble_folder(folder)
+    assert (plain.n_readings, plain.std, plain.precision(np.arange(5))) == (None, None, None)
+    record = read_ble_folder(with_noise(folder))
+    np.testing.assert_array_equal(record.n_readings, [[2, 1, 0, 0, 16], [4, 0, 0, 9, 3]])
+    np.testing.assert_array_equal(record.std, [[1.5, 2, np.nan, np.nan, 1], [0.5, np.nan, np.nan, 0.25, 1]])
+    np.testing.assert_array_equal(record.observation, plain.observation)
+
+
+def test_precision_is_the_inverse_of_the_variance(folder: Path):
+    record = read_ble_folder(with_noise(folder))
+    # The median of 1.5, 2, 0.5 and 0.25 is 1; rows that were not received, and the test row, do not count.
+    expected = [[1.5**-2, 2**-2, 1, 1], [0.5**-2, 1, 1, 0.25**-2]]
+    np.testing.assert_allclose(record.precision(np.arange(4)), expected)
+    of_means = replace(record, std=None)
+    np.testing.assert_array_equal(of_means.precision(np.arange(4)), [[2, 1, 1, 1], [4, 1, 1, 9]])
+
+
+WRONG_NOISE = {
+    "readings of one anchor": ("count_3", "number", TRAIN_FILE, r"line 1: no column count_3; give one for every anch"),
+    "half a reading": ("4,2,0.5", "4,2.5,0.5", TRAIN_FILE, r"row 1: count_3 is '2\.5', .*number of readings, 1 to"),
+    "more readings than there are": (
+        "4,2,0.5",
+        "4,1e30,0.5",
+        TRAIN_FILE,
+        r"row 1: count_3 is .1e30., .*1 to a million",
+    ),
+    "negative": ("4,2,0.5", "4,-2,0.5", TRAIN_FILE, "row 1: count_3 is '-2', where rssi_3 is known"),
+    "no reading": ("4,2,0.5", "4,0,0.5", TRAIN_FILE, "row 1: count_3 is '0', where rssi_3 is known"),
+    "no noise": ("4,2,0.5", "4,2,0", TRAIN_FILE, r"row 1: std_1 is '0', where rssi_1 is known; give the noise in dB"),
+    "unknown noise": ("4,2,0.5", "4,2,", TRAIN_FILE, "row 1: std_1 is '', where rssi_1 is known"),
+    "readings of nothing": ("0,,,", "5,,,", TRAIN_FILE, "row 3: count_1 is '5', but rssi_1 is empty; leave it empty"),
+    "noise of words": ("3,16,1,1", "3,16,much,1", TEST_FILE, "row 1: std_1 is 'much'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_NOISE)
+def test_wrong_readings_and_noise_are_refused(folder: Path, case: str):
+    old, new, name, message = WRONG_NOISE[case]
+    text(name, old, new)(with_noise(folder))
+    with pytest.raises(InputError, match=message) as error:
+        read_ble_folder(folder)
+    assert str(folder / name) in str(error.value)
+
+
+def test_readings_stated_in_one_file_are_refused(folder: Path):
+    with_noise(folder)
+    (folder / TEST_FILE).write_text(TEST)
+    with pytest.raises(InputError, match=rf"{TEST_FILE}: line 1: no column count_3; .* in both files, or none"):
+        read_ble_folder(folder)
+
+
+def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
+    own = read_ble_folder(with_noise(with_columns(folder, pattern=["", "dipole"], tx_polarization=["H", "H"])))
+    named = tuple(
+        replace(one, name=name) for one, name in zip(own.receivers, ("hall, upper", "anchorage"), strict=True)
+    )
+    for record in (own, replace(own, receivers=named, n_readings=None, tx_heading_rad=None)):
+        again = read_ble_folder(write_ble_folder(tmp_path / record.receivers[0].name, record), own.name)
+        for one in fields(Record):
+            if one.name not in ("receivers", "source"):
+                np.testing.assert_equal(getattr(again, one.name), getattr(record, one.name), one.name)
+        for one, other in zip(again.receivers, record.receivers, strict=True):
+            np.testing.assert_equal(vars(one), vars(other))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"official": None}, "it needs signal strengths with an official split"),
+        ({"official": (np.arange(4), np.arange(4))}, "each row must be in one part of the official split"),
+        ({"frequencies_hz": None}, r"its carrier is not known; set Record\.frequencies_hz"),
+        ({"folds": np.zeros(5, int)}, "has folds, which this layout does not state; set Record.folds to None"),
+        ({"tx_pos_m": np.full((5, 3), np.nan)}, "a position, heading or signal strength is not finite"),
+        ({"name of a receiver": "anchor03"}, r"receiver 'anchor03' would be read as another; rename it"),
+        ({"name of a receiver": "a/b"}, r"receiver 'a/b' cannot name a file; rename it"),
+        ({"array_m": np.zeros((1, 3))}, "receiver anchor3: it states no array"),
+    ],
+)
+def test_what_the_layout_does_not_state_is_not_written(folder: Path, change: dict, message: str, tmp_path: Path):
+    record = read_ble_folder(folder)
+    first = record.receivers[0]
+    if "name of a receiver" in change:
+        change = {"receivers": (replace(first, name=change["name of a receiver"]), record.receivers[1])}
+    if "array_m" in change:
+        change = {"receivers": (replace(first, **change), record.receivers[1])}
+    with pytest.raises(InputError, match=message):
+        write_ble_folder(tmp_path / "new", replace(record, **change))
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_carrier_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
+    record, carriers = read_ble_folder(folder), np.array([2.402e9, 2.426e9, 2.48e9, 2.402e9, 2.48e9])
+    for own in (record.at_carriers(carriers), record.at_carrier(868e6), record):
+        again = read_ble_folder(write_ble_folder(tmp_path / "again", own, replace=True))
+        np.testing.assert_equal(again.carriers_hz, own.carriers_hz)
+        np.testing.assert_equal(again.frequencies_hz, own.frequencies_hz)
+    text(TEST_FILE, "ts", "frequency_hz")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: line 1: no column frequency_hz, but {TEST_FILE} has one"):
+        read_ble_folder(folder)
+    text(TRAIN_FILE, ",ts", ",frequency_hz")(folder)
+    text(TRAIN_FILE, "^1,1.6e18", "1,0")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: row 2: frequency_hz is 0; give the carrier"):
+        read_ble_folder(folder)

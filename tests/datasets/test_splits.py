@@ -1,0 +1,236 @@
+"""Splits: every row once, seeded, nested, stored; and the errors."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.cluster.vq import kmeans2
+
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.datasets import load_split, make_splits, save_split
+from wrf_mi.datasets.splits import position_folds
+
+RULES = ("official", "random", "blocked", "trajectory")
+
+
+def make_record(rows: int = 50, folds: bool = True) -> Record:
+    """Any task will do: here one number per receiver and row."""
+    rng = np.random.default_rng(3)
+    blobs = np.arange(rows) * 5 // rows
+    order = rng.permutation(rows)
+    return Record(
+        name="made-up",
+        task="rssi",
+        tx_pos_m=np.stack([10.0 * blobs, np.zeros(rows), np.zeros(rows)], axis=-1) + rng.uniform(-1, 1, (rows, 3)),
+        receivers=(Receiver("gateway1", np.zeros(3), np.array([0.0, 0, 0, 1])),),
+        observation=np.zeros((1, rows), np.float32),
+        official=(order[rows // 4 :], order[: rows // 4]),
+        folds=blobs if folds else None,
+    )
+
+
+def assert_partition(split: Split, rows: int, all_rows: bool = True) -> None:
+    parts = [split.train, split.validation, split.test]
+    together = np.concatenate(parts)
+    assert len(np.unique(together)) == len(together), "a row is used twice"
+    assert set(together.tolist()) <= set(range(rows))
+    assert not all_rows or len(together) == rows
+    for part in parts:
+        assert part.dtype == np.int64
+        assert (np.diff(part) > 0).all(), "rows are not sorted"
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("folds", [True, False])
+def test_every_row_has_one_place(rule: str, folds: bool):
+    for split in make_splits(make_record(folds=folds), rule, seed=1):
+        assert_partition(split, 50)
+
+
+def test_rules():
+    record = make_record()
+    (official,) = make_splits(record, "official")
+    np.testing.assert_array_equal(official.test, np.sort(record.official[1]))
+    np.testing.assert_array_equal(official.all_train, np.sort(record.official[0]))
+    (random,) = make_splits(record, "random", seed=4)
+    assert (len(random.all_train), len(random.test)) == (40, 10)
+    (trajectory,) = make_splits(record, "trajectory", seed=4)
+    assert trajectory.test.tolist() == list(range(40, 50))
+    assert trajectory.all_train.tolist() == list(range(40))
+    blocked = make_splits(record, "blocked")
+    assert [split.name for split in blocked] == [f"blocked:{k}" for k in range(5)]
+    for k, split in enumerate(blocked):
+        np.testing.assert_array_equal(split.test, np.flatnonzero(record.folds == k))
+    (second,) = make_splits(record, "blocked:2")
+    assert second.name == "blocked:2"
+    np.testing.assert_array_equal(second.test, blocked[2].test)
+    np.testing.assert_array_equal(second.validation, blocked[2].validation)
+
+
+def test_blocks_without_a_folds_file_are_the_clusters_of_positions():
+    record = make_record()
+    found = {tuple(split.test.tolist()) for split in make_splits(replace(record, folds=None), "blocked")}
+    expected = {tuple(np.flatnonzero(record.folds == k).tolist()) for k in range(5)}
+    assert found == expected
+
+
+def test_blocks_are_the_tightest_of_several_starts():
+    """Of clusters that could be cut in many ways, ours is among the tightest quarter."""
+    positions = np.random.default_rng(2).uniform(size=(300, 3))
+    record = replace(make_record(300), tx_pos_m=positions, folds=None)
+
+    def spread(labels: np.ndarray) -> float:
+        return sum(positions[labels == k].var(axis=0).sum() * (labels == k).sum() for k in range(5))
+
+    starts = [spread(kmeans2(positions, 5, iter=50, minit="++", rng=seed)[1]) for seed in range(100, 130)]
+    assert spread(position_folds(record)) <= np.percentile(starts, 25)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_rows_that_no_receiver_received_are_left_out(rule: str):
+    record = make_record()
+    observation = np.repeat(record.observation, 2, axis=0)
+    observation[:, [3, 17, 40]] = np.nan
+    observation[0, 20:30] = np.nan  # received by the other
+    heard = replace(record, receivers=record.receivers * 2, observation=observation)
+    used = [np.concatenate([split.all_train, split.test]) for split in make_splits(heard, rule)]
+    for rows in used:
+        assert sorted(rows.tolist()) == [row for row in range(50) if row not in (3, 17, 40)]
+
+
+def test_a_part_that_was_not_received_at_all_is_refused():
+    record = make_record()
+    observation = record.observation.copy()
+    observation[:, record.folds == 2] = np.nan
+    deaf = replace(record, observation=observation)
+    with pytest.raises(InputError, match="split blocked:2: no row that was received scores; use another split"):
+        make_splits(deaf, "blocked")
+    assert len(make_splits(deaf, "blocked:1")[0].test) == 10
+    observation[:] = np.nan
+    with pytest.raises(InputError, match="0 rows"):
+        make_splits(deaf, "random")
+    with pytest.raises(InputError, match="split official: no row that was received trains"):
+        make_splits(deaf, "official")
+
+
+def test_seed_decides():
+    record = make_record(200, folds=False)
+    for rule in ("random", "trajectory"):
+        again, same, other = (make_splits(record, rule, seed=seed)[0] for seed in (5, 5, 6))
+        np.testing.assert_array_equal(again.validation, same.validation)
+        assert set(again.validation.tolist()) != set(other.validation.tolist())
+    one, two = (make_splits(record, "random", seed=seed)[0] for seed in (5, 6))
+    assert set(one.test.tolist()) != set(two.test.tolist())
+    # The blocks belong to the data: no seed moves them.
+    for ours, theirs in zip(
+        make_splits(record, "blocked", seed=5), make_splits(record, "blocked", seed=6), strict=True
+    ):
+        np.testing.assert_array_equal(ours.test, theirs.test)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(5, 120),
+    smaller=st.integers(1, 100),
+    larger=st.integers(1, 100),
+    fraction=st.sampled_from([0, 0.1, 0.15, 0.5, 0.9]),
+    seed=st.integers(0, 2**32 - 1),
+    rule=st.sampled_from(["official", "random", "trajectory"]),
+)
+def test_subsets_are_nested_validation_included(rows, smaller, larger, fraction, seed, rule):
+    record = make_record(rows)
+    whole = make_splits(record, rule, seed, validation_fraction=fraction)[0]
+    available = len(whole.all_train)
+    smaller, larger = sorted((min(smaller, available), min(larger, available)))
+    few, many = (make_splits(record, rule, seed, n, fraction)[0] for n in (smaller, larger))
+    for split, count in ((few, smaller), (many, larger)):
+        assert_partition(split, rows, all_rows=False)
+        assert len(split.all_train) == count
+        assert len(split.train) >= 1
+        assert len(split.validation) == int(np.ceil(round((count - 1) * fraction, 9)))
+        np.testing.assert_array_equal(split.test, whole.test)
+    assert set(few.train.tolist()) <= set(many.train.tolist()) <= set(whole.train.tolist())
+    assert set(few.validation.tolist()) <= set(many.validation.tolist()) <= set(whole.validation.tolist())
+
+
+def test_fractions_count_from_the_rows_of_each_split():
+    record = make_record(100)
+    assert len(make_splits(record, "random", n_train=0.25)[0].all_train) == 20
+    assert len(make_splits(record, "random", n_train=1.0)[0].all_train) == 80
+    assert len(make_splits(record, "random", n_train=1)[0].all_train) == 1
+    assert len(make_splits(record, "random")[0].validation) == 8
+    assert len(make_splits(record, "random", validation_fraction=0)[0].validation) == 0
+    # 30 * 0.1 is a little above 3 in floating point.
+    assert len(make_splits(record, "random", n_train=31)[0].validation) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": "authors"}, "'authors': unknown"),
+        ({"name": "random:2"}, "'random:2': unknown"),
+        ({"name": ""}, "unknown"),
+        ({"name": "blocked:5"}, "no such fold.*blocked:0 to blocked:4"),
+        ({"name": "blocked:"}, "no such fold"),
+        ({"name": "blocked:-1"}, "no such fold"),
+        ({"name": "random", "n_train": 0}, "n_train 0; choose 1 to 40 rows"),
+        ({"name": "random", "n_train": 41}, "n_train 41; choose 1 to 40 rows"),
+        ({"name": "random", "n_train": 1.5}, "n_train 1.5"),
+        ({"name": "random", "n_train": float("nan")}, "n_train nan"),
+        ({"name": "random", "n_train": 1e-9}, "n_train 1e-09"),
+        ({"name": "random", "seed": -1}, "seed -1"),
+        ({"name": "random", "validation_fraction": 1.0}, "validation fraction"),
+    ],
+)
+def test_bad_arguments(arguments: dict, message: str):
+    with pytest.raises(InputError, match=message) as error:
+        make_splits(make_record(), **arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_records_that_cannot_follow_a_rule():
+    with pytest.raises(InputError, match="no official split"):
+        make_splits(replace(make_record(), official=None), "official")
+    with pytest.raises(InputError, match="4 distinct positions"):
+        make_splits(make_record(4, folds=False), "blocked")
+    with pytest.raises(InputError, match="2 rows"):
+        make_splits(make_record(2), "trajectory")
+
+
+def test_a_split_is_stored_with_arrays_only(tmp_path: Path):
+    (split,) = make_splits(make_record(), "blocked:1", seed=8)
+    path = tmp_path / "run" / "split.npz"
+    save_split(path, split)
+    read = load_split(path)
+    assert (read.name, read.seed) == ("blocked:1", 8)
+    for part in ("train", "validation", "test"):
+        np.testing.assert_array_equal(getattr(read, part), getattr(split, part))
+    assert [entry.name for entry in path.parent.iterdir()] == ["split.npz"]
+    with np.load(path, allow_pickle=False) as file:
+        assert sorted(file) == ["format", "name", "seed", "test", "train", "validation"]
+
+
+def test_bad_split_files(tmp_path: Path):
+    path = tmp_path / "split.npz"
+    with pytest.raises(InputError, match="missing"):
+        load_split(path)
+    path.write_text("no npz")
+    with pytest.raises(InputError, match="not a split file"):
+        load_split(path)
+    np.savez(path, train=np.arange(3))
+    with pytest.raises(InputError, match="not a split file"):
+        load_split(path)
+    rows = np.arange(3)
+    head = {"format": 1, "name": "a", "seed": 0, "train": rows}
+    for wrong, message in (
+        ({"validation": rows, "test": rows + 3}, "twice"),
+        ({"validation": rows + 3, "test": rows - 9}, "whole numbers"),
+        ({"validation": rows + 3.5, "test": rows + 9}, "whole numbers"),
+        ({"validation": rows + 3, "test": rows + 9, "format": 2}, "format 2, not 1"),
+    ):
+        np.savez(path, **{**head, **wrong})
+        with pytest.raises(InputError, match=message):
+            load_split(path)

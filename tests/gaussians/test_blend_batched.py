@@ -1,0 +1,97 @@
+"""Splatting of transmitters that share one geometry against splatting each with a geometry of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from wrf_mi.core import Receiver
+from wrf_mi.gaussians import (
+    Encoding,
+    Factorised,
+    Gaussians,
+    WrfGs,
+    WrfGsPlus,
+    random_gaussians,
+    tiles,
+)
+from wrf_mi.gaussians.blend_batched import GROUP, group_of
+from wrf_mi.gaussians.footprint import Pose
+from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.tiles import perception_plane
+
+pytestmark = pytest.mark.all_threads
+
+Float64 = dr.float64_array_t(mi.Float)
+Tensor64 = dr.tensor_t(Float64)
+SIZE = 23, 61
+"""No whole number of tiles either way."""
+TOLERANCE = 1e-12
+"""Float64 sums of 60 Gaussians, and of as many pixels, in another order."""
+RECEIVER = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0.0, 0.8]))
+ENCODING = Encoding(2, 4.0, 2, 1.0)
+FIELDS: dict[str, Any] = {
+    "wrf-gs": WrfGs(ENCODING, layers=2, width=16, signal_widths=(16, 8)),
+    "wrf-gs+": WrfGsPlus(ENCODING, layers=2, width=16, skip=1, still=True),
+    "factorised": Factorised(ENCODING, terms=4, layers=1, width=16),
+}
+
+
+def pose() -> Pose:
+    return Pose([Float64(x) for x in RECEIVER.position_m], [[Float64(x) for x in row] for row in RECEIVER.to_world])
+
+
+def drawn(name: str, batch: int) -> tuple[dict[str, Any], Any]:
+    rng = np.random.default_rng(0)
+    weights = FIELDS[name].init(random_gaussians([RECEIVER], 60, rng, size_deg=12.0), rng)
+    weights["rotation"] = rng.standard_normal(weights["rotation"].shape)
+    weights["log_scale"] = weights["log_scale"] + rng.normal(0, 0.3, weights["log_scale"].shape)
+    params = {key: Tensor64(np.asarray(value, float)) for key, value in weights.items()}
+    return params, Tensor64(rng.standard_normal((3, batch)))
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("batch", [2, 5, 8])
+def test_one_geometry_serves_all_transmitters(name: str, batch: int) -> None:
+    """Spectra, and derivatives by every parameter; batches of half a group, of a prime number, of two groups."""
+    plane, rng = perception_plane(*SIZE, Float64), np.random.default_rng(3)
+    weight = [Float64(rng.standard_normal(batch * plane.pixels)) for _ in range(2)]
+    images, slopes = [], []
+    for spread in (False, True):
+        params, tx_pos = drawn(name, batch)
+        dr.enable_grad(params)
+        gaussians: Gaussians = FIELDS[name].gaussians(params, tx_pos)
+        assert gaussians.shared
+        gaussians = gaussians.spread() if spread else gaussians
+        assert gaussians.shared != spread
+        re, im = splat(gaussians, pose(), plane)
+        dr.backward(dr.sum(re * weight[0] + im * weight[1]))
+        images.append(np.concatenate([re.numpy(), im.numpy()]))
+        slopes.append({key: dr.grad(p).numpy().copy() for key, p in params.items()})
+    np.testing.assert_allclose(*images, atol=TOLERANCE * np.abs(images[1]).max())
+    for key, expected in slopes[1].items():
+        np.testing.assert_allclose(slopes[0][key], expected, atol=TOLERANCE * np.abs(expected).max(), err_msg=key)
+        assert expected.any(), key
+
+
+def test_lists_that_were_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Large fields have lists with as much room as they need; they serve all groups of transmitters too."""
+    plane, images = perception_plane(*SIZE, Float64), []
+    params, tx_pos = drawn("factorised", 8)
+    gaussians = FIELDS["factorised"].gaussians(params, tx_pos)
+    for reserved in (tiles.RESERVED, 1):
+        monkeypatch.setattr(tiles, "RESERVED", reserved)
+        images.append(splat(gaussians, pose(), plane)[0].numpy())
+    np.testing.assert_array_equal(*images)
+    assert images[0].any()
+
+
+def test_groups_divide_the_batch() -> None:
+    sizes = [group_of(batch) for batch in range(1, 13)]
+    assert sizes == [1, 2, 3, 4, 1, 3, 1, 4, 3, 2, 1, 4]
+    assert max(sizes) == GROUP

@@ -1,0 +1,128 @@
+"""What is done in parts is what is done at once: lists of tiles, networks of many Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import fields as fields_of
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from made_spectra import RECEIVERS, SIZE, true_field
+
+from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.core import InputError
+from wrf_mi.gaussians import (
+    FIELDS,
+    Gaussians,
+    random_gaussians,
+    tiles,
+)
+from wrf_mi.gaussians.chunks import gaussians_in_parts
+from wrf_mi.gaussians.footprint import depth_order, project
+from wrf_mi.gaussians.operator import weight_strips
+from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
+from wrf_mi.training import step
+from wrf_mi.training.predictor import Predictor
+from wrf_mi.training.step import device_pose
+
+pytestmark = pytest.mark.all_threads
+
+ROUNDING = 1e-5
+"""Float32: matrix products add in another order for another number of columns; the same formula else."""
+
+
+def gaussians(batch: int, count: int, size: float) -> Gaussians:
+    rng = np.random.default_rng(3)
+    return Gaussians(
+        position=[to_float(x) for x in rng.normal(0, 2, (3, count))],
+        scale=[mi.Float(np.full(batch * count, size, np.float32)) for _ in range(3)],
+        rotation=[to_float(x) for x in rng.normal(size=(4, batch * count))],
+        signal=[to_float(x) for x in rng.normal(size=(2, batch * count))],
+        opacity=to_float(rng.uniform(0, 0.9, batch * count)),
+        attenuation=None,
+        batch=batch,
+    )
+
+
+def members(lists: TileLists, n: int) -> list[list[int]]:
+    index, length = lists.index.numpy(), lists.length.numpy()
+    start = lists.begin(dr.arange(mi.UInt32, len(length)), n).numpy()
+    return [index[a : a + b].tolist() for a, b in zip(start, length, strict=True)]
+
+
+@pytest.mark.parametrize("by_box", [True, False])
+@pytest.mark.parametrize("size", [0.02, 0.4])
+def test_counted_lists_are_the_reserved_ones(monkeypatch: pytest.MonkeyPatch, size: float, by_box: bool):
+    """A plane whose last tiles stick out, three transmitters, Gaussians below the horizon and across the seam."""
+    batch, count, pose, plane = 3, 60, device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
+    field = gaussians(batch, count, size)
+    footprints = project(field, pose)
+    order = depth_order(footprints.depth, field.position)
+    reserved = build_lists(footprints, order, plane, batch, by_box)
+    monkeypatch.setattr(tiles, "RESERVED", 0)
+    counted = build_lists(footprints, order, plane, batch, by_box)
+    assert reserved.start is None
+    assert counted.start is not None
+    assert members(counted, count) == members(reserved, count)
+    room = dr.width(counted.index)
+    assert room == int(counted.length.numpy().sum())
+    assert room < dr.width(reserved.index) or not by_box
+
+
+def test_nothing_in_any_tile(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(tiles, "RESERVED", 0)
+    field = gaussians(1, 5, 1e-3)
+    field.position = [mi.Float(0, 0.1, 0.2, 0, 0), mi.Float(0), dr.full(mi.Float, -3, 5)]
+    footprints = project(field, device_pose(RECEIVERS[0]))
+    footprints.visible = dr.zeros(mi.Bool, 5)
+    lists = build_lists(footprints, dr.arange(mi.UInt32, 5), perception_plane(*SIZE, mi.Float), 1)
+    assert not lists.length.numpy().any()
+
+
+def test_operator_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
+    """Its strips are planes of a row of tiles each."""
+    field, pose, plane = gaussians(1, 60, 0.3), device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
+    whole = [part.toarray() for _, part in weight_strips(field, pose, plane)]
+    monkeypatch.setattr(tiles, "RESERVED", 0)
+    counted = [part.toarray() for _, part in weight_strips(field, pose, plane)]
+    np.testing.assert_array_equal(np.concatenate(counted), np.concatenate(whole))
+    assert np.concatenate(whole).any()
+
+
+def test_lists_that_32_bits_cannot_count():
+    """Refused before anything is reserved."""
+    with pytest.raises(InputError, match="splatting: 4294967296 entries"):
+        tiles._checked(2**32)
+    assert tiles._checked(2**32 - 1) == 2**32 - 1
+
+
+@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_networks_in_parts(model: str, batch: int):
+    field = FIELDS[model]()
+    rng = np.random.default_rng(0)
+    start = random_gaussians([RECEIVERS[0]], 23, rng)
+    params = {name: to_tensor(values) for name, values in field.init(start, rng).items()}
+    tx = to_tensor(rng.normal(size=(3, batch)))
+    whole, parts = field.gaussians(params, tx), gaussians_in_parts(field, params, tx, 7 * batch)
+    assert (parts.count, parts.batch) == (23, batch)
+    for one in fields_of(Gaussians):
+        if one.name == "batch" or getattr(whole, one.name) is None:
+            assert getattr(parts, one.name) == getattr(whole, one.name)
+            continue
+        for a, b in zip(*(np.atleast_2d(np.array(getattr(g, one.name))) for g in (parts, whole)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_predictions_of_many_gaussians(monkeypatch: pytest.MonkeyPatch):
+    """Above a number of Gaussians nothing is recorded, networks see parts, lists are counted; spectra are the same."""
+    field, params = true_field("wrf-gs+")
+    tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
+    recorded = Predictor(field, params, RECEIVERS, *SIZE)
+    expected = recorded(tx)
+    monkeypatch.setattr(step, "AT_ONCE", 1)
+    monkeypatch.setattr(tiles, "RESERVED", 0)
+    parts = Predictor(field, params, RECEIVERS, *SIZE)
+    np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
+    assert parts._predict.n_recordings == 0 < recorded._predict.n_recordings

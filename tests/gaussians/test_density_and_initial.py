@@ -1,0 +1,415 @@
+"""Density control between two steps, and where Gaussians start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import kstest
+
+from wrf_mi.backend.device import to_float
+from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix
+from wrf_mi.gaussians import gaussians_from_points, random_gaussians
+from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, logit, reset_opacity
+from wrf_mi.scene.points import read_points
+from wrf_mi.training.state import FitState
+
+SPLIT_RAD = np.radians(5.0)
+LEAST_OPACITY = 0.005
+FLOAT32_EPS = 1e-6
+"""Relative rounding of one or two float32 operations, with room."""
+SMALLEST_P = 1e-3
+"""Level of the tests on drawn samples. The seeds are fixed: a pass stays a pass."""
+
+
+def sigmoid(x: Any) -> Any:
+    return 1 / (1 + np.exp(-np.asarray(x, float)))
+
+
+def made_up(n: int, seed: int = 0, opacity: bool = True) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    parameters = {
+        "position": rng.normal(0, 3, (3, n)),
+        "log_scale": rng.normal(-2, 0.5, (3, n)),
+        "rotation": rng.standard_normal((4, n)),
+        "signal": rng.standard_normal((2, n)),
+    }
+    if opacity:
+        parameters["opacity"] = rng.uniform(-3, 3, (1, n))
+    return {name: values.astype(np.float32) for name, values in parameters.items()}
+
+
+def one_round(parameters: dict[str, np.ndarray], urge: Any, **changes: Any) -> DensityChange:
+    n = parameters["position"].shape[1]
+    arguments = {
+        "distance_m": np.ones(n),
+        "rng": np.random.default_rng(1),
+        "grow": 0.25,
+        "most": 10 * n,
+        "split_rad": SPLIT_RAD,
+        "least_opacity": LEAST_OPACITY,
+    }
+    return adapt(parameters, np.asarray(urge, float), **(arguments | changes))
+
+
+def test_small_ones_are_cloned_and_large_ones_split() -> None:
+    parameters = made_up(8)
+    parameters["log_scale"][:] = np.log(0.01)
+    parameters["log_scale"][1, 5] = np.log(0.5)  # one axis is enough
+    urge = [1, 9, 2, 3, 4, 8, 5, 6]
+    change = one_round(parameters, urge)
+    assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
+    # The two that ask most, 1 and 5, stand once more behind the old ones.
+    np.testing.assert_array_equal(change.source, [0, 1, 2, 3, 4, 5, 6, 7, 1, 5])
+    # A clone's original goes on; both parts of a split one are new.
+    np.testing.assert_array_equal(np.flatnonzero(change.fresh), [5, 8, 9])
+    for name, values in change.parameters.items():
+        for part, old in ((1, 1), (8, 1), (5, 5), (9, 5)):
+            if name == "opacity":
+                # Two of these let through what one of the old let through.
+                passed = (1 - sigmoid(values[0, part])) ** 2
+                np.testing.assert_allclose(passed, 1 - sigmoid(parameters[name][0, old]), rtol=FLOAT32_EPS)
+            elif name == "position" and old == 5:
+                assert not np.array_equal(values[:, part], parameters[name][:, old])
+            elif name == "log_scale" and old == 5:
+                shrunk = np.exp(parameters[name][:, old] - values[:, part])
+                np.testing.assert_allclose(shrunk, SPLIT_SHRINK, rtol=FLOAT32_EPS)
+            else:
+                np.testing.assert_array_equal(values[:, part], parameters[name][:, old])
+
+
+def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
+    """The same Gaussian is split near the receiver and cloned far from it."""
+    parameters = made_up(2)
+    parameters["log_scale"][:] = np.log(0.2)
+    change = one_round(parameters, [1.0, 1.0], distance_m=np.array([1.0, 10.0]), grow=1.0)
+    assert (change.cloned, change.split) == (1, 1)
+    np.testing.assert_array_equal(np.flatnonzero(change.fresh), [0, 2, 3])
+
+
+def test_parts_of_a_split_one_are_drawn_from_it() -> None:
+    """In the Gaussian's own axes the parts lie as its density: each coordinate over its scale is standard normal."""
+    n = 400
+    parameters = made_up(n)
+    parameters["log_scale"][:] = np.log([[0.3], [1.0], [3.0]])
+    change = one_round(parameters, np.ones(n), grow=1.0)
+    assert change.split == n
+    moved = (change.parameters["position"] - parameters["position"][:, change.source]).T
+    own = np.einsum("nij,ni->nj", rotation_matrix(parameters["rotation"][:, change.source].T), moved)
+    for axis, scale in enumerate((0.3, 1.0, 3.0)):
+        assert kstest(own[:, axis] / scale, "norm").pvalue > SMALLEST_P
+
+
+def test_faint_and_unseen_ones_are_pruned() -> None:
+    parameters = made_up(5)
+    parameters["opacity"][0] = [0, logit(LEAST_OPACITY) - 0.1, logit(LEAST_OPACITY) + 0.1, 0, 0]
+    change = one_round(parameters, [1, 1, 1, 0, 1], grow=0.0)
+    assert change.pruned == 2
+    np.testing.assert_array_equal(change.source, [0, 2, 4])
+    # Without opacities (product blending) only those that no pixel saw go.
+    change = one_round(made_up(5, opacity=False), [1, 1, 1, 0, 1], grow=0.0)
+    np.testing.assert_array_equal(change.source, [0, 1, 2, 4])
+
+
+@pytest.mark.parametrize("opacity", [True, False])
+def test_a_field_never_becomes_empty(opacity: bool) -> None:
+    parameters = made_up(4, opacity=opacity)
+    if opacity:
+        parameters["opacity"][0] = [-20, -19, -18, -19]
+    change = one_round(parameters, np.zeros(4))
+    assert change.parameters["position"].shape == (3, 1)
+    assert change.source[0] == (2 if opacity else 0)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    n=st.integers(1, 30),
+    most=st.integers(1, 40),
+    grow=st.floats(0, 1),
+    seed=st.integers(0, 1000),
+    opacity=st.booleans(),
+)
+def test_what_every_round_keeps(n: int, most: int, grow: float, seed: int, opacity: bool) -> None:
+    parameters = made_up(n, seed, opacity)
+    before = {name: values.copy() for name, values in parameters.items()}
+    rng = np.random.default_rng(seed)
+    urge, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
+    change = one_round(parameters, urge, distance_m=distance, most=most, grow=grow)
+    count = len(change.source)
+    assert count >= 1
+    # Growth ends at the most; a field that is larger to begin with is not cut.
+    assert count <= max(most, n - change.pruned)
+    assert count == n - change.pruned + change.cloned + change.split
+    assert change.cloned + change.split <= round(grow * (n - change.pruned))
+    assert change.fresh.sum() == change.cloned + 2 * change.split
+    for name, values in change.parameters.items():
+        assert values.shape == (before[name].shape[0], count)
+        assert values.dtype == np.float32
+        np.testing.assert_array_equal(parameters[name], before[name])  # the old set is left as it was
+        # What is left is as it was; only the opacity of a clone's original has changed.
+        old = ~change.fresh
+        if name == "opacity":
+            old &= np.bincount(change.source, minlength=n)[change.source] == 1
+        np.testing.assert_array_equal(values[:, old], before[name][:, change.source[old]])
+
+
+def test_opacity_reset() -> None:
+    before = np.float32([[-9.0, logit(0.05), 0.0, 5.0]])
+    after = reset_opacity(before, 0.05)
+    np.testing.assert_allclose(after, [[-9.0, logit(0.05), logit(0.05), logit(0.05)]], rtol=FLOAT32_EPS)
+    assert after.dtype == np.float32
+
+
+def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
+    """A state after three steps with gradients that are not zero, a network's weight among its parameters."""
+    parameters = {"net.bias": np.zeros((4, 1), np.float32)} | made_up(n)
+    parameters["log_scale"][:] = np.log(1e-3)
+    parameters["log_scale"][:, 4:5] = 0.0  # large enough to be split
+    state = FitState(parameters)
+    state.adam.set_learning_rate(0.1)
+    for _ in range(3):
+        dr.backward(sum(dr.sum(dr.square(p.array + 1)) for p in state.adam.values()))
+        state.adam.step()
+    state.mean = {name: mi.TensorXf(values + 7) for name, values in state.params().items()}
+    state.urge, state.urge_steps = to_float(np.arange(n)), 3
+    return state, state.params()
+
+
+def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
+    n = 6
+    state, before = trained_state(n)
+    first, second, count = state.moments()
+    assert count == 3
+    assert all(m.any() and v.any() for m, v in zip(first.values(), second.values(), strict=True))
+    own = {name: values for name, values in before.items() if name != "net.bias"}
+    change = one_round(own, [0, 1, 2, 3, 9, 8], grow=0.4)
+    assert (change.cloned, change.split, change.pruned) == (1, 1, 1)
+    mean = state.mean_params()
+    state.change_density(change)
+    assert state.gaussians == 7
+    new_first, new_second, new_count = state.moments()
+    new_mean = state.mean_params()
+    assert new_count == 3  # Adam's bias correction goes on for all
+    for name, values in change.parameters.items():
+        np.testing.assert_array_equal(state.params()[name], values)
+        for new, old in ((new_first, first), (new_second, second)):
+            assert not new[name][:, change.fresh].any()
+            np.testing.assert_array_equal(new[name][:, ~change.fresh], old[name][:, change.source[~change.fresh]])
+        new = change.fresh.copy()
+        if name == "opacity":  # that of the clone's original has changed with the clone's
+            new |= np.bincount(change.source, minlength=n)[change.source] == 2
+            assert new.sum() == change.fresh.sum() + 1
+        np.testing.assert_array_equal(new_mean[name][:, new], values[:, new])
+        np.testing.assert_array_equal(new_mean[name][:, ~new], mean[name][:, change.source[~new]])
+    for new, old in ((new_first, first), (new_second, second), (state.params(), before), (new_mean, mean)):
+        np.testing.assert_array_equal(new["net.bias"], old["net.bias"])
+    assert state.urge_steps == 0
+    np.testing.assert_array_equal(state.urge.numpy(), np.zeros(7))
+
+
+def test_a_step_works_after_a_round() -> None:
+    state, _ = trained_state(5)
+    parameters = state.params()
+    own = {name: parameters[name] for name in made_up(1)}
+    state.change_density(one_round(own, np.ones(5), grow=1.0))
+    state.adam.set_learning_rate(0.1)
+    before = state.params()
+    dr.backward(sum(dr.sum(dr.square(p.array + 1)) for p in state.adam.values()))
+    state.adam.step()
+    assert all((values != before[name]).all() for name, values in state.params().items())
+
+
+def test_reset_forgets_momentum_of_that_parameter_alone() -> None:
+    state, before = trained_state(5)  # opacity is the last parameter: the step count must not come from it
+    first, _, _ = state.moments()
+    state.set_param("opacity", reset_opacity(before["opacity"], 0.05))
+    new_first, new_second, count = state.moments()
+    assert count == 3
+    assert not new_first["opacity"].any()
+    assert not new_second["opacity"].any()
+    np.testing.assert_array_equal(new_first["signal"], first["signal"])
+    np.testing.assert_allclose(state.params()["opacity"].max(), logit(0.05), rtol=FLOAT32_EPS)
+    assert {int(t[0]) for _, _, _, (t, _, _, _) in state.adam.state.values()} == {3}
+
+
+def test_state_survives_its_arrays() -> None:
+    state, _ = trained_state(4)
+    arrays = state.arrays()
+    again = FitState.from_arrays(arrays).arrays()
+    assert set(again) == set(arrays)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
+def test_the_best_moment_stays_as_it_was() -> None:
+    """Dr.Jit gives memory of an array that is summed to in place to the next one of that size."""
+    state, _ = trained_state(4)
+    state.keep_best(1.0)
+    for _ in range(3):
+        state.urge += to_float(np.ones(4))
+        dr.eval(state.urge)
+    assert state.best is not None
+    np.testing.assert_array_equal(state.best["urge"], np.arange(4))
+
+
+TILTED = Receiver("a", np.array([5.0, 0.3, 1.0]), np.array([0.5, -0.5, -0.5, 0.5]))
+UPSIDE_DOWN = Receiver("b", np.array([-40.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def seen_from(receiver: Receiver, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Azimuth, elevation and distance in the receiver's frame."""
+    local = (position_m - receiver.position_m) @ receiver.to_world
+    return (*azimuth_elevation(local), np.linalg.norm(local, axis=1))
+
+
+def test_random_gaussians_fill_each_receivers_hemisphere() -> None:
+    count, size_deg = 4001, 7.0
+    start = random_gaussians([TILTED, UPSIDE_DOWN], count, np.random.default_rng(0), (1.0, 8.0), size_deg)
+    assert start.position_m.shape == (count, 3)
+    shares = np.array_split(np.arange(count), 2)
+    assert {len(s) for s in shares} == {2000, 2001}
+    for receiver, own in zip((TILTED, UPSIDE_DOWN), shares, strict=True):
+        azimuth, elevation, distance = seen_from(receiver, start.position_m[own])
+        assert distance.min() >= 1.0
+        assert distance.max() <= 8.0
+        assert kstest(distance, "uniform", (1.0, 7.0)).pvalue > SMALLEST_P
+        assert kstest(azimuth, "uniform", (0, 2 * np.pi)).pvalue > SMALLEST_P
+        # Uniform on the sphere: the sine of the elevation is; a margin of one size reaches below the horizon.
+        low = -np.sin(np.radians(size_deg))
+        assert kstest(np.sin(elevation), "uniform", (low, 1 - low)).pvalue > SMALLEST_P
+        np.testing.assert_allclose(np.degrees(np.arctan(start.scale_m[own] / distance)), size_deg, rtol=1e-9)
+
+
+def test_fewer_gaussians_than_receivers() -> None:
+    start = random_gaussians([TILTED, UPSIDE_DOWN], 1, np.random.default_rng(0))
+    assert start.count == 1
+    assert np.isfinite(start.position_m).all()
+
+
+def test_geometry_of_the_start() -> None:
+    start = random_gaussians([TILTED], 9, np.random.default_rng(2), opacity=0.3)
+    weights = start.geometry()
+    np.testing.assert_allclose(weights["position"].T, start.position_m, rtol=FLOAT32_EPS)
+    np.testing.assert_allclose(np.exp(weights["log_scale"]), np.tile(start.scale_m, (3, 1)), rtol=FLOAT32_EPS)
+    np.testing.assert_array_equal(rotation_matrix(weights["rotation"].T), np.tile(np.eye(3), (9, 1, 1)))
+    np.testing.assert_allclose(sigmoid(start.opacity_logit()), 0.3, rtol=FLOAT32_EPS)
+
+
+def test_points_give_the_gap_to_their_neighbours() -> None:
+    """A square grid's nearest three points lie one step away (at a corner two, and one across)."""
+    grid = np.stack(np.meshgrid(np.arange(5), np.arange(5), [2.0], indexing="ij"), axis=-1).reshape(-1, 3) * 0.5
+    start = gaussians_from_points(grid, 25, np.random.default_rng(0))
+    order = np.lexsort(start.position_m.T[::-1])
+    np.testing.assert_array_equal(start.position_m[order], grid)
+    corner = np.isin(grid[:, 0], [0, 2]) & np.isin(grid[:, 1], [0, 2])
+    expected = np.where(corner, 0.5 * np.sqrt((1 + 1 + 2) / 3), 0.5)
+    np.testing.assert_allclose(start.scale_m[order], expected)
+
+
+def test_chosen_points_are_points_of_the_cloud() -> None:
+    cloud = np.random.default_rng(3).normal(size=(50, 3))
+    first = gaussians_from_points(cloud, 10, np.random.default_rng(4))
+    assert len({tuple(p) for p in first.position_m} & {tuple(p) for p in cloud}) == 10
+    # The gap is that between chosen points, which is wider than between all.
+    apart = np.sort(np.linalg.norm(first.position_m[:, None] - first.position_m, axis=2), axis=1)[:, 1:4]
+    np.testing.assert_allclose(first.scale_m, np.sqrt((apart**2).mean(axis=1)))
+    # Points on top of each other still have a size.
+    assert (gaussians_from_points(np.zeros((6, 3)), 6, np.random.default_rng(0)).scale_m > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "count", "message"),
+    [
+        (np.zeros((9, 2)), 4, r"expected shape \[m, 3\], got \[9, 2\]"),
+        (np.zeros((9, 3)), 10, "9 points for 10 Gaussians"),
+        (np.zeros((9, 3)), 3, "9 points for 3 Gaussians"),
+        (np.where(np.arange(27).reshape(9, 3) == 13, np.nan, 1.0), 4, "row 5: not a number"),
+    ],
+)
+def test_point_clouds_that_cannot_be_used(points: np.ndarray, count: int, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        gaussians_from_points(points, count, np.random.default_rng(0))
+
+
+POINTS = np.array([[0.5, 1.25, -2.0], [3.0, 4.5, 5.0], [6.0, -7.75, 8.0], [0.0, 0.0, 0.25], [1.0, 2.0, 3.0]])
+
+
+def write_points(path: Path) -> None:
+    if path.suffix == ".npz":
+        np.savez(path, points=POINTS)
+    elif path.suffix == ".txt":
+        np.savetxt(path, POINTS)
+    else:
+        trimesh.PointCloud(POINTS).export(path)
+
+
+@pytest.mark.parametrize("name", ["cloud.ply", "cloud.xyz", "cloud.npz"])
+def test_points_are_read(name: str, tmp_path: Path) -> None:
+    write_points(tmp_path / name)
+    points = read_points(tmp_path / name)
+    assert points.dtype == np.float64
+    np.testing.assert_allclose(points, POINTS, rtol=FLOAT32_EPS)
+
+
+def test_a_meshs_vertices_are_points(tmp_path: Path) -> None:
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    box.export(tmp_path / "box.obj")
+    points = read_points(tmp_path / "box.obj")
+    np.testing.assert_allclose(np.sort(points, axis=0), np.sort(box.vertices, axis=0))
+
+
+BAD_FILES = {
+    "junk.npz": (b"no archive", "no points to be read"),
+    "junk.ply": (b"ply\n\xff\x00junk", "no points to be read"),
+    "empty.ply": (b"", "no points to be read"),
+    "words.xyz": (b"x y z\none two three\n", "no points to be read"),
+    "short.xyz": (b"1 2\n3 4\n", "no points to be read"),
+    "other.foo": (b"1 2 3\n", "no points to be read"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_files_without_points(name: str, tmp_path: Path) -> None:
+    content, message = BAD_FILES[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_points(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"vertices": POINTS}, "points is not a file in the archive"),
+        ({"points": POINTS[:, :2]}, r"expected points of shape \[m, 3\], got \[5, 2\]"),
+        ({"points": POINTS[:0]}, "no points in it"),
+        ({"points": np.array(["a", "b"])}, "no points to be read"),
+        ({"points": np.where(POINTS == -7.75, np.inf, POINTS)}, "point 3: not finite"),
+    ],
+)
+def test_arrays_without_points(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "cloud.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_points(tmp_path / "cloud.npz")
+
+
+def test_missing_and_damaged_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_points(tmp_path / "none.ply")
+    write_points(tmp_path / "cloud.ply")
+    (tmp_path / "cut.ply").write_bytes((tmp_path / "cloud.ply").read_bytes()[:-20])
+    with pytest.raises(InputError, match="no points to be read"):
+        read_points(tmp_path / "cut.ply")
+    # A file of several meshes has no vertices of its own.
+    both = trimesh.Scene([trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=0)])
+    both.export(tmp_path / "scene.glb")
+    with pytest.raises(InputError, match="no points in it"):
+        read_points(tmp_path / "scene.glb")

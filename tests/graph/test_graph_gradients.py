@@ -1,0 +1,121 @@
+"""Gradients of both sides of a hybrid in one graph by every kind of parameter, against differences in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+import pytest
+from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+
+from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.graph.learned import learned_field
+from wrf_mi.tracing import TraceOptions
+
+Float64 = dr.float64_array_t(mi.Float)
+Tensor64 = dr.tensor_t(Float64)
+
+TOLERANCE = 1e-6
+"""Error of a derivative along a direction of standard normal numbers, relative to the gradient's norm: the standard
+deviation of such derivatives. Central differences in float64."""
+ROUNDING = 2e-15
+"""Of the terms that the loss sums, relative to the sum of their sizes: over the step, what differences add to that."""
+STEP = 1e-6
+"""So small that no pixel crosses a footprint's cut-off, where the field jumps."""
+DIRECTIONS = 3
+HEIGHT, WIDTH, BATCH = 12, 40, 2
+ELEMENTS_M = planar_array(3, 3, 0.16)
+
+MODELS: dict[str, Any] = {
+    "pixel": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent"),
+    "pixel-power": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "power"),
+    "array": ArrayReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent", instrument_scale=True),
+    "rssi": PowerReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ,)),
+    "csi": CsiReceiver(HEIGHT, WIDTH, (FREQUENCY_HZ, 1.01 * FREQUENCY_HZ)),
+}
+
+
+KINDS = (
+    *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
+    *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),
+    *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal"),
+)
+"""Of parameters; beside them the field has networks."""
+
+
+@pytest.fixture(scope="module", params=["named", "surface"])
+def both(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
+    """A traced side with reflections and transmissions, a learned one, and all their parameters, none round."""
+    rng = np.random.default_rng(5)
+    scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
+    own = receiver((30, 20, 10))
+    options = TraceOptions(max_depth=2, transmission=True, rays=4096)
+    how = TracedOptions(options, pattern_degree=2, gain=300.0, materials=request.param, planes=True)
+    traced = TracedField(scene, transmitters(BATCH), own, how)
+    values = {name: value.astype(float) for name, value in traced.parameters().items()}
+    # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it.
+    encoding = Encoding(position_octaves=1, position_scale_m=1e12, tx_octaves=2)
+    field = WrfGsPlus(encoding=encoding, layers=3, width=16, skip=2)
+    start = field.init(random_gaussians([own], 25, rng, opacity=0.4), rng)
+    start["log_scale"] += rng.normal(0, 0.3, start["log_scale"].shape).astype(np.float32)
+    start["rotation"] = rng.standard_normal(start["rotation"].shape).astype(np.float32)
+    values |= {f"field.{name}": value.astype(float) for name, value in start.items()}
+    moved = ("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter")
+    for name in (*moved, "receiver.array.gain", "plane.shift", "plane.tilt"):
+        values[name] += rng.normal(0, 0.02, values[name].shape)
+    return traced, field, values
+
+
+def terms_of(
+    both: tuple[TracedField, WrfGsPlus, dict[str, Any]], model: Any, weight: Any
+) -> Callable[[dict[str, Any]], Any]:
+    """The weighted report of a receiver, whose sum is the loss."""
+    traced, field, _ = both
+    plane, tx_pos = perception_plane(HEIGHT, WIDTH, Float64), Tensor64(np.ascontiguousarray(traced.tx_pos_m.T))
+
+    def terms(parameters: dict[str, Any]) -> Any:
+        own = {name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")}
+        learned = learned_field(field.gaussians(own, tx_pos), traced.pose(parameters, Float64), plane, model.sphere)
+        return model(traced(parameters), learned) * weight
+
+    return terms
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, dict[str, Any]]) -> None:
+    model, rng = MODELS[name], np.random.default_rng(2)
+    size = BATCH * int(np.prod(model.shape))
+    terms = terms_of(both, model, Float64(rng.standard_normal(size)))
+    parameters = {n: Tensor64(value) for n, value in both[2].items()}
+    for p in parameters.values():
+        dr.enable_grad(p)
+    dr.backward(dr.sum(terms(parameters)))
+    gradient = {n: dr.grad(p).numpy() for n, p in parameters.items()}
+    parameters = {n: dr.detach(p) for n, p in parameters.items()}
+    rounding = ROUNDING * float(np.abs(terms(parameters).numpy()).sum()) / STEP
+    errors = {}
+    for n, p in parameters.items():
+        for k in range(DIRECTIONS):
+            direction = rng.standard_normal(p.shape)
+            ends = [terms(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)}).numpy().sum() for s in (1, -1)]
+            numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[n] * direction).sum())
+            errors[n, k] = abs(numeric - analytic) / (TOLERANCE * np.linalg.norm(gradient[n]) + rounding)
+    assert all(any(fnmatchcase(n, kind) for n in gradient) for kind in KINDS)
+    # Differences see every slope but a metal's, which waves do not enter.
+    drowned = {n for n, slope in gradient.items() if rounding > 0.01 * np.linalg.norm(slope)}
+    assert drowned <= {"material.itu_metal.permittivity", "material.itu_metal.conductivity"}
+    assert max(errors.values()) < 1, errors

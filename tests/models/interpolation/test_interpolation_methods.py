@@ -1,0 +1,174 @@
+"""The methods among the baselines: registry, settings, and what they predict."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import yaml
+from calling import call, stored
+from made_channels import channels
+
+import wrf_mi
+from wrf_mi.core import InputError, Record
+from wrf_mi.core.settings import describe, settings_from
+from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
+from wrf_mi.models import MODELS, known_model
+from wrf_mi.runs.api import train
+from wrf_mi.runs.folder import _plain
+from wrf_mi.tasks import TASKS
+
+SETTINGS = {
+    f"{name} {what}": kind
+    for name, model in MODELS.items()
+    for what, kind in (model.settings.items() if isinstance(model.settings, dict) else [("", model.settings)])
+}
+ROUNDING = 1e-4
+"""Powers of tens of dBm are stored in single precision."""
+
+
+def test_registry_lists_what_is_there_and_each_entry_is_what_it_says() -> None:
+    assert {"wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", "idw", "kriging"} <= set(MODELS)
+    for name, model in MODELS.items():
+        assert model.name == name
+        assert set(model.tasks or ()) <= set(TASKS)
+        assert model.source
+        for task in model.tasks or TASKS:
+            kind = model.serving(task, model.scene != "none").settings
+            assert isinstance(kind, type)
+            kind()
+    with pytest.raises(InputError, match="model 'no-such': no such model; choose from wrf-gs, wrf-gs"):
+        known_model("no-such")
+
+
+def test_settings_are_listed_and_null_is_a_value(flat_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = call(["train", "--help-settings"], capsys)
+    assert status == 0
+    for line in ("idw:", "neighbours=null", "kriging:", "length_m=null", "mri:", "shared=False"):
+        assert line in out.splitlines(), line
+    given = wrf_mi.with_settings(
+        MODELS["kriging"].settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
+    )
+    assert (given.length_m, given.noise, given.trend) == (None, 1.0, "constant")
+    assert isinstance(given.noise, float)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_settings_survive_the_configuration_and_the_list(name: str) -> None:
+    """As ``config.yaml`` keeps them and as ``--help-settings`` shows them, lists, choices and null included."""
+    settings = SETTINGS[name]()
+    kept = yaml.safe_load(yaml.safe_dump(_plain(asdict(settings))))
+    assert settings_from(type(settings), kept, "config.yaml") == settings
+    assert wrf_mi.with_settings(settings, describe(settings).splitlines()) == settings
+
+
+@dataclass(frozen=True)
+class Several:
+    """Settings of every type."""
+
+    pair: tuple[float, float] = (1.0, 2.0)
+    many: tuple[int, ...] = (1,)
+    kind: Literal["a", "b"] = "a"
+    maybe: float | None = None
+
+
+def test_settings_of_every_type() -> None:
+    given = wrf_mi.with_settings(Several(), ["pair=[3, 4]", "many=[5, 6, 7]", "kind=b", "maybe=2"])
+    assert given == Several((3.0, 4.0), (5, 6, 7), "b", 2.0)
+    for wrong, message in (
+        ("pair=[3]", "setting pair: expected a list of 2 values"),
+        ("many=5", "setting many: expected a list of values, got 5"),
+        ("many=[1.5]", "setting many: expected int, got 1.5"),
+        ("kind=c", "setting kind: 'c'; choose from a, b"),
+        ("maybe=x", "setting maybe: expected float, got 'x'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            wrf_mi.with_settings(Several(), [wrong])
+
+
+def test_mri_finds_the_law_that_strengths_were_made_by(flat_folder: Path, tmp_path: Path) -> None:
+    """T = -45 dBm and gamma = 2 at both anchors, without noise; a receiver missed some rows."""
+    record = load(flat_folder)
+    distance = np.stack([np.linalg.norm(record.tx_pos_m - r.position_m, axis=1) for r in record.receivers])
+    exact = (-45 - 20 * np.log10(distance)).astype(np.float32)
+    observation = exact.copy()
+    observation[1, 3:9] = np.nan
+    made = replace(record, observation=observation)
+    for shared in ("false", "true"):
+        out = train(made, tmp_path / shared, "mri", settings=(f"shared={shared}",)).folder
+        with np.load(out / "model.npz") as arrays:
+            np.testing.assert_allclose(arrays["1/law"], [-45, -2], atol=ROUNDING)
+        np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
+
+
+def test_kriging_of_every_task_is_that_of_the_library(folder: Path, tmp_path: Path) -> None:
+    """Given lengths and noise: the adapter's constant trend and, for channels, complex numbers and all antennas."""
+    from wrf_mi.models.interpolation.kriging import Kriging
+
+    for data in (folder, write_nerf2_csi(tmp_path / "stations", channels())):
+        out = train(data, tmp_path / f"run-{data.name}", "kriging", settings=("length_m=0.5", "noise=0.1")).folder
+        record, arrays = load(data), stored(out)
+        (split,) = make_splits(record, "official")
+        model = Kriging(0.5, 0.1).fit(record.tx_pos_m[split.all_train], record.observation[0, split.all_train])
+        np.testing.assert_array_equal(arrays["prediction"], model.predict(record.tx_pos_m[split.test]))
+
+
+def test_strengths_are_predicted_with_headings(flat_folder: Path, tmp_path: Path) -> None:
+    """Kriging about each receiver's log-distance law, and trees, as the library alone has them."""
+    from wrf_mi.models.interpolation.kriging import Kriging, log_distance
+    from wrf_mi.models.interpolation.trees import Trees
+
+    record = load(flat_folder)
+    (split,) = make_splits(record, "official")
+    place, turned = record.tx_pos_m, record.tx_heading_rad
+    given = {
+        "kriging": ("length_m=0.5", "noise=0.1", "heading_length=1.5"),
+        "trees": ("trees=20", "leaf_rows=2"),
+    }
+    for name, settings in given.items():
+        found = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
+        for r, receiver in enumerate(record.receivers):
+            law = log_distance(receiver.position_m)
+            model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
+            known = split.all_train
+            expected = model.fit(place[known], record.observation[r, known], turned[known])
+            np.testing.assert_allclose(found[r], expected.predict(place[split.test], turned[split.test]), atol=ROUNDING)
+
+
+def test_grown_trees_are_the_librarys(flat_folder: Path) -> None:
+    from wrf_mi.models.interpolation.trees import GrownTrees, Trees
+
+    record = load(flat_folder)
+    rng = np.random.default_rng(2)
+    positions, heading = rng.uniform(0, 5, (400, 3)), rng.uniform(-3, 3, 400)
+    for turned_by in (None, heading):
+        model = Trees(30, 2).fit(positions, np.sin(positions[:, 0]).astype(np.float32), turned_by)
+        kept = GrownTrees.from_arrays(model.grown().arrays())
+        # At thresholds, where single precision decides the side.
+        edge = np.resize(record.tx_pos_m, (300, 3))
+        edge[:, 0] = np.resize(kept.threshold[(kept.feature == 0) & (kept.left != kept.right)], 300)
+        asked = edge, None if turned_by is None else np.resize(record.tx_heading_rad, 300)
+        np.testing.assert_allclose(kept.predict(*asked), model.predict(*asked), atol=1e-6)  # sums in another order
+
+
+def test_published_figure_of_mri(tmp_path: Path) -> None:
+    """Median 4.17 dB, 90th percentile 10.2 dB, over all anchors and test rows: the data's description."""
+    if not (Path(os.environ.get("WRF_MI_DATA", "/nowhere")) / "flat-ble").is_dir():
+        pytest.skip("WRF_MI_DATA names no folder with flat-ble/")
+    score = json.loads((train("flat-ble", tmp_path / "run", "mri").folder / "metrics.json").read_text())
+    assert score["abs_error_db"]["median"] == pytest.approx(4.17, abs=0.01)
+    assert score["abs_error_db"]["p90"] == pytest.approx(10.2, abs=0.05)
+
+
+def test_one_training_row_is_copied_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
+    """Spectra of two receivers, and the least that a blend needs."""
+    data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
+    out = train(data, tmp_path / "run", "idw", n_train=1).folder
+    arrays = stored(out)
+    assert arrays["prediction"].shape == arrays["truth"].shape
+    assert (arrays["prediction"] == arrays["prediction"][:, :1]).all()

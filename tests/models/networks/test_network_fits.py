@@ -1,0 +1,299 @@
+"""Fits of VAE, DCGAN and NeRF2: that they learn, keep what they learned, and refuse what they cannot learn from.
+
+Sanity figures of the real data, which correct versions reach: 8 spectra are fitted to a structural similarity of 0.9,
+and held-out spectra are predicted better than by the mean training spectrum (0.673 on the authors' rows of rfid-lab).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+from small_fits import network_settings
+
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.datasets import load, make_splits
+from wrf_mi.models.method import Method, inputs_of
+from wrf_mi.models.networks import dcgan, nerf2, vae
+from wrf_mi.models.networks.dcgan import DcganSettings
+from wrf_mi.models.networks.nerf2 import Nerf2Settings
+from wrf_mi.models.networks.nerf2_march import Networks
+from wrf_mi.models.networks.vae import VaeSettings
+from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
+from wrf_mi.training.session import FitSession
+
+FITTED = 0.9
+"""Structural similarity to which 8 spectra must be fitted."""
+MEAN_SPECTRUM = 0.673
+"""Median of the mean training spectrum on the authors' held-out rows of rfid-lab."""
+MRI_DB = 4.17
+"""Median absolute error of a log-distance fit on flat-ble."""
+SAME = 1e-5
+"""Sums in float32 whose order may differ."""
+
+DATA = Path(os.environ.get("WRF_MI_DATA", "/nowhere"))
+
+
+def needs(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(not (DATA / name).is_dir(), reason=f"WRF_MI_DATA names no folder with {name}/")
+
+
+SMALL: dict[str, tuple[Method, Any]] = {
+    "vae": (vae.METHOD, network_settings(VaeSettings, 500, 8, 3e-3, latent=4, width=32, last=16, octaves=2)),
+    "dcgan": (dcgan.METHOD, network_settings(DcganSettings, 310, 8, 3e-3, noise=2, hidden=24, channels=16, octaves=2)),
+    "nerf2": (
+        nerf2.METHOD,
+        network_settings(
+            Nerf2Settings,
+            500,
+            8,
+            5e-3,
+            networks=Networks(3, 48, 0, 2, 2),
+            rays=200,
+            sphere_rays=24,
+            samples=2,
+            tx_octaves=2,
+        ),
+    ),
+}
+
+
+RECEIVER = Receiver("station", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
+
+
+def array_spectra(rows: int = 12, size: tuple[int, int] = (15, 60)) -> Record:
+    """Spectra of a small array that sees transmitters within a metre directly and by way of two fixed points."""
+    tx = np.random.default_rng(3).uniform([2, -0.5, 2], [3, 0.5, 3], (rows, 3))
+    points, frequency = np.array([[1.0, 3, 4], [0.5, -2, 3]]), 1.5e8
+    ways = np.concatenate([tx[:, None], np.broadcast_to(points, (rows, 2, 3))], axis=1) - RECEIVER.position_m
+    near = np.linalg.norm(ways, axis=2)
+    length = near + np.concatenate([np.zeros((rows, 1)), np.linalg.norm(tx[:, None] - points, axis=2)], axis=1)
+    elements = planar_array(3, 3, 0.8)
+    response = array_response(elements, ways / near[..., None], frequency)
+    amplitude = np.exp(-2j * np.pi * frequency / speed_of_light * length) / length
+    image = bartlett_spectrum(np.einsum("nw,nwm->nm", amplitude, response), elements, frequency, *size)
+    return Record("made", "spectrum", tx, (RECEIVER,), minmax_scale(image).astype(np.float32)[None])
+
+
+def first_rows(record: Record, count: int) -> Split:
+    rows = np.arange(count)
+    return Split("few", 0, rows, rows[:0], rows)
+
+
+@pytest.mark.parametrize("name", list(SMALL))
+def test_eight_spectra_are_fitted_and_kept(name: str):
+    method, settings = SMALL[name]
+    record = array_spectra()
+    fitted = method.fit(record, first_rows(record, 8), settings, 0, FitSession())
+    asked = inputs_of(record, np.arange(8))
+    found = fitted.predict(asked, 0)
+    truth = record.observation[0, :8]
+    assert found.shape == truth.shape
+    assert np.median(ssim(found, truth)) > FITTED
+    # One row alone is predicted as among others, by what was kept too, without the observations.
+    blank = replace(record, observation=np.zeros_like(record.observation))
+    arrays = fitted.arrays()
+    assert not any(key.startswith("run/") for key in arrays)
+    again = method.load(arrays, blank).predict(inputs_of(record, np.array([5])), 0)
+    np.testing.assert_allclose(again[0], found[5], atol=SAME)
+
+
+@pytest.mark.parametrize("name", list(SMALL))
+def test_rows_outside_the_split_are_not_seen(name: str, two_gateways: Record):
+    """Other spectra in held-out rows, and a row that one receiver did not receive, change nothing and break nothing."""
+    method, settings = SMALL[name]
+    settings = replace(settings, steps=8)
+    train = np.arange(10)
+    split = Split("some", 0, train[:8], train[8:], np.arange(10, 24))
+    seen = two_gateways.observation.copy()
+    seen[1, 3] = np.nan
+    other = seen.copy()
+    other[:, 10:] = 1 - other[:, 10:]
+    asked = inputs_of(two_gateways, np.arange(3))
+    both = [
+        [method.fit(one, split, settings, 0, FitSession()).predict(asked, r) for r in (0, 1)]
+        for one in (replace(two_gateways, observation=o) for o in (seen, other))
+    ]
+    np.testing.assert_allclose(both[0], both[1], atol=1e-3)
+    assert np.isfinite(both[0]).all()
+    assert np.abs(np.subtract(*both[0])).max() > 1e-3, "receivers differ"
+
+
+@pytest.mark.parametrize("name", list(SMALL))
+def test_what_cannot_be_learned_from_is_refused(name: str, one_gateway: Record):
+    method, settings = SMALL[name]
+    nowhere = replace(one_gateway, tx_pos_m=np.full_like(one_gateway.tx_pos_m, np.nan))
+    with pytest.raises(InputError, match="no position in row 0"):
+        method.fit(nowhere, first_rows(nowhere, 8), settings, 0, FitSession())
+    nothing = replace(one_gateway, observation=np.full_like(one_gateway.observation, np.nan))
+    with pytest.raises(InputError, match="gateway1 received no training row"):
+        method.fit(nothing, first_rows(nothing, 8), settings, 0, FitSession())
+    with pytest.raises(InputError, match="one training row"):
+        method.fit(one_gateway, first_rows(one_gateway, 1), settings, 0, FitSession())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: VaeSettings(latent=0),
+        lambda: VaeSettings(noise=0.0),
+        lambda: DcganSettings(channels=4),
+        lambda: DcganSettings(l1=-1.0),
+        lambda: Nerf2Settings(samples=0),
+        lambda: Nerf2Settings(near_m=2.0, far_m=1.0),
+        lambda: Networks(layers=0),
+        lambda: Networks(scale_m=0.0),
+    ],
+)
+def test_settings_of_no_network_are_refused(make: Callable[[], Any]):
+    with pytest.raises(InputError, match="choose"):
+        make()
+
+
+def test_signal_strengths_of_two_receivers_beat_their_means():
+    """Powers that fall with distance; one receiver misses some rows."""
+    rng = np.random.default_rng(0)
+    tx = rng.uniform(-3, 3, (80, 3))
+    receivers = (RECEIVER, replace(RECEIVER, name="second", position_m=np.array([3.0, 3, 1])))
+    distance = np.linalg.norm(tx - np.stack([r.position_m for r in receivers])[:, None], axis=2)
+    power = (-40 - 30 * np.log10(distance) + np.array([[0], [-15]])).astype(np.float32)
+    power[1, ::7] = np.nan
+    record = Record("made", "rssi", tx, receivers, power, frequencies_hz=np.array([2.4e9]))
+    split = Split("some", 0, np.arange(50), np.arange(50, 60), np.arange(60, 80))
+    method, settings = SMALL["nerf2"]
+    fitted = method.fit(record, split, replace(settings, steps=375, sphere_batch=16, tx_octaves=1), 0, FitSession())
+    errors, of_means = [], []
+    for r in (0, 1):
+        truth = power[r, split.test]
+        found = fitted.predict(inputs_of(record, split.test), r)
+        assert found.shape == truth.shape
+        errors.append(abs_error_db(found, truth))
+        of_means.append(abs_error_db(np.full_like(truth, np.nanmean(power[r, split.all_train])), truth))
+    assert np.nanmedian(errors) < 0.7 * np.nanmedian(of_means)
+
+
+UPLINK_HZ = 2.4e9 + 1e6 * np.arange(6)
+DOWNLINK_HZ = 2.4e9 + 1e6 * np.arange(6, 12)
+
+
+def sparse_paths(rows: int = 300, antennas: int = 2, seed: int = 0) -> Record:
+    """Three paths a row, two of them by way of fixed points, to antennas half a wavelength apart."""
+    rng = np.random.default_rng(seed)
+    tx, points = rng.uniform([2, -4, 0], [8, 4, 2], (rows, 3)), np.array([[4.0, 25, 1], [6.0, -40, 1]])
+    elements = np.stack([np.zeros(antennas), 0.0612 * np.arange(antennas), np.zeros(antennas)], axis=1)
+    at = RECEIVER.position_m + elements
+    direct = np.linalg.norm(tx[:, None] - at, axis=2)
+    around = np.linalg.norm(tx[:, None] - points, axis=2)[:, None] + np.linalg.norm(at[:, None] - points, axis=2)
+    length = np.concatenate([direct[..., None], around], axis=2)
+    gain = np.array([1.0, 4.0, 4.0]) / length
+
+    def channel(frequencies: np.ndarray) -> np.ndarray:
+        phase = 2 * np.pi * frequencies * length[..., None] / speed_of_light
+        return (gain[..., None] * np.exp(-1j * phase)).sum(axis=2).astype(np.complex64)
+
+    return Record(
+        "made",
+        "csi",
+        tx,
+        (RECEIVER,),
+        channel(DOWNLINK_HZ)[None],
+        frequencies_hz=DOWNLINK_HZ,
+        uplink=channel(UPLINK_HZ),
+        uplink_hz=UPLINK_HZ,
+    ).with_array(elements)
+
+
+def test_downlink_from_uplink_beats_the_uplink():
+    record = sparse_paths()
+    rows = np.arange(len(record))
+    split = Split("some", 0, rows[:200], rows[200:230], rows[230:])
+    method, settings = SMALL["nerf2"]
+    chosen = replace(settings, steps=625, sphere_batch=64, sphere_rays=8)
+    fitted = method.fit(record, split, chosen, 0, FitSession())
+    asked, truth = inputs_of(record, split.test), record.observation[0, split.test]
+    found = fitted.predict(asked, 0)
+    assert found.shape == truth.shape
+    assert record.uplink is not None
+    copied = np.median(cea_db(record.uplink[split.test], truth))
+    assert np.median(cea_db(found, truth)) > copied + 3
+    # An uplink that is turned and louder brings a downlink that is.
+    louder = replace(asked, uplink=asked.uplink * np.complex64(2j))
+    np.testing.assert_allclose(fitted.predict(louder, 0), 2j * found, rtol=1e-3, atol=1e-5)
+    with pytest.raises(InputError, match="rows to predict have none"):
+        fitted.predict(replace(asked, uplink=None), 0)
+    assert record.uplink is not None
+    with pytest.raises(InputError, match="uplink of 1 antennas and a downlink of 2"):
+        method.fit(replace(record, uplink=record.uplink[:, :1]), split, chosen, 0, FitSession())
+
+
+def test_channels_by_position_keep_their_shape():
+    record = replace(sparse_paths(12), uplink=None, uplink_hz=None)
+    settings = replace(SMALL["nerf2"][1], steps=5)
+    split = first_rows(record, 12)
+    fitted = nerf2.fit(record, split, settings, 0, FitSession())
+    found = fitted.predict(inputs_of(record, split.test), 0)
+    assert found.shape == record.observation[0].shape
+    assert found.dtype == np.complex64
+    one = replace(record, observation=record.observation[:, :, 0])
+    assert nerf2.fit(one, split, settings, 0, FitSession()).predict(inputs_of(one, split.test), 0).shape == (12, 6)
+
+
+def test_networks_of_their_own_for_each_receiver(two_gateways: Record):
+    settings = replace(SMALL["nerf2"][1], steps=5, shared=False)
+    fitted = nerf2.fit(two_gateways, first_rows(two_gateways, 8), settings, 0, FitSession())
+    arrays = fitted.arrays()
+    assert any(key.startswith("group1/") for key in arrays)
+    asked = inputs_of(two_gateways, np.arange(2))
+    again = nerf2.load(arrays, two_gateways)
+    for r in (1, 0):
+        np.testing.assert_allclose(again.predict(asked, r), fitted.predict(asked, r), atol=SAME)
+
+
+@needs("rfid-lab")
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        (vae.METHOD, VaeSettings(steps=750, batch=8)),
+        (dcgan.METHOD, DcganSettings(steps=750)),
+        (nerf2.METHOD, Nerf2Settings(steps=1000, batch=8, rays=512)),
+    ],
+    ids=["vae", "dcgan", "nerf2"],
+)
+def test_eight_measured_spectra_are_fitted(method: Method, settings: Any):
+    record = load("rfid-lab")
+    rows = make_splits(record, "official")[0].train[::18][:8]
+    fitted = method.fit(record, Split("few", 0, rows, rows[:0], rows), settings, 0, FitSession())
+    assert np.median(ssim(fitted.predict(inputs_of(record, rows), 0), record.observation[0, rows])) > FITTED
+
+
+@needs("rfid-lab")
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [vae.METHOD, dcgan.METHOD, nerf2.METHOD], ids=["vae", "dcgan", "nerf2"])
+def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
+    record = load("rfid-lab")
+    split = make_splits(record, "official")[0]
+    fitted = method.fit(record, split, method.settings(), 0, FitSession())
+    found = fitted.predict(inputs_of(record, split.test), 0)
+    assert np.median(ssim(found, record.observation[0, split.test])) > MEAN_SPECTRUM
+
+
+@needs("flat-ble")
+@pytest.mark.slow
+def test_measured_signal_strengths_are_as_near_as_those_of_a_log_distance_fit():
+    record = load("flat-ble")
+    split = make_splits(record, "official")[0]
+    fitted = nerf2.fit(record, split, Nerf2Settings(), 0, FitSession())
+    errors = [
+        abs_error_db(fitted.predict(inputs_of(record, split.test), r), record.observation[r, split.test])
+        for r in range(len(record.receivers))
+    ]
+    assert np.nanmedian(np.concatenate(errors)) < MRI_DB

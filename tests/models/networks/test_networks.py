@@ -1,0 +1,347 @@
+"""Convolutions, the march along rays and the fitting rule of network baselines, against NumPy twins and differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.core import InputError
+from wrf_mi.core.settings import with_settings
+from wrf_mi.models.networks.conv import NORM_FLOOR, Grid, coarser, convolve, finer, instance_norm, patches, resized
+from wrf_mi.models.networks.coordinates import Coordinates
+from wrf_mi.models.networks.dcgan import softplus
+from wrf_mi.models.networks.nerf2_march import LEAK, Networks, Rays, constant_parts, look, march
+from wrf_mi.models.networks.tensors import columns
+from wrf_mi.models.networks.training import Network, NetworkSettings, NetworkTrainer
+from wrf_mi.models.networks.vae import elbo_loss, pooled
+from wrf_mi.tasks.conditions import channels_from, normalised_uplink
+from wrf_mi.training.adam import NumericsError
+
+pytestmark = pytest.mark.all_threads
+
+EXACT = 1e-12
+"""Some hundred float64 products of numbers around one."""
+
+DIFFERENCE = 1e-6
+"""Step of central differences in float64: their error is about its square plus 1e-16 / 1e-6."""
+
+SLOPES_AGREE = 1e-7
+"""Ten times that error, for slopes around one."""
+
+
+def doubles(values: np.ndarray) -> Any:
+    """A float64 tensor."""
+    return to_tensor(values, mi.Float64)
+
+
+def assert_slopes(function: Callable[[list[Any]], Any], arrays: list[np.ndarray], rng: np.random.Generator) -> None:
+    """Reverse derivatives of a scalar function of tensors equal central differences along random directions."""
+    tensors = [doubles(a) for a in arrays]
+    dr.enable_grad(tensors)
+    dr.backward(function(tensors))
+    for i, array in enumerate(arrays):
+        direction = rng.standard_normal(array.shape)
+        ahead, behind = (
+            function([doubles(a + step * direction if k == i else a) for k, a in enumerate(arrays)])[0]
+            for step in (DIFFERENCE, -DIFFERENCE)
+        )
+        slope = float(np.sum(dr.grad(tensors[i]).numpy() * direction))
+        assert slope == pytest.approx((ahead - behind) / (2 * DIFFERENCE), rel=SLOPES_AGREE, abs=SLOPES_AGREE)
+
+
+def weighted(x: Any, weights: np.ndarray) -> Any:
+    """A scalar whose derivative by each element differs."""
+    return dr.sum(x.array * doubles(weights).array)
+
+
+def padded(images: np.ndarray) -> np.ndarray:
+    """Images [c, b, h, w] with a row of zeros above and below, and a column of the other side at each."""
+    wide = np.concatenate([images[..., -1:], images, images[..., :1]], axis=-1)
+    return np.pad(wide, [(0, 0), (0, 0), (1, 1), (0, 0)])
+
+
+@pytest.mark.parametrize("side", [2, 3])
+def test_convolution_equals_its_sum_over_neighbours(side: int):
+    rng = np.random.default_rng(0)
+    c, out, b, h, w = 3, 2, 2, 4, 5
+    images, kernel, bias = rng.standard_normal((c, b, h, w)), rng.standard_normal((out, side, side, c)), [[0.5], [-1]]
+    wide, expected = padded(images), np.zeros((out, b, h, w))
+    for down in range(side):
+        for right in range(side):
+            part = wide[:, :, down : down + h, right : right + w]
+            expected += np.einsum("oc,cbhw->obhw", kernel[:, down, right], part)
+    params = {"k.hidden": doubles(kernel.reshape(out, -1)), "k.bias": doubles(np.array(bias))}
+    found = convolve(params, "k", doubles(images.reshape(c, -1)), Grid(b, h, w), side)
+    np.testing.assert_allclose(found.numpy(), expected.reshape(out, -1) + bias, atol=EXACT)
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("side", [2, 3])
+def test_slopes_of_patches(side: int):
+    rng = np.random.default_rng(1)
+    grid = Grid(2, 3, 4)
+    images, weights = rng.standard_normal((2, grid.columns)), rng.standard_normal((side * side * 2, grid.columns))
+    assert_slopes(lambda x: weighted(patches(x[0], grid, side), weights), [images], rng)
+
+
+def test_finer_and_coarser_undo_each_other():
+    rng = np.random.default_rng(2)
+    grid = Grid(2, 3, 4)
+    x = rng.standard_normal((8, grid.columns))
+    fine, fine_grid = finer(doubles(x), grid)
+    assert (fine_grid.height, fine_grid.width) == (6, 8)
+    # Channel 1 of the four at position (1, 0): a row below, the same column.
+    part = x.reshape(2, 2, 2, 2, 3, 4)[1, 0, 1]
+    np.testing.assert_array_equal(fine.numpy().reshape(2, 2, 6, 8)[1, :, 1::2, 0::2], part)
+    back, back_grid = coarser(fine, fine_grid)
+    assert back_grid == grid
+    np.testing.assert_array_equal(back.numpy(), x)
+
+
+@pytest.mark.gradcheck
+def test_slopes_of_layouts_and_normalisation():
+    rng = np.random.default_rng(3)
+    grid = Grid(2, 2, 4)
+    x, scale, bias = (rng.standard_normal(shape) for shape in ((4, grid.columns), (4, 1), (4, 1)))
+    weights = rng.standard_normal((1, 2 * 3 * 5))
+
+    def function(given: list[Any]) -> Any:
+        y = instance_norm({"n.scale": given[1], "n.bias": given[2]}, "n", given[0], grid)
+        y, fine = finer(y, grid)
+        cut, _ = resized(y, fine, 3, 5)
+        y, _ = coarser(y, fine)
+        return weighted(cut, weights) + dr.sum(y.array * y.array * y.array)
+
+    assert_slopes(function, [x, scale, bias], rng)
+    images = instance_norm({"n.scale": doubles(scale * 0 + 1), "n.bias": doubles(bias * 0)}, "n", doubles(x), grid)
+    each = x.reshape(4, 2, -1)
+    expected = (each - each.mean(-1, keepdims=True)) / np.sqrt(each.var(-1, keepdims=True) + NORM_FLOOR)
+    np.testing.assert_allclose(images.numpy().reshape(each.shape), expected, atol=EXACT)
+
+
+def test_resized_fills_with_zeros():
+    found, grid = resized(doubles(np.ones((1, 4))), Grid(1, 2, 2), 3, 3)
+    np.testing.assert_array_equal(found.numpy().reshape(3, 3), [[1, 1, 0], [1, 1, 0], [0, 0, 0]])
+    assert grid.pixels == 9
+
+
+def test_columns_by_index():
+    x = np.arange(12.0).reshape(3, 4)
+    np.testing.assert_array_equal(columns(doubles(x), mi.UInt32([2, 0, 2])).numpy(), x[:, [2, 0, 2]])
+
+
+def test_coordinates_are_centred_and_kept():
+    frame = Coordinates.of([[0, 0, 1], [2, 0, 1]])
+    again = Coordinates.load(frame.arrays())
+    features = again.features([[2, 0, 1]], octaves=1, scale_m=2.0).numpy()[:, 0]
+    # One unit of plain coordinate; a half turn in two units of scale is 1 m.
+    np.testing.assert_allclose(features, [1, 0, 0, 1, 0, 0, 0, 1, 1], atol=1e-6)
+
+
+SMALL = Networks(layers=3, width=6, skip=1, point_octaves=1, view_octaves=1)
+FREQUENCIES_HZ = np.array([9.0e8, 9.1e8])
+SAMPLES, FAR_M = 3, 1.5
+
+
+def small_march(seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
+    """Weights, rays (directions, origin, constants) and conditions of two transmitters."""
+    rng = np.random.default_rng(seed)
+    weights = {k: v.astype(float) for k, v in SMALL.init(2, len(FREQUENCIES_HZ), rng).items()}
+    for name in weights:
+        if name.endswith("bias"):
+            weights[name] += rng.standard_normal(weights[name].shape) * 0.3
+    directions = rng.standard_normal((3, 4))
+    rays = dict(constant_parts([0.3, -0.2, 0.1], [0.1, 0, 0], 2.0, 0.0, FAR_M, SAMPLES, FREQUENCIES_HZ))
+    rays["direction"] = directions / np.linalg.norm(directions, axis=0)
+    return weights, rays, rng.standard_normal((2, 2))
+
+
+def marched(weights: dict[str, Any], rays: dict[str, np.ndarray], condition: np.ndarray) -> Any:
+    seen = look(SMALL, weights, Rays(**{name: doubles(values) for name, values in rays.items()}))
+    return march(weights, seen, doubles(condition), SAMPLES)
+
+
+def twin_of_march(w: dict[str, np.ndarray], rays: dict[str, np.ndarray], condition: np.ndarray) -> np.ndarray:
+    """The sum along each ray, point by point, with the networks on concatenated inputs: [outputs, batch, rays]."""
+
+    def relu(x: np.ndarray) -> np.ndarray:
+        return np.maximum(x, 0)
+
+    def encoded(p: np.ndarray, extent: float) -> np.ndarray:
+        return np.concatenate([p / extent, np.sin(np.pi * p), np.cos(np.pi * p)])
+
+    def strength(x: np.ndarray) -> np.ndarray:
+        return np.where(x > 0, x, -LEAK * x)
+
+    def phase(x: np.ndarray) -> np.ndarray:
+        return 2 * np.pi / (1 + np.exp(-x))
+
+    cell, k = FAR_M / SAMPLES, 2 * np.pi * FREQUENCIES_HZ / 299792458.0
+    total = np.zeros((2, condition.shape[1], 4), complex)
+    for ray in range(4):
+        u = rays["direction"][:, ray]
+        lost = np.zeros(2, complex)
+        for s in range(SAMPLES):
+            r = (s + 0.5) * cell
+            x = encoded(np.array([0.2, -0.2, 0.1]) + r * u, 2.0)
+            h = relu(w["attenuation.0.point"] @ x + w["attenuation.0.bias"][:, 0])
+            h = relu(w["attenuation.1.hidden"] @ h + w["attenuation.1.point"] @ x + w["attenuation.1.bias"][:, 0])
+            h = relu(w["attenuation.2.hidden"] @ h + w["attenuation.2.bias"][:, 0])
+            a = w["attenuation.out.hidden"] @ h + w["attenuation.out.bias"][:, 0]
+            feature = w["feature.hidden"] @ h + w["feature.bias"][:, 0]
+            for b in range(condition.shape[1]):
+                y = w["radiance.0.feature"] @ feature + w["radiance.0.view"] @ encoded(u, 1.0)
+                y = relu(y + w["radiance.0.condition"] @ condition[:, b] + w["radiance.0.bias"][:, 0])
+                y = relu(w["radiance.1.hidden"] @ y + w["radiance.1.bias"][:, 0])
+                y = w["radiance.out.hidden"] @ y + w["radiance.out.bias"][:, 0]
+                sent = strength(y[:2]) * np.exp(1j * phase(y[2:]))
+                total[:, b, ray] += sent * cell / r * np.exp(-1j * k * r) * np.exp(-lost)
+            lost += (strength(a[:2]) + 1j * phase(a[2:])) * cell
+    return total
+
+
+def test_march_equals_its_sum_point_by_point():
+    weights, rays, condition = small_march(4)
+    re, im = marched({k: doubles(v) for k, v in weights.items()}, rays, condition)
+    expected = twin_of_march(weights, rays, condition)
+    np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(expected.shape), expected, atol=EXACT)
+
+
+@pytest.mark.gradcheck
+def test_slopes_of_march():
+    """By every weight of both networks; kinks are further off than the step for this seed."""
+    weights, rays, condition = small_march(5)
+    names = list(weights)
+    rng = np.random.default_rng(6)
+    by_re, by_im = rng.standard_normal((2, 2 * 2 * 4))
+
+    def function(given: list[Any]) -> Any:
+        re, im = marched(dict(zip(names, given, strict=True)), rays, condition)
+        return dr.sum(re * doubles(by_re).array + im * doubles(by_im).array)
+
+    assert_slopes(function, list(weights.values()), rng)
+
+
+def test_uplink_loses_and_channels_regain_size_and_phase():
+    rng = np.random.default_rng(7)
+    uplink = rng.standard_normal((3, 2, 5)) + 1j * rng.standard_normal((3, 2, 5))
+    features, divisor = normalised_uplink(uplink)
+    turned = uplink * 3e-6 * np.exp(2j)
+    np.testing.assert_allclose(normalised_uplink(turned)[0], features, atol=1e-6)
+    np.testing.assert_allclose(channels_from(features, divisor, uplink.shape), uplink, atol=1e-6)
+    assert np.square(features).sum(axis=1) == pytest.approx(5, rel=1e-6)
+    with pytest.raises(InputError, match="row 1, antenna 0"):
+        normalised_uplink(np.where(np.arange(3)[:, None, None] == 1, 0, uplink))
+
+
+@pytest.mark.gradcheck
+def test_slopes_of_the_evidence_bound():
+    rng = np.random.default_rng(8)
+    shapes = {
+        "q.0.image": (5, 4), "q.0.position": (5, 3), "q.0.bias": (5, 1), "q.1.hidden": (5, 5), "q.1.bias": (5, 1),
+        "q.out.hidden": (4, 5), "q.out.bias": (4, 1), "p.0.latent": (5, 2), "p.0.position": (5, 3), "p.0.bias": (5, 1),
+        "p.1.hidden": (5, 5), "p.1.bias": (5, 1), "p.out.hidden": (6, 5), "p.out.bias": (6, 1),
+    }  # fmt: skip
+    weights = {name: rng.standard_normal(shape) for name, shape in shapes.items()}
+    sizes = {"cells": 4, "where": 3, "pixels": 6}
+    data = {name: doubles(rng.uniform(size=(size, 3))) for name, size in sizes.items()}
+    given = {"rows": mi.UInt32([2, 0]), "noise": doubles(rng.standard_normal((2, 2)))}
+    given["prior"] = doubles(rng.standard_normal((2, 2)))
+
+    def function(tensors: list[Any]) -> Any:
+        return elbo_loss(dict(zip(weights, tensors, strict=True)), data, given, 0.5, 0.3, 0.4)
+
+    assert_slopes(function, list(weights.values()), rng)
+
+
+def test_divergence_is_that_of_normal_distributions():
+    """A decoder of zeros leaves the divergence alone: KL(N(m, v) || N(0, 1)) = (m^2 + v - 1 - log v) / 2."""
+    zero = {name: doubles(np.zeros(shape)) for name, shape in {
+        "q.0.image": (1, 1), "q.0.position": (1, 1), "q.0.bias": (1, 1), "q.1.hidden": (1, 1), "q.1.bias": (1, 1),
+        "q.out.hidden": (2, 1), "p.0.latent": (1, 1), "p.0.position": (1, 1), "p.0.bias": (1, 1),
+        "p.1.hidden": (1, 1), "p.1.bias": (1, 1), "p.out.hidden": (1, 1), "p.out.bias": (1, 1),
+    }.items()}  # fmt: skip
+    params = zero | {"q.out.bias": doubles(np.array([[0.7], [np.log(0.25)]]))}
+    data = {
+        "cells": doubles(np.ones((1, 1))),
+        "where": doubles(np.ones((1, 1))),
+        "pixels": doubles(np.full((1, 1), 0.5)),
+    }
+    given = {"rows": mi.UInt32([0, 0]), "noise": doubles(np.ones((1, 2))), "prior": doubles(np.ones((1, 2)))}
+    found = elbo_loss(params, data, given, 1.0, 1.0, 0.5)[0]
+    assert found == pytest.approx((0.49 + 0.25 - 1 - np.log(0.25)) / 2, abs=EXACT)
+
+
+def test_cells_are_means_over_blocks():
+    image = np.arange(24.0).reshape(1, 4, 6)
+    np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
+
+
+def test_softplus_at_both_ends():
+    x = np.array([-800.0, -1, 0, 2, 800])
+    np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
+
+
+def quadratic(params: Any, data: Any, given: Any) -> Any:
+    """Squared distance from some numbers, with a pole that ``given`` may ask for."""
+    return dr.sum(dr.square(params["x.bias"].array - data)) + given
+
+
+def trainer_of(goal: list[float], draw: Any, score: Any = None, *settings: str) -> NetworkTrainer:
+    """Numbers that start at 0 and are to reach ``goal``; of samples 0 to 9 the last two validate."""
+    rows = [np.arange(8)], [np.arange(10)]
+    start = {"x.bias": np.zeros(len(goal), np.float32)}
+    network = Network("x", start, quadratic, to_float(goal), draw, *rows, score, "distance")
+    own = ("optimiser.warm_up=1", "optimiser.averaging=0", "log_every=1000", *settings)
+    return NetworkTrainer(network, with_settings(NetworkSettings(), own), (0,))
+
+
+def test_a_step_that_is_not_finite_changes_nothing_and_is_named():
+    """It is the hundredth."""
+
+    def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
+        return dr.opaque(mi.Float, np.nan if trainer.state.step == 99 else 0.0)
+
+    trainer = trainer_of([3, -2], draw, None, "steps=200", "optimiser.network=0.1")
+    trainer.run(stop=lambda: trainer.state.step == 99)
+    before = trainer.state.params()["x.bias"], trainer.state.mean_params()["x.bias"]
+    np.testing.assert_allclose(before[1], [3, -2], atol=0.1)
+    with pytest.raises(NumericsError, match=r"^step 100: not finite: loss"):
+        trainer.run()
+    np.testing.assert_array_equal(trainer.state.params()["x.bias"], before[0])
+    np.testing.assert_array_equal(trainer.state.mean_params()["x.bias"], before[1])
+
+
+def test_steps_are_chosen_on_validation_and_all_rows_end_it():
+    """The validation score is best after a quarter; what is drawn from all rows comes last and pulls elsewhere."""
+    drawn = []
+
+    def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
+        drawn.append(int(rows.max()))
+        return dr.opaque(mi.Float, 0)
+
+    def score(params: Any) -> float:
+        return abs(float(params["x.bias"].numpy()[0]) - 1.0)
+
+    own = ("steps=120", "batch=8", "optimiser.network=0.05", f"hold_out={80 / 120}", "validate_every=20")
+    trainer = trainer_of([4], draw, score, *own)
+    assert trainer.run()
+    # Adam moves by about its rate a step: 1 after 20 steps.
+    assert trainer.state.chosen == 20
+    assert trainer.state.best_score == pytest.approx(0, abs=0.1)
+    assert drawn[:80] == [7] * 80
+    assert len(drawn) == 80 + 10, "as many more as led there, in proportion"
+    assert max(drawn[80:]) == 9
+    assert 1.1 < trainer.state.mean_params()["x.bias"][0] < 1.6
+
+
+@pytest.mark.parametrize("wrong", ["steps=0", "optimiser.averaging=1", "hold_out=1.5", "validate_every=0", "batch=0"])
+def test_loops_that_are_none_are_refused(wrong: str):
+    with pytest.raises(InputError, match=r"^setting .* is out of range, choose"):
+        with_settings(NetworkSettings(), [wrong])

@@ -1,0 +1,325 @@
+"""Element signals as a Gaussian process: its covariances, its fit, and the spectra that it is expected to give."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_waves import CONE_DEG, ELEMENTS_M, FREQUENCY_HZ, WAVELENGTH_M, WAVENUMBER, positions, signals
+from scipy.spatial.distance import cdist
+from scipy.stats import rice
+
+from wrf_mi.core.angles import fibonacci_sphere
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.models.physics import signals as module
+from wrf_mi.models.physics.expected_spectrum import SpectrumReport, rician
+from wrf_mi.models.physics.signal_kernels import Covariances, departures, fit_shares
+from wrf_mi.models.physics.signals import Posterior, SignalProcess, fit_signals
+from wrf_mi.receivers.array import bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.retrieve import mirror_order
+
+TOWARDS = np.array([3.0, 1.0, -0.5]) / np.linalg.norm([3.0, 1.0, -0.5])
+DICTIONARY = Covariances(np.array([4.0, 1.0, 0.3]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, CONE_DEG, count=60))
+ROUNDING = 1e-9
+"""Of sums of some hundred numbers of size one, through the inverse of a matrix of condition 1e4."""
+
+
+def drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A circular complex Gaussian vector."""
+    value, vector = np.linalg.eigh(covariance)
+    pair = rng.normal(size=(2, len(value))) / np.sqrt(2)
+    return vector @ (np.sqrt(np.maximum(value, 0)) * (pair[0] + 1j * pair[1]))
+
+
+def some_process(rows: int = 30, seed: int = 1, noise: float = 1e-3) -> SignalProcess:
+    """Of three components with shares of their own; two rows lie at one position."""
+    rng = np.random.default_rng(seed)
+    where = positions(rows, seed)
+    where[1] = where[0]
+    weight = rng.uniform(size=(3, DICTIONARY.count)) * (rng.uniform(size=(3, DICTIONARY.count)) < 0.1)
+    basis = np.linalg.qr(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3)))[0]
+    values = rng.normal(size=(rows, 3)) + 1j * rng.normal(size=(rows, 3))
+    values[1] = values[0]
+    return SignalProcess(where, values, DICTIONARY, basis, weight, noise * np.array([1.0, 2.0, 0.5]))
+
+
+# Covariances and their shares
+
+
+def test_each_covariance_is_one() -> None:
+    """Hermitian, one on the diagonal, positive semidefinite, and what its formula says."""
+    where = positions(12)
+    where[3] = where[7]
+    each = DICTIONARY(where)
+    assert each.shape == (DICTIONARY.count, 12, 12)
+    np.testing.assert_allclose(each, each.conj().swapaxes(1, 2), atol=ROUNDING)
+    np.testing.assert_allclose(np.diagonal(each, axis1=1, axis2=2), 1, atol=ROUNDING)
+    assert np.linalg.eigvalsh(each).min() > -ROUNDING
+    length, turn = divmod(DICTIONARY.count - 2, len(DICTIONARY.turns))
+    apart = where[2] - where[9]
+    expected = np.exp(-np.linalg.norm(apart) / DICTIONARY.lengths_m[length] + 1j * DICTIONARY.turns[turn] @ apart)
+    assert each[-2, 2, 9] == pytest.approx(expected, abs=ROUNDING)
+
+
+def test_sums_are_made_without_the_dictionary() -> None:
+    here, there = positions(7, 1), positions(5, 2)
+    weight = np.random.default_rng(0).uniform(size=(2, DICTIONARY.count))
+    weight[:, ::3] = 0
+    block = DICTIONARY(np.concatenate([here, there]))[:, :7, 7:]
+    np.testing.assert_allclose(
+        DICTIONARY.mixed(here, there, weight), np.tensordot(weight, block, 1), rtol=0, atol=ROUNDING * weight.sum()
+    )
+
+
+def test_departures_lie_in_the_cone() -> None:
+    turns = departures(TOWARDS, WAVENUMBER, CONE_DEG, count=400)
+    assert not turns[0].any()
+    leaving = turns / WAVENUMBER + TOWARDS
+    np.testing.assert_allclose(np.linalg.norm(leaving, axis=1), 1, atol=ROUNDING)
+    angle = np.degrees(np.arccos(np.clip(leaving @ TOWARDS, -1, 1)))
+    assert angle.max() < CONE_DEG
+    assert angle.max() > CONE_DEG - 10  # neighbours are 10 degrees apart
+    share = (1 - np.cos(np.radians(CONE_DEG))) / 2
+    assert len(turns) - 1 == pytest.approx(share * 400, rel=0.03)
+
+
+def test_sphere_is_covered_evenly() -> None:
+    directions = fibonacci_sphere(500)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=ROUNDING)
+    np.testing.assert_allclose(directions.T @ directions / 500, np.eye(3) / 3, atol=2e-3)
+    nearest = np.sort(cdist(directions, directions), axis=1)[:, 1]
+    assert nearest.min() > 0.7 * nearest.max()
+
+
+def test_each_step_raises_the_likelihood() -> None:
+    rng = np.random.default_rng(0)
+    each = DICTIONARY(positions(25))
+    signal = drawn(each[40] + 0.3 * each[0] + 0.01 * np.eye(25), rng)
+    costs = [fit_shares(signal, each, steps).cost for steps in range(12)]
+    # Shares of a ten-thousandth are dropped on the way, which may cost as much.
+    assert np.diff(costs).max() < 1e-4 * abs(costs[0])
+    assert costs[-1] < costs[0] - 5
+    shares = fit_shares(signal, each, 7)
+    covariance = np.tensordot(shares.weight, each, 1) + shares.noise * np.eye(25)
+    quadratic = (signal.conj() @ np.linalg.solve(covariance, signal)).real
+    # Of a circular complex vector the logarithm of the determinant counts whole, not half.
+    assert shares.cost == pytest.approx(quadratic + np.linalg.slogdet(covariance)[1])
+
+
+def test_shares_are_found_again() -> None:
+    """As far as one signal at 120 positions tells them; no less likely than the truth itself."""
+    rng = np.random.default_rng(1)
+    where = rng.uniform(-1.5, 1.5, (120, 3)) * WAVELENGTH_M * [1, 1, 0.3]
+    few = Covariances(np.array([6.0, 0.6]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, 60.0, 16))
+    each, truth = few(where), np.zeros(few.count)
+    turned, short = 2, slice(len(few.turns), None)
+    truth[turned], truth[short.start] = 2.0, 1.0
+    covariance = np.tensordot(truth, each, 1) + 0.1 * np.eye(120)
+    signal = drawn(covariance, rng)
+    shares = fit_shares(signal, each, 40)
+    quadratic = (signal.conj() @ np.linalg.solve(covariance, signal)).real
+    assert shares.cost < quadratic + np.linalg.slogdet(covariance)[1]
+    assert shares.weight.argmax() == turned
+    # A long coherence has few independent parts here: ten leave a third of the variance uncertain.
+    assert shares.weight[turned] == pytest.approx(2, rel=0.4)
+    assert shares.weight[short].sum() == pytest.approx(1, rel=0.4)
+    assert shares.noise == pytest.approx(0.1, rel=0.5)
+
+
+def test_nothing_but_rounding_is_no_signal() -> None:
+    """Components of fewer rows than elements: their likelihood says nothing, and is the same for all of them."""
+    each = DICTIONARY(positions(6))
+    rng = np.random.default_rng(0)
+    costs = [fit_shares(1e-17 * scale * rng.normal(size=6).astype(complex), each, 10, 1e-6).cost for scale in (1, 30)]
+    assert costs[0] == pytest.approx(costs[1], abs=1e-6)
+    assert np.isfinite(fit_shares(np.zeros(6, complex), each, 10).cost)
+
+
+# The process
+
+
+def test_prediction_is_that_of_a_gaussian_process() -> None:
+    process, where = some_process(), positions(4, seed=9)
+    posterior = process.predict(where)
+    every = np.concatenate([process.tx_pos_m, where])
+    components = process.signals @ process.basis.conj()
+    for c in range(3):
+        whole = np.tensordot(process.weight[c], DICTIONARY(every), 1)
+        own = whole[:30, :30] + process.noise[c] * np.eye(30)
+        cross = whole[30:, :30]
+        mean = cross @ np.linalg.solve(own, components[:, c])
+        left = whole[0, 0] - np.diagonal(cross @ np.linalg.solve(own, cross.conj().T)) + process.noise[c]
+        np.testing.assert_allclose(posterior.mean @ process.basis.conj()[:, c], mean, atol=1e-8)
+        np.testing.assert_allclose(posterior.variance[:, c], left.real, atol=1e-8)
+
+
+def test_prediction_passes_through_rows_and_forgets_them_far_away() -> None:
+    process = some_process(noise=1e-8)
+    at_rows = process.predict(process.tx_pos_m)
+    np.testing.assert_allclose(at_rows.mean, process.signals, atol=1e-4)
+    assert at_rows.ignorance.max() < 1e-6
+    away = process.predict(process.tx_pos_m[:1] + 1000.0)
+    assert np.abs(away.mean).max() < 1e-9
+    assert away.ignorance == pytest.approx([1.0])
+
+
+@pytest.mark.parametrize("radius_m", [0.0, 0.12, 0.25])
+def test_held_out_is_a_fit_without_those_rows(radius_m: float) -> None:
+    process, rows = some_process(), np.array([0, 4, 17])
+    found = process.held_out(radius_m, rows)
+    for number, row in enumerate(rows):
+        far = cdist(process.tx_pos_m[[row]], process.tx_pos_m)[0] > radius_m
+        assert 0 < far.sum() < 30
+        without = SignalProcess(
+            process.tx_pos_m[far], process.signals[far], DICTIONARY, process.basis, process.weight, process.noise
+        ).predict(process.tx_pos_m[[row]])
+        np.testing.assert_allclose(found.mean[number], without.mean[0], atol=1e-8)
+        np.testing.assert_allclose(found.variance[number], without.variance[0], atol=1e-8)
+
+
+def test_held_out_without_any_other_row_knows_nothing() -> None:
+    process = some_process()
+    found = process.held_out(100.0, np.array([3]))
+    assert np.abs(found.mean).max() < 1e-8
+    np.testing.assert_allclose(found.variance[0], process.prior, rtol=1e-8)
+
+
+def test_process_is_stored_and_read(tmp_path: Path) -> None:
+    process, where = some_process(), positions(3, seed=5)
+    np.savez(tmp_path / "process.npz", **process.arrays())
+    with np.load(tmp_path / "process.npz") as stored:
+        again = SignalProcess.from_arrays(dict(stored))
+    np.testing.assert_array_equal(again.predict(where).mean, process.predict(where).mean)
+    np.testing.assert_array_equal(again.predict(where).variance, process.predict(where).variance)
+
+
+SHAPES = {"symmetric": ELEMENTS_M, "without opposites": np.delete(planar_array(3, 3, 0.15), [0, 5], axis=0)}
+
+
+@pytest.mark.parametrize("elements_m", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("most", [100, 60])
+def test_phases_and_mirror_images_are_found(elements_m: np.ndarray, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever phase and mirror image each row comes with; where rows are many, shares are fitted to some of them."""
+    monkeypatch.setattr(module, "MOST_ROWS", most)
+    rng = np.random.default_rng(0)
+    where = positions(110, seed=2)
+    truth = signals(where, TOWARDS, elements_m)
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    opposite = mirror_order(elements_m)
+    given = truth.copy()
+    if opposite is not None:
+        exchanged = rng.uniform(size=len(given)) < 0.5
+        given[exchanged] = given[exchanged][:, opposite].conj()
+    else:
+        assert len(elements_m) == 7
+    given *= 3 * np.exp(2j * np.pi * rng.uniform(size=(len(given), 1)))
+    train, test = np.arange(100), np.arange(100, 110)
+    process = fit_signals(given[train], where[train], elements_m, DICTIONARY)
+    assert process.signals.shape == (100, len(elements_m))
+    # Not the mirror images, each as it was: a cone in the wrong direction would be less likely.
+    same = np.abs(np.einsum("nm,nm->n", process.signals.conj(), truth[train]))
+    assert same.min() > 1 - 1e-9
+    predicted = process.predict(where[test]).mean
+    overlap = np.abs(np.einsum("nm,nm->n", predicted.conj(), truth[test])) / np.linalg.norm(predicted, axis=1)
+    nearest = cdist(where[test], where[train]).argmin(axis=1)
+    copied = np.abs(np.einsum("nm,nm->n", truth[train][nearest].conj(), truth[test]))
+    assert (1 - overlap**2).mean() < 0.5 * (1 - copied**2).mean()
+
+
+def test_single_rows_are_turned_to_what_the_others_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the alignment of neighbours got wrong: a mirror image, and a phase."""
+    where, opposite = positions(60, seed=2), mirror_order(ELEMENTS_M)
+    assert opposite is not None
+    truth = signals(where, TOWARDS)
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    right = fit_signals(truth, where, ELEMENTS_M, DICTIONARY)
+    rows = right.signals.copy()
+    rows[7] = 1j * rows[7, opposite].conj()
+    rows[30] *= np.exp(2j)
+    wrong = SignalProcess(where, rows, DICTIONARY, right.basis, right.weight, right.noise)
+    turned = module._realigned(wrong, opposite)
+    angle = np.angle(np.einsum("nm,nm->n", right.signals.conj(), turned))
+    np.testing.assert_allclose(turned, right.signals * np.exp(1j * angle)[:, None], atol=ROUNDING)
+    assert np.ptp(angle) < 0.5  # all are turned a little by what was wrong
+    monkeypatch.setattr(module, "align_signals", lambda *given: rows)
+    fitted = fit_signals(truth, where, ELEMENTS_M, DICTIONARY).signals
+    assert np.abs(np.einsum("nm,nm->n", fitted.conj(), truth)).min() > 1 - ROUNDING
+
+
+def test_more_elements_than_rows() -> None:
+    where = positions(8)
+    process = fit_signals(signals(where, TOWARDS), where, ELEMENTS_M, DICTIONARY)
+    posterior = process.predict(positions(3, seed=1))
+    assert np.isfinite(posterior.mean).all()
+    assert ((posterior.ignorance > 0) & (posterior.ignorance <= 1)).all()
+
+
+# The spectrum that is expected
+
+
+@pytest.mark.parametrize("dtype", [np.complex128, np.complex64])
+def test_magnitude_is_rician(dtype: type) -> None:
+    """As SciPy has it, with a deviation of sqrt(variance / 2) in each part; far from zero too, in single precision."""
+    mean = np.array([0, 0.3, 1, 3, 10, 30, 100, 2000]).astype(dtype) * np.exp(0.7j)
+    variance = np.full(len(mean), 2.0, mean.real.dtype)
+    expected, deviation = rician(mean.astype(dtype), variance)
+    rel = 1e-5 if dtype is np.complex128 else 3e-4  # of the series where it begins; of float32's differences before
+    told = np.abs(mean.astype(complex))[:-2]  # beyond, SciPy overflows; there the mean is b + 1 / (2 b)
+    assert expected == pytest.approx([*rice.mean(told), 100.005, 2000.00025], rel=rel)
+    assert deviation == pytest.approx([*rice.std(told), 0.999975, 1.0], rel=rel)
+
+
+def test_magnitude_without_variance_is_known() -> None:
+    expected, deviation = rician(np.array([0, 2j, 1e-3]), np.zeros(3))
+    assert expected == pytest.approx([0, 2, 1e-3])
+    assert not deviation.any()
+
+
+def certain(mean: np.ndarray, variance: float) -> Posterior:
+    m = mean.shape[1]
+    basis = np.linalg.qr(np.random.default_rng(5).normal(size=(m, m)))[0].astype(complex)
+    return Posterior(mean, np.full(mean.shape, variance) * np.linspace(0.5, 1.5, m), basis, np.ones(m))
+
+
+@pytest.mark.parametrize("size", [(12, 24), (90, 360)])
+def test_known_signals_give_their_spectrum(size: tuple[int, int]) -> None:
+    """On any grid: extremes are sought as far apart as lobes of the array allow, not so many pixels.
+
+    A null is a cone; where its tip lies between the directions that are looked at, all is some per cent too low.
+    """
+    h = signals(positions(4), TOWARDS)
+    grey, deviation = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, *size)(certain(h, 1e-12))
+    np.testing.assert_allclose(
+        grey, minmax_scale(bartlett_spectrum(h, ELEMENTS_M, FREQUENCY_HZ, *size)), rtol=0, atol=0.03
+    )
+    assert deviation.max() < 1e-5
+
+
+def test_expected_spectrum_is_the_mean_of_many() -> None:
+    """Up to 1 / sqrt(64) of the deviation, which the report's own draws leave in the extremes."""
+    h = signals(positions(2), TOWARDS)
+    posterior = certain(h, 0.5 * float(np.square(np.abs(h)).mean()))
+    rng = np.random.default_rng(0)
+    pair = rng.normal(size=(2, 3000, 1, 9)) / np.sqrt(2)
+    noise = (pair[0] + 1j * pair[1]) * np.sqrt(posterior.variance)
+    drawn = minmax_scale(
+        bartlett_spectrum(posterior.mean + noise @ posterior.basis.T, ELEMENTS_M, FREQUENCY_HZ, 16, 32)
+    )
+    grey, deviation = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
+    assert np.abs(grey - drawn.mean(axis=0)).max() < 0.05
+    assert np.sqrt(np.square(grey - drawn.mean(axis=0)).mean()) < 0.02
+    # That the scale is a draw's own is not in the deviation stated.
+    assert deviation.mean() == pytest.approx(drawn.std(axis=0).mean(), rel=0.1)
+
+
+def test_report_of_another_process_is_its_own() -> None:
+    h = signals(positions(2), TOWARDS)
+    first = certain(h, 0.1)
+    turned = np.linalg.qr(np.random.default_rng(1).normal(size=first.basis.shape))[0].astype(complex)
+    second = replace(first, basis=turned, variance=first.variance * np.arange(1, 10))
+    used = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)
+    for posterior in (first, second, first):
+        fresh = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
+        np.testing.assert_array_equal(used(posterior), fresh)

@@ -1,0 +1,196 @@
+"""The registry of models: one from outside the package, by registration and by an installed entry point."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused
+
+import wrf_mi
+from wrf_mi import models
+from wrf_mi.core import InputError
+from wrf_mi.core.registry import Registry
+from wrf_mi.datasets import load
+from wrf_mi.models import Interrupted
+from wrf_mi.runs.api import evaluate_run, open_run, resume, train
+from wrf_mi.runs.compare import compare
+
+PACKAGE = '''
+"""A package with a model: the mean of the nearest training rows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrf_mi.core import Prediction
+from wrf_mi.models import Fitted, Model
+
+
+@dataclass(frozen=True)
+class NearestSettings:
+    neighbours: int = 3
+
+
+class Nearest(Fitted):
+    def __init__(self, arrays, settings):
+        self.kept, self.settings = arrays, settings
+
+    def predict(self, inputs, receiver):
+        apart = np.linalg.norm(inputs.tx_pos_m[:, None] - self.kept["tx_pos"], axis=2)
+        seen = self.kept["observation"][receiver, np.argsort(apart, axis=1)[:, : self.settings.neighbours]]
+        return Prediction(np.nanmean(seen, axis=1), np.nanstd(seen, axis=1) + 1)
+
+    def arrays(self):
+        return self.kept
+
+    def facts(self):
+        return {"rows": len(self.kept["tx_pos"])}
+
+
+def fit(problem, split, session):
+    session.report("nearest rows", 0.0)
+    record, rows = problem.record, problem.rows(split)
+    kept = {"tx_pos": record.tx_pos_m[rows], "observation": record.observation[:, rows]}
+    return Nearest(kept, problem.settings)
+
+
+def load(arrays, problem, folder):
+    return Nearest(arrays, problem.settings)
+
+
+MODEL = Model("nearest", ("rssi",), NearestSettings, fit, load, "this test")
+'''
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    module = types.ModuleType("nearest_of_others")
+    sys.modules[module.__name__] = module  # where its dataclass looks for its types
+    exec(PACKAGE, module.__dict__)
+    models.register(module.MODEL)
+    with pytest.raises(InputError, match="model 'nearest': there is one of that name; choose another"):
+        models.register(module.MODEL)
+    yield
+    del models._MODELS._known["nearest"], sys.modules[module.__name__]
+
+
+def test_registered_model_is_trained_resumed_evaluated_asked_and_compared(
+    registered: None, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
+        train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
+    refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    told: list[tuple[str, float]] = []
+    run = resume(out, listen=lambda stage, share, _: told.append((stage, share)))
+    assert told == [("nearest rows", 0.0)]
+    assert (run.metrics["model"], run.metrics["rows"]) == ("nearest", 24)
+    assert 0 < run.metrics["inside_90"] <= 1
+    assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
+    record = load(flat_folder)
+    one = open_run(out).predict(record.tx_pos_m[:1], "anchor1")
+    nearest = np.argsort(np.linalg.norm(record.tx_pos_m[:24] - record.tx_pos_m[0], axis=1))[:2]
+    assert one.mean == pytest.approx([record.observation[0, nearest].mean()])
+    with pytest.raises(InputError, match="does not know how the transmitter is turned; leave heading_rad away"):
+        run.predict(record.tx_pos_m[:1], 0, [0.5])
+    other = train(flat_folder, tmp_path / "blocked", "nearest", split="blocked")
+    compare([out, other.folder], tmp_path / "page")
+    with (tmp_path / "page" / "compare.csv").open(newline="") as file:
+        assert [row["model"] for row in csv.DictReader(file)][:2] == ["nearest", "nearest"]
+    refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene", capsys)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a Python that has the package installed."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "nearest_of_others.py").write_text(PACKAGE)
+    info = site / "nearest_of_others-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: nearest-of-others\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[wrf_mi.models]\nnearest = nearest_of_others:MODEL\n")
+    path = os.pathsep.join([str(site), *(part for part in sys.path if part)])
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def test_model_of_an_installed_package_is_one_of_the_commands(
+    installed: dict[str, str], flat_folder: Path, tmp_path: Path
+) -> None:
+    def command(*arguments: Any) -> str:
+        words = [sys.executable, "-m", "wrf_mi.cli", *map(str, arguments)]
+        done = subprocess.run(words, env=installed, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    out = tmp_path / "run"
+    trained = json.loads(
+        command("train", flat_folder, "--model", "nearest", "--set", "neighbours=1", "--out", out, "--json")
+    )
+    for name in ("model.npz", "metrics.json", "predictions.npz"):  # as a run that was stopped
+        (out / name).unlink()
+    resumed, scored = (json.loads(command(*what, out, "--json")) for what in (("train", "--resume"), ("evaluate",)))
+    assert trained["abs_error_db"] == resumed["abs_error_db"] == scored["abs_error_db"]
+    (tmp_path / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
+    command("predict", out, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz") as predicted:
+        assert predicted["prediction"].shape == predicted["std"].shape == (2, 2)
+    command("compare", out, "--out", tmp_path / "page")
+    assert "nearest" in (tmp_path / "page" / "index.html").read_text()
+
+
+OLD = {
+    "field": "dataset: here\nsplit: official\nn_train: null\nseed: 0\nversions: {}\nsettings: {model: wrf-gs+}\n",
+    "hybrid": "model: hybrid\ndataset: here\nsplit: official\nseed: 0\nsettings: []\n",
+    "baseline": "model: idw\ndataset: here\nsplit: official\nseed: 0\nsettings: {neighbours: 4}\n",
+    "traced": "model: ray-tracing\ndataset: here\nscene: room\noptions: {max_depth: 3}\n",
+}
+
+
+@pytest.mark.parametrize("kind", OLD)
+def test_runs_of_version_0_1_are_refused_by_every_command(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = tmp_path / "old", tmp_path / "out"
+    run.mkdir()
+    (run / "config.yaml").write_text(OLD[kind])
+    (run / "metrics.json").write_text('{"task": "rssi"}')
+    if kind in ("hybrid", "baseline"):
+        (run / {"hybrid": "hybrid.npz", "baseline": "fitted.npz"}[kind]).write_bytes(b"old")
+    (tmp_path / "tx.csv").write_text("x,y,z\n1,2,1\n")
+    message = f"^wrf-mi: {run}: a run of version 0.1; train it anew, or use version 0.1$"
+    for arguments in (
+        ["train", "--resume", run],
+        ["evaluate", run],
+        ["evaluate", run, "--split", "random"],
+        ["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz"],
+        ["compress", run, "--out", out],
+        ["compare", run, "--out", out],
+    ):
+        refused(arguments, message, capsys)
+    for use in (wrf_mi.open_run, wrf_mi.resume, wrf_mi.evaluate_run, lambda path: wrf_mi.scene_view(path, 0)):
+        with pytest.raises(InputError, match=r"a run of version 0\.1"):
+            use(run)
+    assert not out.exists()
+    assert not (tmp_path / "p.npz").exists()
+    if kind == "field":
+        assert call(["train", "--help"], capsys)[0] == 0
+
+
+def test_registry_imports_an_entry_when_it_is_asked_for() -> None:
+    registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
+    assert list(registry) == ["json"]
+    assert registry["json"] is json.loads
+    registry.add("other", json.dumps)
+    assert len(registry) == 2
+    with pytest.raises(KeyError):
+        registry["none"]

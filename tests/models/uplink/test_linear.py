@@ -1,0 +1,154 @@
+"""The linear map from uplink to downlink: exact where it is one, the weights and the penalty of its docstring."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.models.method import Inputs, inputs_of
+from wrf_mi.models.uplink.csi_bands import relative_error
+from wrf_mi.models.uplink.linear import METHOD, PENALTIES, LinearMap, LinearSettings, choose
+from wrf_mi.tasks.conditions import normalised_uplink
+from wrf_mi.training.session import FitSession
+
+ROWS, ANTENNAS, UP, DOWN = 40, 3, 6, 5
+EXACT = 1e-5
+"""Coefficients are stored in single precision; the least penalty is 1e-10 of the uplink's energy."""
+ROUNDING = 1e-9
+"""Of float64, squared by the normal equations."""
+
+
+def complex_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return rng.standard_normal((*shape, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+
+
+def record_of(uplink: np.ndarray, downlink: np.ndarray) -> Record:
+    receiver = Receiver("base-station", np.full(3, np.nan), np.array([0.0, 0.0, 0.0, 1.0]))
+    nowhere = np.full((len(uplink), 3), np.nan)
+    return Record(
+        "made", "csi", nowhere, (receiver,), downlink[None].astype(np.complex64), uplink=uplink.astype(np.complex64)
+    )
+
+
+def linear_record(noise: float = 0.0) -> tuple[Record, np.ndarray]:
+    """A downlink that is a linear map of the uplink, rows of very different size, and the map [UP, DOWN]."""
+    rng = np.random.default_rng(0)
+    matrix = complex_normal(rng, UP, DOWN)
+    uplink = complex_normal(rng, ROWS, ANTENNAS, UP) * 10 ** rng.uniform(-6, -3, (ROWS, 1, 1))
+    size = np.sqrt(np.square(np.abs(uplink)).mean(axis=(1, 2), keepdims=True))
+    return record_of(uplink, uplink @ matrix + noise * size * complex_normal(rng, ROWS, ANTENNAS, DOWN)), matrix
+
+
+def split_of(train: int = 24, validation: int = 6) -> Split:
+    rows = np.arange(ROWS)
+    return Split("made", 0, rows[:train], rows[train : train + validation], rows[train + validation :])
+
+
+def fit(record: Record, split: Split, **settings: float) -> LinearMap:
+    fitted = METHOD.fit(record, split, LinearSettings(**settings), 0, FitSession())
+    assert isinstance(fitted, LinearMap)
+    return fitted
+
+
+def test_exact_on_a_noise_free_linear_relation() -> None:
+    record, matrix = linear_record()
+    split = split_of()
+    fitted = fit(record, split)
+    assert fitted.penalty == PENALTIES[0]
+    np.testing.assert_allclose(fitted.matrix, matrix, atol=EXACT)
+    found, truth = fitted.predict(inputs_of(record, split.test), 0), record.observation[0, split.test]
+    assert found.dtype == np.complex64
+    assert relative_error(found, truth).max() < EXACT**2
+
+
+def test_the_penalty_of_the_validation_rows_and_all_training_rows() -> None:
+    """Against least squares with rows for the penalty below, antenna by antenna as they are in the docstring."""
+    record, _ = linear_record(noise=1.5)
+    split = split_of(8, 12)
+    heard: list[float] = []
+    session = FitSession(listen=lambda stage, share, progress: heard.append(share))
+    fitted = METHOD.fit(record, split, LinearSettings(), 0, session)
+    assert isinstance(fitted, LinearMap)
+    assert heard[-1] == 1
+    assert heard == sorted(heard)
+
+    def solved(rows: np.ndarray, penalty: float) -> np.ndarray:
+        assert record.uplink is not None
+        u, d = record.uplink[rows].astype(complex), record.observation[0, rows].astype(complex)
+        divisor = normalised_uplink(u)[1][..., None]
+        weight = np.abs(divisor) / np.sqrt(np.square(np.abs(d)).sum(axis=(1, 2), keepdims=True))
+        x, y = (weight * u / divisor).reshape(-1, UP), (weight * d / divisor).reshape(-1, DOWN)
+        damping = np.sqrt(penalty * np.square(np.abs(x)).sum() / UP)
+        x, y = np.vstack([x, damping * np.eye(UP)]), np.vstack([y, np.zeros((UP, DOWN))])
+        return np.asarray(np.linalg.lstsq(x, y, rcond=None)[0])
+
+    def error(penalty: float) -> float:
+        assert record.uplink is not None
+        truth = record.observation[0, split.validation]
+        found = record.uplink[split.validation] @ solved(split.train, penalty)
+        return float(np.median(relative_error(found.reshape(len(truth), -1), truth.reshape(len(truth), -1))))
+
+    assert fitted.penalty == min(PENALTIES, key=error)
+    assert PENALTIES[0] < fitted.penalty < PENALTIES[-1], "something is chosen"
+    np.testing.assert_allclose(fitted.matrix, solved(split.all_train, fitted.penalty), rtol=ROUNDING, atol=ROUNDING)
+    assert fit(record, split, penalty=0.5).penalty == 0.5
+
+
+def test_rows_count_by_their_relative_error() -> None:
+    """Rows of other amplitudes change nothing, and a row without energy in the downlink is no row."""
+    record, _ = linear_record(noise=0.3)
+    assert record.uplink is not None
+    split, size = split_of(), np.float32(10) ** np.arange(ROWS)[:, None, None].clip(0, 5)
+    larger = replace(record, observation=record.observation * size, uplink=record.uplink * size)
+    expected = fit(record, split).matrix
+    np.testing.assert_allclose(fit(larger, split).matrix, expected, rtol=EXACT, atol=EXACT)
+    silent = record.observation.copy()
+    silent[0, 3] = 0
+    fewer = replace(split, train=np.delete(split.train, 3))
+    muted = fit(replace(record, observation=silent), split, penalty=0.1).matrix
+    np.testing.assert_allclose(muted, fit(record, fewer, penalty=0.1).matrix, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_without_validation_rows_training_rows_choose() -> None:
+    record, _ = linear_record(noise=1.5)
+    rows = np.arange(20)
+    split = Split("made", 0, rows, rows[:0], np.arange(20, ROWS))
+    expected = choose(record, np.setdiff1d(rows, rows[::5]), rows[::5], lambda what, share: None)
+    assert fit(record, split).penalty == expected
+    two = fit(record, replace(split, train=rows[:2]))
+    assert np.isfinite(two.matrix).all()
+
+
+def test_rows_that_were_not_received_are_left_out() -> None:
+    record, _ = linear_record(noise=0.3)
+    lost = record.observation.copy()
+    lost[0, 2] = np.nan
+    fewer = replace(split_of(), train=np.delete(split_of().train, 2))
+    found = fit(replace(record, observation=lost), split_of()).matrix
+    np.testing.assert_array_equal(found, fit(record, fewer).matrix)
+
+
+def test_an_antenna_without_signal_is_predicted_as_silent() -> None:
+    record, _ = linear_record()
+    uplink = np.ones((2, ANTENNAS, UP), np.complex64)
+    uplink[1, 2] = 0
+    found = fit(record, split_of()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0)
+    assert not found[1, 2].any()
+    assert found[1, 1].all()
+
+
+def test_what_is_refused() -> None:
+    record, _ = linear_record()
+    for penalty in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(InputError, match="choose a positive number, or null"):
+            LinearSettings(penalty=penalty)
+    with pytest.raises(InputError, match="made: no training row's downlink has any energy"):
+        fit(replace(record, observation=np.zeros_like(record.observation)), split_of())
+    fitted, where = fit(record, split_of()), np.full((2, 3), np.nan)
+    with pytest.raises(InputError, match="without uplink"):
+        fitted.predict(Inputs(where), 0)
+    with pytest.raises(InputError, match=r"fitted on \(3, 6\)"):
+        fitted.predict(Inputs(where, uplink=np.ones((2, ANTENNAS, DOWN), np.complex64)), 0)

@@ -1,0 +1,345 @@
+"""Methods from the uplink: exact where theory says so, better than no method elsewhere, clear about bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+from small_fits import network_settings
+
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.models.method import Inputs, inputs_of
+from wrf_mi.models.networks import nerf2
+from wrf_mi.models.networks.nerf2_field import Nerf2Settings
+from wrf_mi.models.networks.nerf2_march import Networks
+from wrf_mi.models.networks.training import network_adam
+from wrf_mi.models.uplink import fire, linear, optml, r2f2
+from wrf_mi.models.uplink.csi_bands import Bands, bands_of
+from wrf_mi.models.uplink.fire import FireSettings
+from wrf_mi.models.uplink.linear import LinearSettings
+from wrf_mi.models.uplink.optml import OptMLSettings
+from wrf_mi.models.uplink.path_network import Simulation
+from wrf_mi.models.uplink.r2f2 import R2F2Settings
+from wrf_mi.models.uplink.uplink_paths import find_paths
+from wrf_mi.models.uplink.uplink_waves import waves_of
+from wrf_mi.tasks.scores import cea_db
+from wrf_mi.training.session import FitSession
+
+CARRIER_HZ, SPACING_HZ, HALF = 2.4e9, 312.5e3, 26
+OFFSETS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)]) * SPACING_HZ
+"""The 52 used subcarriers of 802.11 at 20 MHz, without the carrier."""
+HZ = CARRIER_HZ + OFFSETS
+EXACT_DB = 60.0
+"""Coefficients are stored as complex64, whose 140 dB the step to the next band and single antennas in a fade may cost
+some; a wrong path, or one of them missing, gives less than 30."""
+METHODS = {"linear": linear.METHOD, "fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
+"""That need the uplink alone."""
+FIELDS = {"nerf2": nerf2.METHOD}
+SMALL = {
+    "linear": LinearSettings(),
+    "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
+    "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
+    "optml": OptMLSettings(
+        steps=5,
+        batch=4,
+        simulation=Simulation(channels=12, paths=2),
+        width=4,
+        rounds=1,
+        wavefront="plane",
+        max_distance_m=30.0,
+    ),
+    "nerf2": Nerf2Settings(12, 8, networks=Networks(layers=2, width=8), sphere_rays=8, samples=2),
+}
+
+
+def channels(gains, theta, elements, spherical):
+    """Coefficients [n, antennas, 52] of paths: gains [n, k], distances and cosines [n, k, 3]."""
+    d, along = theta[..., :1], theta[..., 1:] @ elements[:, :2].T
+    s = np.sqrt(d * d - 2 * d * along + np.square(elements).sum(axis=1)) if spherical else d - along
+    amplitude = d / s if spherical else np.ones_like(s)
+    return np.einsum("nk,nka,nkaf->naf", gains, amplitude, np.exp(-2j * np.pi / speed_of_light * s[..., None] * HZ))
+
+
+def record_of(h, elements=None, known=True):
+    """A record of coefficients [n, antennas, 52]."""
+    receiver = Receiver("bs", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    return Record(
+        "made",
+        "csi",
+        np.full((len(h), 3), np.nan),
+        (receiver,),
+        h[None, :, :, HALF:].astype(np.complex64),
+        frequencies_hz=HZ[HALF:] if known else None,
+        uplink_hz=HZ[:HALF] if known else None,
+        uplink=h[:, :, :HALF].astype(np.complex64),
+    ).with_array(elements)
+
+
+def split_of(n, test=0):
+    """First rows train, the next fifth validates, the last ``test`` test."""
+    rows = np.arange(n)
+    cut = (n - test) - (n - test) // 5
+    return Split("made", 0, rows[:cut], rows[cut : n - test], rows[n - test :])
+
+
+def noisy(h, snr_db, rng):
+    """With white noise so far below each row's mean power."""
+    deviation = np.sqrt(np.square(np.abs(h)).mean(axis=(1, 2), keepdims=True) * 10 ** (-snr_db / 10) / 2)
+    return h + deviation * (rng.standard_normal((*h.shape, 2)) @ np.array([1, 1j]))
+
+
+def sparse(n, paths, rng, near=10.0, far=60.0):
+    """Gains and parameters of paths whose directions lie in different quarters of the sky."""
+    centres = np.array([[-0.5, -0.4], [0.5, -0.4], [-0.5, 0.4], [0.5, 0.4]])[:paths]
+    cosines = centres + rng.uniform(-0.15, 0.15, (n, paths, 2))
+    theta = np.concatenate([rng.uniform(near, far, (n, paths, 1)), cosines], axis=2)
+    return rng.uniform(0.4, 1, (n, paths)) * np.exp(2j * np.pi * rng.random((n, paths))), theta
+
+
+@pytest.fixture(scope="module")
+def elements():
+    return planar_array(6, 8, speed_of_light / CARRIER_HZ / 2)
+
+
+@pytest.fixture(scope="module")
+def walk(elements):
+    """80 rows of a user who walks past six image sources, noise-free, and the record at 25 dB."""
+    rng = np.random.default_rng(0)
+    gains, theta = sparse(1, 4, rng, 3.0, 25.0)
+    along = np.linspace(0, 1, 80)[:, None]
+    moved = np.repeat(theta, 80, axis=0)
+    moved[..., 0] += along * rng.uniform(-1.5, 1.5, 4)
+    moved[..., 1:] += along[..., None] * rng.uniform(-0.2, 0.2, (4, 2))
+    truth = channels(np.repeat(gains, 80, axis=0), moved, elements, spherical=True)
+    return truth, record_of(noisy(truth, 25, rng), elements)
+
+
+@pytest.mark.parametrize("wavefront", ["plane", "spherical"])
+def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
+    rng = np.random.default_rng(1)
+    h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
+    record = record_of(h, elements)
+    fitted = r2f2.METHOD.fit(record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, FitSession())
+    assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0), h[:, :, HALF:])
+    assert cea.min() > EXACT_DB
+
+
+def test_r2f2_without_elements_is_exact_where_delays_are_apart():
+    rng = np.random.default_rng(2)
+    delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
+    gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
+    h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
+    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, FitSession())
+    record = record_of(h)
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0), h[:, :, HALF:])
+    assert fitted.kind == "free"
+    assert cea.min() > EXACT_DB
+
+
+def test_r2f2_finds_which_subcarriers_are_left_out():
+    rng = np.random.default_rng(3)
+    gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
+    waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
+    record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
+    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, FitSession())
+    assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
+
+
+def test_noise_ends_the_search(elements):
+    rng = np.random.default_rng(4)
+    h = channels(*sparse(8, 3, rng), elements, spherical=False)
+    record = record_of(noisy(h, 25, rng), elements)
+    bands = bands_of(record, SPACING_HZ)
+    waves = waves_of("plane", bands, 100.0)
+    paths = find_paths(waves, record.uplink.astype(complex), 10, 2, 10)
+    assert (paths.present.sum(axis=1) == 3).all(), "no path is missed, none fits noise"
+    cea = cea_db(waves.evaluate(paths.theta, paths.gains, bands.downlink_hz), h[:, :, HALF:])
+    # 15 real numbers from 1,248 noisy coefficients: noise falls by 22 dB, of which the next band costs about 10.
+    assert np.median(cea) > 30
+
+
+@pytest.mark.parametrize("kind", ["plane", "spherical", "free"])
+def test_step_of_least_squares_goes_down_the_gradient(kind, elements):
+    """Variable projection: the slope of the residual's energy with the gains at their best, by finite differences."""
+    rng = np.random.default_rng(5)
+    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), elements[:, :2], True)
+    waves = waves_of(kind, bands, 100.0)
+    h = rng.standard_normal((2, len(elements), HALF, 2)) @ np.array([1, 1j])
+    theta = np.concatenate([rng.uniform(2, 20, (2, 3, 1)), rng.uniform(-0.5, 0.5, (2, 3, 2))], axis=2)
+    theta = theta[..., :1] if kind == "free" else theta
+    present = np.array([[True, True, True], [True, False, True]])
+    right = waves.normal(theta, waves.solve(theta, present, h))[1]
+    step, numbers = 1e-5, theta.shape[1] * theta.shape[2]
+    for number in range(numbers):
+        moved = np.zeros(numbers)
+        moved[number] = step
+        up, down = (waves.solve(theta + s * moved.reshape(theta.shape[1:]), present, h).energy for s in (1, -1))
+        # Curvatures of up to 1e6 times the step, squared, and rounding of energies of 2,500.
+        np.testing.assert_allclose(-2 * right[:, number], (up - down) / (2 * step), rtol=1e-4, atol=1e-2)
+
+
+def test_fire_beats_copying_the_uplink(walk):
+    truth, record = walk
+    split = split_of(80, 16)
+    settings = network_settings(FireSettings, 375, 128, 2e-3, 100, sample="antenna", width=64, latent=16)
+    fitted = fire.METHOD.fit(record, split, settings, 0, FitSession())
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
+
+
+def test_a_row_without_downlink_leaves_fire_as_it_is(walk):
+    truth, record = walk
+    split, settings = split_of(80, 16), FireSettings(steps=75, sample="row", width=32)
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    observation = record.observation.copy()
+    observation[0, :2] = 0
+    lost = replace(record, observation=observation)
+    first, second = (
+        np.median(cea_db(fire.METHOD.fit(one, split, settings, 0, FitSession()).predict(inputs, 0), down))
+        for one in (record, lost)
+    )
+    assert second > first - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
+
+
+def test_a_linear_map_beats_copying_the_uplink(walk):
+    truth, record = walk
+    split = split_of(80, 16)
+    fitted = linear.METHOD.fit(record, split, LinearSettings(), 0, FitSession())
+    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    assert mine > copied + 10, "its phase alone, put right, gives 2 dB"
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    # Methods other than fields look at no pose.
+    [(name, "nothing") for name in METHODS]
+    + [(name, known) for name in FIELDS for known in ("nothing", "its position", "its orientation")],
+)
+def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
+    """As Argos' captures are: the base station's place is not known, nor its elements and frequencies.
+
+    Networks of ten steps predict no better than zeros; the other methods reach a median CEA of 15 dB.
+    """
+    truth, _ = walk
+    place = np.array([1.0, 2.0, 3.0]) if known == "its position" else np.full(3, np.nan)
+    turned = np.array([0.5, 0.5, 0.5, 0.5]) if known == "its orientation" else np.full(4, np.nan)
+    record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
+    settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
+    method, split = (METHODS | FIELDS)[name], split_of(30, 5)
+    fitted = method.fit(record, split, settings, 0, FitSession())
+    inputs = inputs_of(record, split.test)
+    found = fitted.predict(inputs, 0)
+    assert found.shape == (5, 6, HALF)
+    assert np.isfinite(found).all()
+    assert np.abs(found).min() > 0
+    if name in ("linear", "r2f2", "optml"):
+        assert np.median(cea_db(found, record.observation[0][split.test])) > 15
+    np.testing.assert_array_equal(method.load(fitted.arrays(), record).predict(inputs, 0), found)
+
+
+def test_optml_starts_close_enough_with_few_steps(elements):
+    rng = np.random.default_rng(6)
+    h = channels(*sparse(20, 3, rng), elements, spherical=False)
+    record, split = record_of(noisy(h, 25, rng), elements), split_of(20, 8)
+    settings = OptMLSettings(
+        steps=125,
+        batch=8,
+        optimiser=network_adam(5e-3),
+        simulation=Simulation(channels=150, paths=4),
+        width=16,
+        wavefront="plane",
+        rounds=2,
+        max_distance_m=60.0,
+    )
+    fitted = optml.METHOD.fit(record, split, settings, 0, FitSession())
+    cea = cea_db(fitted.predict(inputs_of(record, split.test), 0), h[split.test][:, :, HALF:])
+    assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_loaded_predicts_the_same(name, walk, tmp_path):
+    _, record = walk
+    split = split_of(80, 16)
+    fitted = METHODS[name].fit(record, split, SMALL[name], 0, FitSession())
+    arrays = fitted.arrays()
+    assert not any(key.startswith("run/") for key in arrays)
+    np.savez(tmp_path / "a.npz", **arrays)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as stored:
+        again = METHODS[name].load(dict(stored), replace(record, observation=np.zeros_like(record.observation)))
+    inputs = inputs_of(record, split.test[:5])
+    prediction = fitted.predict(inputs, 0)
+    assert prediction.shape == (5, 48, HALF)
+    assert prediction.dtype == np.complex64
+    np.testing.assert_array_equal(again.predict(inputs, 0), prediction)
+
+
+def broken(record, case):
+    """A record with one thing wrong."""
+    nan = record.uplink.copy()
+    nan[3, 2, 1] = complex(np.nan, 0)
+    lost = record.observation.copy()
+    lost[0, 3, 2, 1] = complex(0, np.nan)
+    return {
+        "no uplink": lambda: replace(record, uplink=None),
+        "uplink frequencies": lambda: replace(record, uplink_hz=record.uplink_hz[:-1]),
+        "downlink frequencies": lambda: replace(record, frequencies_hz=record.frequencies_hz[:-1]),
+        "antennas": lambda: replace(record, uplink=record.uplink[:, :-1]),
+        "array": lambda: record.with_array(record.receivers[0].array_m[:-1]),
+        "two receivers": lambda: replace(
+            record, receivers=record.receivers * 2, observation=np.repeat(record.observation, 2, axis=0)
+        ),
+        "NaN uplink": lambda: replace(record, uplink=nan),
+        "NaN downlink": lambda: replace(record, observation=lost),
+    }[case]()
+
+
+BAD = {
+    "no uplink": "has no uplink",
+    "uplink frequencies": "26 uplink subcarriers and 25 frequencies",
+    "downlink frequencies": "26 subcarriers and 25 frequencies",
+    "antennas": "and 48 antennas",
+    "array": "47, 3",
+    "two receivers": "needs one receiver",
+    "NaN uplink": "row 3: uplink, 1 of",
+    "NaN downlink": "row 3: 1 of",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "text"),
+    # A linear map does not look at the array.
+    [(name, case, text) for name in METHODS for case, text in BAD.items() if (name, case) != ("linear", "array")],
+)
+def test_bad_records_are_named(name, case, text, walk):
+    with pytest.raises(InputError, match=text):
+        METHODS[name].fit(broken(walk[1], case), split_of(80), SMALL[name], 0, FitSession())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_one_row_is_too_few(name, walk):
+    nothing = np.zeros(0, np.int64)
+    split = Split("made", 0, np.array([0]), nothing, nothing)
+    with pytest.raises(InputError, match="1 training row"):
+        METHODS[name].fit(walk[1], split, SMALL[name], 0, FitSession())
+
+
+def test_bad_inputs_to_a_prediction_are_named(walk):
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
+    where = np.full((2, 3), np.nan)
+    with pytest.raises(InputError, match="without uplink"):
+        fitted.predict(Inputs(where), 0)
+    with pytest.raises(InputError, match="fitted on"):
+        fitted.predict(Inputs(where, uplink=np.ones((2, 48, 25), np.complex64)), 0)
+    with pytest.raises(InputError, match="not finite"):
+        fitted.predict(Inputs(where, uplink=np.full((2, 48, 26), np.nan, np.complex64)), 0)
+
+
+def test_a_dead_row_is_predicted_as_silence(walk):
+    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
+    assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()

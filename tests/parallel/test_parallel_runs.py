@@ -1,0 +1,201 @@
+"""`predict` and `trace` on two workers of which one is lost: the same files as of one process."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from calling import call, refused
+from made_flat import write_flat
+from made_waves import wave_record
+from small_fits import official, settings
+from worker_tasks import Lossy
+from wrf_mi_bench.bench import BenchFailed, bench, case_folder
+
+from wrf_mi import parallel
+from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import load, write_spectrum_folder
+from wrf_mi.models import ray_tracing
+from wrf_mi.parallel import Scheduler, open_scheduler
+from wrf_mi.runs.api import predict_to_file, train
+from wrf_mi.scene.make import make_scene
+from wrf_mi.tracing import TraceOptions
+
+PRODUCTS = 1e-5
+"""Share of the largest value by which hybrids and operators may differ: a product of matrices adds in an order that
+depends on how many columns it has. Splatted fields and traces are bit-identical."""
+POSITIONS = 24
+
+
+@pytest.fixture(scope="module")
+def two() -> Iterator[Scheduler]:
+    with open_scheduler("local:2") as workers:
+        yield workers
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Signal strengths at a few places."""
+    return write_flat(tmp_path_factory.mktemp("data") / "flat", rows=6, held_out=2)
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several parts of few positions."""
+    monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 2)
+
+
+@pytest.fixture(scope="module")
+def room(flat: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scene(flat / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+def positions(record: Record, rows: int = POSITIONS) -> np.ndarray:
+    """New places among those of a record."""
+    low, high = record.tx_pos_m.min(axis=0), record.tx_pos_m.max(axis=0)
+    return np.random.default_rng(6).uniform(low, high, (rows, 3))
+
+
+def stored(file: Path) -> dict[str, np.ndarray]:
+    with np.load(file, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def both(
+    run: Path, tx_pos_m: np.ndarray, two: Scheduler, folder: Path, heading: np.ndarray | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Predictions of one process, and of two workers of which one is lost."""
+    predict_to_file(run, tx_pos_m, folder / "serial.npz", heading)
+    lossy = Lossy(two, folder)
+    predict_to_file(run, tx_pos_m, folder / "parallel.npz", heading, lossy)
+    lossy.assert_one_was_lost()
+    serial, parallel = stored(folder / "serial.npz"), stored(folder / "parallel.npz")
+    assert serial.keys() == parallel.keys()
+    np.testing.assert_array_equal(parallel["row"], np.arange(len(tx_pos_m)))
+    np.testing.assert_array_equal(parallel["tx_pos"], tx_pos_m)
+    return serial, parallel
+
+
+def assert_same_bits(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    assert one.keys() == other.keys()
+    for key in one:
+        assert one[key].dtype == other[key].dtype, key
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+def assert_close(one: dict[str, np.ndarray], other: dict[str, np.ndarray], *keys: str) -> None:
+    for key in keys:
+        np.testing.assert_allclose(other[key], one[key], rtol=0, atol=PRODUCTS * np.abs(one[key]).max(), err_msg=key)
+
+
+@pytest.mark.parametrize("model", ["wrf-gs+", "wrf-gs"])
+def test_field_predicts_the_same(model: str, two_gateways: Record, two: Scheduler, tmp_path: Path) -> None:
+    """One is splatted; the other is a product of matrices."""
+    folder = write_spectrum_folder(tmp_path / "made-here", two_gateways, bits=16)
+    record = load(folder)
+    run = train(
+        record, tmp_path / "run", model, settings=settings("steps=4", model=model), split=official(record)
+    ).folder
+    serial, parallel = both(run, positions(record), two, tmp_path)
+    assert serial["prediction"].shape == (2, POSITIONS, *record.observation.shape[-2:])
+    assert np.ptp(serial["prediction"]) > 0
+    if model == "wrf-gs":
+        assert_close(serial, parallel, "prediction")
+    else:
+        assert_same_bits(serial, parallel)
+
+
+def test_traced_run_is_the_same_and_predicts_the_same(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
+    """With the number of rays settled by the search itself, which looks at all positions."""
+    options = TraceOptions(max_depth=1, rays="auto")
+    serial = train(flat, tmp_path / "serial", "ray-tracing", scene=room, settings=options).folder
+    lossy = Lossy(two, tmp_path)
+    parallel = train(flat, tmp_path / "parallel", "ray-tracing", scene=room, settings=options, scheduler=lossy).folder
+    lossy.assert_one_was_lost()
+    for file in ("paths.npz", "predictions.npz", "split.npz"):
+        assert_same_bits(stored(serial / file), stored(parallel / file))
+    for file in tmp_path.glob("begun"):
+        file.unlink()
+    assert_same_bits(*both(serial, positions(load(flat)), two, tmp_path))
+
+
+def test_paths_drawn_at_random_are_the_same(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
+    """Diffuse reflections are searched from receivers, diffraction from transmitters."""
+    for kind in ({"scattering": True}, {"diffraction": True}):
+        options = TraceOptions(max_depth=1, rays=1 << 8, **kind)
+        name = next(iter(kind))
+        serial = train(flat, tmp_path / f"{name}-serial", "ray-tracing", scene=room, settings=options).folder
+        parallel = train(
+            flat, tmp_path / f"{name}-parallel", "ray-tracing", scene=room, settings=options, scheduler=two
+        ).folder
+        arrays = stored(serial / "paths.npz")
+        assert (arrays["interactions"] == {"scattering": 2, "diffraction": 8}[name]).any()
+        assert_same_bits(arrays, stored(parallel / "paths.npz"))
+
+
+def test_hybrids_predict_the_same(flat: Path, two: Scheduler, tmp_path: Path) -> None:
+    waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
+    for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
+        folder = tmp_path / name
+        run = train(data, folder / "run", "hybrid", settings=given).folder
+        places = positions(load(data))
+        heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
+        serial, parallel = both(run, places, two, folder, heading)
+        assert_close(serial, parallel, "prediction", "std")
+
+
+def test_command_names_the_row_of_the_whole_in_one_line(
+    flat: Path, two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cabinet stands where the last transmitter is."""
+    box = trimesh.creation.box((0.3, 0.3, 0.3))
+    box.apply_translation((50.0, 50.0, 1.0))
+    box.export(tmp_path / "box.ply")
+    direct = TraceOptions(reflection=False, max_depth=0)
+    run = train(
+        flat, tmp_path / "run", "ray-tracing", scene=tmp_path / "box.ply", settings=direct, material="concrete"
+    ).folder
+    places = np.concatenate([positions(load(flat)), [[50.0, 50.0, 1.0]]])
+    with pytest.raises(InputError, match=f"^transmitter {POSITIONS + 1} at .* is inside the solid 'box'"):
+        predict_to_file(run, places, tmp_path / "p.npz", scheduler=two)
+    assert not (tmp_path / "p.npz").exists()
+    np.savez(tmp_path / "tx.npz", tx_pos=places[-1:])
+    monkeypatch.setattr(parallel, "open_scheduler", lambda text: nullcontext(two))
+    given = ["--input", tmp_path / "tx.npz", "--out", tmp_path / "p.npz", "--scheduler", "local"]
+    refused(["predict", run, *given], "transmitter 1 at .* is inside the solid 'box'; move one of them", capsys)
+    np.savez(tmp_path / "tx.npz", tx_pos=places[:3])
+    status, out, err = call(["predict", run, *given], capsys)
+    assert status == 0
+    assert re.fullmatch("predicting: 3 of 3, [12] workers?", err.splitlines()[-1])
+    assert out.startswith("3 predictions: ")
+    traced_again = ["trace", tmp_path / "box.ply", flat, "--material", "concrete", "--paths", "line-of-sight"]
+    status, _, err = call([*traced_again, "--out", tmp_path / "again", "--scheduler", "local"], capsys)
+    assert status == 0
+    assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])
+    assert_same_bits(stored(run / "predictions.npz"), stored(tmp_path / "again" / "predictions.npz"))
+
+
+def test_bench_writes_what_workers_measured_and_says_why_one_failed(
+    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A check that was measured before, and a run that cannot go on."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    folder = case_folder(runs, "flat-plan")
+    folder.mkdir(parents=True)
+    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
+    (folder / "check.json").write_text(json.dumps({"figures": figures}))
+    rows = bench(["flat-plan"], out, runs, two)
+    assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
+    assert rows[0]["figures"] == figures
+    assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
+    assert "cases that share a machine" in capsys.readouterr().err
+    case_folder(runs, "demo").mkdir()
+    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
+    with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
+        bench(["flat-plan", "demo"], out, runs, two)

@@ -1,0 +1,96 @@
+"""Gaussians behind opaque walls are left out, and the field changes by no more than is stated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import wrf_mi_plugins
+from test_plugin_integrator import complex_image, scene_of
+from test_plugin_integrator_rays import gaussians_of
+from test_plugin_integrator_walls import BRICK, FREQUENCY_HZ
+from traced_fields import RECEIVER, any_field
+from wrf_mi_plugins import integrator
+
+from wrf_mi.core import InputError
+
+pytestmark = pytest.mark.all_threads
+
+wrf_mi_plugins.register_all()
+
+ROUNDING = 1e-5
+"""Float32 sums of some tens of signals of size one, in the same order."""
+COUNT = 120
+
+
+def sheet(where: list[float], size: float, name: str) -> dict[str, Any]:
+    """A square across the x axis before or behind the receiver."""
+    turn = mi.ScalarTransform4f().translate([*(RECEIVER.position_m + where)]).rotate([0, 1, 0], 90).scale(size)
+    return {"type": "rectangle", "to_world": turn, "bsdf": {"type": "ref", "id": name}}
+
+
+# Mitsuba makes one of two materials that look alike, whatever their ids.
+GREY = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.3}}
+METAL = {"type": "twosided", "id": "mat-itu_metal", "bsdf": GREY}
+SHEETS = {
+    "brick": BRICK,
+    "metal": METAL,
+    "large": sheet([-0.7, 0, 0], 1.0, METAL["id"]),
+    "small": sheet([0.5, 0.3, 0.3], 0.3, METAL["id"]),
+    "masonry": sheet([-0.8, 0, 0], 9.0, BRICK["id"]),
+}
+
+
+def rendered(blending: str, seed: int, power: float, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, int]:
+    """The field, and how many entries lists had when it was blended."""
+    entries = []
+
+    def counting(footprints: Any, signal: Any, lists: Any, *more: Any) -> Any:
+        entries.append(int(lists.start[dr.width(lists.start) - 1]))
+        return blend(footprints, signal, lists, *more)
+
+    blend = integrator.blend_rays
+    traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ, "thickness_itu_brick": 0.3, "opaque_power": power}
+    scene = scene_of(gaussians_of(any_field(COUNT, seed, 0.05), blending), integrator=traced, **SHEETS)
+    with monkeypatch.context() as patch:
+        patch.setattr(integrator, "blend_rays", counting)
+        image = complex_image(mi.render(scene))
+    return image, entries[0]
+
+
+@pytest.mark.parametrize("blending", ["alpha", "product"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_error_is_within_the_bound(blending: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Metal hides at any bound and changes nothing; masonry that passes a sixth of the power does so at 0.2."""
+    strength = np.linalg.norm(any_field(COUNT, seed, 0.05)["signal"], axis=1)
+    largest = strength.max() if blending == "alpha" else strength.sum()
+    whole, entries = rendered(blending, seed, 0.0, monkeypatch)
+    few, fewer = rendered(blending, seed, 1e-8, monkeypatch)
+    assert fewer < entries
+    assert np.abs(few - whole).max() <= 1e-4 * largest + ROUNDING
+    least, fewest = rendered(blending, seed, 0.2, monkeypatch)
+    assert fewest < fewer
+    error = np.abs(least - whole).max()
+    assert 1e-3 < error <= np.sqrt(0.2) * largest
+
+
+def test_what_is_in_front_stays() -> None:
+    """A sheet behind all Gaussians hides none, and of a scene without walls nothing is left out."""
+    field = gaussians_of(any_field(COUNT, 0, 0.1), "alpha")
+    traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
+    for walls in ({}, {"metal": METAL, "far": sheet([60.0, 0, 0], 100.0, METAL["id"])}):
+        images = [
+            complex_image(mi.render(scene_of(field, integrator=traced | {"opaque_power": power}, **walls)))
+            for power in (0.0, 0.5)
+        ]
+        np.testing.assert_array_equal(*images)
+        assert np.abs(images[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("power", [-0.1, 1.0])
+def test_no_such_share(power: float) -> None:
+    with pytest.raises((InputError, RuntimeError), match="opaque_power"):
+        mi.load_dict({"type": "wrf_traced", "opaque_power": power})

@@ -1,0 +1,243 @@
+"""The traced integrator in Mitsuba: images, derivatives through ``mi.render``, what it keeps, bad scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import wrf_mi_plugins
+from test_plugin_integrator_rays import brute, bundles_of, gaussians_of, pose_of
+from traced_fields import RECEIVER, any_field, blended
+from wrf_mi_bench import traced as bench_traced
+from wrf_mi_plugins import integrator as integrator_module
+from wrf_mi_plugins.sensor import receiver_to_world
+from wrf_mi_plugins.shape import gaussian_shape, shape_parameters
+
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.core import InputError, pixel_directions
+from wrf_mi.core.angles import equirectangular_sphere
+from wrf_mi.gaussians import Gaussians
+
+pytestmark = pytest.mark.all_threads
+
+wrf_mi_plugins.register_all()
+
+LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02
+"""Traced against splatted where Gaussians are small in angle: what projection may cost."""
+FLOAT32_TOLERANCE = 1e-4
+"""Relative L2 error of an image by float32 rounding."""
+GRADIENT_TOLERANCE = 1e-3
+"""Relative L2 error of a gradient in float32, and rays that fall to the other side of a cut-off."""
+
+
+def film(height: int, width: int, **more: Any) -> dict[str, Any]:
+    box = {"type": "box"}
+    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance", "rfilter": box, **more}
+
+
+def scene_of(field: Gaussians, height: int = 12, width: int = 40, **more: Any) -> Any:
+    to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "wrf_traced"},
+            "sensor": {"type": "wrf_perception_plane", "to_world": to_world, "film": film(height, width)},
+            "gaussians": gaussian_shape(field),
+        }
+        | more
+    )
+
+
+def complex_image(tensor: Any) -> np.ndarray:
+    return np.asarray(tensor.numpy(), float) @ np.array([1, 1j])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_traced_is_splatted_where_gaussians_are_small(seed: int) -> None:
+    """Gaussians of up to 2 degrees and axes up to 2 : 1, one on the zenith, one on the seam; random poses."""
+    for blending in bench_traced.BLENDINGS:
+        gaussians, receiver = bench_traced.random_field(seed, blending)
+        traced, splatted = (f(gaussians, receiver) for f in (bench_traced.traced, bench_traced.splatted))
+        found = bench_traced.difference(traced, splatted)
+        assert found["ssim"] >= LOWEST_SSIM
+        assert found["magnitude_error"] <= LARGEST_ERROR
+        assert found["complex_error"] <= LARGEST_ERROR
+
+
+def test_difference_grows_as_explained() -> None:
+    """Of second order in the size of round Gaussians, of first order in that of others."""
+    rows = bench_traced.by_size((1.0, 2.0), fields=2)
+    errors = {(row["size_deg"], row["ratio"]): row["complex_error"] for row in rows}
+    # Pixels whose edge moved, by half the order more, are on both.
+    assert errors[2.0, 1.0] / errors[1.0, 1.0] > 1.8
+    assert 1.5 < errors[2.0, 2.0] / errors[1.0, 2.0] < 2.5
+    assert errors[1.0, 2.0] > 2 * errors[1.0, 1.0]
+
+
+@pytest.mark.parametrize("blending", ["alpha", "product"])
+@pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
+def test_image_is_the_definition(blending: str, coverage: str) -> None:
+    """``mi.render`` against float64 NumPy, and the film's channels; Gaussians of all shapes all around."""
+    field = any_field(50)
+    to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
+    sensor = {"type": "wrf_perception_plane", "to_world": to_world, "film": film(45, 90), "coverage": coverage}
+    scene = scene_of(gaussians_of(field, blending, mi.Float), sensor=sensor)
+    tensor = mi.render(scene)
+    assert tensor.shape == (45, 90, 2)
+    image = complex_image(tensor)
+    directions = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](45, 90)
+    expected = blended(field, blending, directions)
+    off = np.abs(image - expected) > 1e-3 * np.abs(expected).max()
+    assert off.mean() < 2e-3  # on a cut-off, a ray may fall to either side in float32
+    assert np.linalg.norm((image - expected)[~off]) < FLOAT32_TOLERANCE * np.linalg.norm(expected)
+    developed = scene.sensors()[0].film().develop().numpy()
+    np.testing.assert_allclose(developed[..., 0], np.abs(image), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(developed[..., 1:], tensor.numpy())
+
+
+def test_crop_and_xml(tmp_path: Path) -> None:
+    """A crop is a part of the image. The integrator of a scene file is found and set."""
+    gaussians = gaussians_of(any_field(20), "alpha", mi.Float)
+    whole = mi.render(scene_of(gaussians)).numpy()
+    crop = {"crop_width": 15, "crop_height": 5, "crop_offset_x": 20, "crop_offset_y": 6}
+    to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
+    sensor = {"type": "wrf_perception_plane", "to_world": to_world, "film": film(12, 40, **crop)}
+    part = mi.render(scene_of(gaussians, sensor=sensor)).numpy()
+    np.testing.assert_allclose(part, whole[6:11, 20:35], atol=1e-6)
+    own = '<integrator type="wrf_traced"><float name="frequency_hz" value="9e8"/></integrator>'
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{own}</scene>')
+    assert "frequency_hz = 9e+08" in str(mi.load_file(str(tmp_path / "scene.xml")).integrator())
+
+
+def test_perspective_camera() -> None:
+    """Any sensor that is a point: a camera of one sample a pixel sees what the rays it draws see."""
+    field = any_field(40, size=0.1)
+    look = mi.ScalarTransform4f().look_at(
+        origin=RECEIVER.position_m, target=RECEIVER.position_m + RECEIVER.to_world[:, 2], up=[0, 0, 1]
+    )
+    one = {"type": "independent", "sample_count": 1}
+    sensor = {"type": "perspective", "fov": 70, "to_world": look, "film": film(20, 30), "sampler": one}
+    scene = scene_of(gaussians_of(field, "product", mi.Float), sensor=sensor)
+    image = complex_image(mi.render(scene, seed=5))
+    camera, own = scene.sensors()[0], scene.integrator()
+    sampler, _ = own.prepare(camera, 5, 1, [])
+    ray, _, _ = own.sample_rays(scene, camera, sampler)
+    local = np.array(ray.d, float).T @ RECEIVER.to_world
+    expected = blended(field, "product", local.reshape(20, 30, 3))
+    off = np.abs(image - expected) > 1e-3 * np.abs(expected).max()
+    assert off.mean() < 0.01
+    assert np.linalg.norm((image - expected)[~off]) < FLOAT32_TOLERANCE * np.linalg.norm(expected)
+    # More samples are averaged as complex numbers.
+    assert mi.render(scene, spp=16).shape == (20, 30, 2)
+
+
+def test_what_is_traced_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """New signals trace nothing; new geometry or a new pose does, and the image is as that of a new scene."""
+    calls = []
+    real = integrator_module.traced_lists
+    monkeypatch.setattr(integrator_module, "traced_lists", lambda *a: calls.append(1) or real(*a))
+    scene = scene_of(gaussians_of(any_field(30), "alpha", mi.Float))
+    params = mi.traverse(scene)
+    first = mi.render(scene).numpy()
+    other = shape_parameters(gaussians_of(any_field(30, seed=1), "alpha", mi.Float))
+    for name, expected_calls in (("signal", 1), ("opacity", 1), ("data", 2)):
+        params[f"gaussians.{name}"] = other[name]
+        params.update()
+        again = mi.render(scene).numpy()
+        assert len(calls) == expected_calls
+    assert not np.allclose(first, again)
+    fresh = mi.render(scene_of(gaussians_of(any_field(30, seed=1), "alpha", mi.Float))).numpy()
+    np.testing.assert_array_equal(again, fresh)
+    calls.clear()
+    before = params["sensor.to_world"].matrix
+    params["sensor.to_world"] = mi.AffineTransform4f(before) @ mi.AffineTransform4f().rotate([0, 0, 1], 9.0)
+    params.update()
+    # One column is 9 degrees.
+    np.testing.assert_allclose(mi.render(scene).numpy(), np.roll(again, -1, axis=1), atol=1e-4)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("blending", ["alpha", "product"])
+def test_derivatives_through_render(blending: str) -> None:
+    """Backward of ``mi.render`` is that of the plain function in float64; forward agrees with backward."""
+    field, rng = any_field(20, seed=3, size=0.2), np.random.default_rng(0)
+    scene = scene_of(gaussians_of(field, blending, mi.Float))
+    params = mi.traverse(scene)
+    own = "opacity" if blending == "alpha" else "attenuation"
+    values = {name: params[f"gaussians.{name}"].numpy().astype(float).copy() for name in ("data", "signal", own)}
+    steps = {name: rng.standard_normal(v.shape) * 1e-2 for name, v in values.items()}
+    weight = rng.standard_normal((12, 40, 2))
+
+    for name in values:
+        dr.enable_grad(params[f"gaussians.{name}"])
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params) * to_tensor(weight), axis=None))
+    gradient = {name: params[f"gaussians.{name}"].grad.numpy().astype(float) for name in values}
+
+    data = values["data"].reshape(20, 10)
+    exact = field | {"position": data[:, :3], "scale": data[:, 3:6], "rotation": data[:, 6:]}
+    gaussians = gaussians_of(exact, blending)
+    attached = {
+        "data": [*gaussians.position, *gaussians.scale, *gaussians.rotation],
+        "signal": gaussians.signal,
+        own: gaussians.attenuation or [gaussians.opacity],
+    }
+    dr.enable_grad(attached)
+    parts = brute(gaussians, pose_of(), bundles_of(pixel_directions(12, 40)))
+    dr.backward(sum(dr.sum(p * type(p)(weight[..., k].ravel())) for k, p in enumerate(parts)))
+    for name, arrays in attached.items():
+        expected = np.stack([dr.grad(a).numpy() for a in arrays], axis=1).ravel()
+        assert np.linalg.norm(gradient[name] - expected) < GRADIENT_TOLERANCE * np.linalg.norm(expected), name
+
+    s = dr.opaque(mi.Float, 0.0)
+    dr.enable_grad(s)
+    for name in values:
+        params[f"gaussians.{name}"] = mi.Float(values[name]) + s * mi.Float(steps[name])
+    params.update()
+    dr.set_grad(s, 1.0)
+    slope = dr.forward_to(mi.render(scene, params)).numpy().astype(float)
+    backward = sum(float(gradient[name] @ steps[name]) for name in values)
+    assert abs(np.sum(slope * weight) - backward) < GRADIENT_TOLERANCE * np.abs(slope * weight).sum()
+
+
+def test_derivative_by_the_receivers_place() -> None:
+    """Moving the receiver one way is moving all Gaussians the other way."""
+    scene = scene_of(gaussians_of(any_field(20, seed=3, size=0.2), "alpha", mi.Float))
+    params = mi.traverse(scene)
+    weight = to_tensor(np.random.default_rng(0).standard_normal((12, 40, 2)))
+    place = dr.opaque(mi.Point3f, 0.0)
+    dr.enable_grad(place, params["gaussians.data"])
+    pose = mi.AffineTransform4f(params["sensor.to_world"].matrix)
+    params["sensor.to_world"] = mi.AffineTransform4f().translate(place) @ pose
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params) * weight, axis=None))
+    moved = params["gaussians.data"].grad.numpy().reshape(20, 10)[:, :3]
+    expected = -moved.sum(axis=0)
+    error = np.linalg.norm(place.grad.numpy().ravel() - expected)
+    assert error < GRADIENT_TOLERANCE * np.abs(moved).sum()
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ({"gaussians": {"type": "sphere"}}, "no ellipsoids shape with a signal attribute"),
+        ({"more": gaussian_shape(gaussians_of(any_field(2), "alpha", mi.Float))}, "2 shapes of Gaussians"),
+        ({"sensor": {"type": "orthographic", "film": film(4, 4)}}, "do not start at one point"),
+    ],
+)
+def test_bad_scenes(more: dict[str, Any], text: str) -> None:
+    scene = scene_of(gaussians_of(any_field(5), "alpha", mi.Float), **more)
+    with pytest.raises(InputError, match=text):
+        scene.integrator().render(scene)
+
+
+@pytest.mark.slow
+def test_as_fast_as_mitsubas_own() -> None:
+    """10,000 Gaussians, 360 x 90 directions, hits found anew: not slower than ``volprim_rf_basic``."""
+    for size in (1.0, 2.0):
+        found = bench_traced.pace(size, repeats=9)
+        assert found["stock_over_traced"] >= 1, found

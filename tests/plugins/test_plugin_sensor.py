@@ -1,0 +1,161 @@
+"""The perception plane as a Mitsuba sensor: its rays, its poses, and Mitsuba's own integrators through it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import wrf_mi_plugins
+from wrf_mi_plugins.sensor import receiver_to_world
+
+from wrf_mi.core import InputError, azimuth_elevation, pixel_directions, rotation_matrix
+from wrf_mi.core.angles import equirectangular_sphere
+
+FLOAT32 = 2e-6
+"""Unit vectors and metres in float32 after a rotation."""
+
+wrf_mi_plugins.register_all()
+
+POSITION = np.array([1.0, -2.0, 0.5])
+QUATERNION = np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
+TURN = rotation_matrix(QUATERNION)
+
+
+def film(height: int, width: int, **more: Any) -> dict[str, Any]:
+    box = {"type": "box"}
+    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance", "rfilter": box, **more}
+
+
+def plane(height: int = 9, width: int = 36, film_more: Any = None, **more: Any) -> dict[str, Any]:
+    entry = {"type": "wrf_perception_plane", "to_world": receiver_to_world(POSITION, QUATERNION)}
+    one = {"type": "independent", "sample_count": 1}
+    return entry | {"film": film(height, width, **(film_more or {})), "sampler": one} | more
+
+
+def rays(sensor: Any, height: int, width: int) -> np.ndarray:
+    """Directions of the rays of random places in every pixel, world frame."""
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[:height, :width]
+    x, y = ((k + rng.uniform(0, 0.999, k.shape)).ravel() / size for k, size in ((column, width), (row, height)))
+    ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(mi.Float(x), mi.Float(y)), mi.Point2f(0.5))
+    np.testing.assert_allclose(np.array(ray.o).T, np.broadcast_to(POSITION, (1, 3)), atol=FLOAT32)
+    assert float(mi.unpolarized_spectrum(weight)[0][0]) == 1.0
+    return np.array(ray.d, float).T.reshape(height, width, 3)
+
+
+@pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
+def test_rays_go_through_points(coverage: str) -> None:
+    """Wherever in a pixel the sample lies: the one direction of `core.angles`, turned by the quaternion."""
+    sensor = mi.load_dict(plane(9, 36, coverage=coverage))
+    expected = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](9, 36)
+    np.testing.assert_allclose(rays(sensor, 9, 36), expected @ TURN.T, atol=FLOAT32)
+
+
+def test_rows_of_the_sphere() -> None:
+    azimuth, elevation = azimuth_elevation(equirectangular_sphere(18, 36))
+    np.testing.assert_allclose(np.degrees(elevation[:, 5]), -90 + 10 * np.arange(18), atol=1e-6)
+    np.testing.assert_allclose(np.degrees(azimuth[3]), 10 * np.arange(36), atol=1e-6)
+
+
+def test_crop_is_a_part_of_the_film() -> None:
+    crop = {"crop_width": 10, "crop_height": 4, "crop_offset_x": 7, "crop_offset_y": 3}
+    sensor = mi.load_dict(plane(9, 36, crop))
+    expected = pixel_directions(9, 36)[3:7, 7:17]
+    np.testing.assert_allclose(rays(sensor, 4, 10), expected @ TURN.T, atol=FLOAT32)
+    own = np.array(sensor.crop_directions(), float).T.reshape(4, 10, 3)
+    np.testing.assert_allclose(own, expected, atol=FLOAT32)
+
+
+def test_parameters() -> None:
+    """What ``mi.traverse`` lists, and that a new pose and a new size are taken over, with derivatives."""
+    sensor = mi.load_dict(plane())
+    params = mi.traverse(sensor)
+    flags = params.flags("to_world")
+    assert flags & mi.ParamFlags.Discontinuous.value
+    assert not flags & mi.ParamFlags.NonDifferentiable.value
+    height = mi.Float(3.0)
+    dr.enable_grad(height)
+    params["to_world"] = mi.AffineTransform4f().translate([0, 0, height])
+    params["film.size"] = [20, 5]
+    params.update()
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.0, 0.0), mi.Point2f(0.5))
+    dr.backward(ray.o.z * 2)
+    assert height.grad == 2
+    assert np.array(sensor.world_transform().matrix)[2, 3] == 3
+    np.testing.assert_allclose(
+        np.array(sensor.directions(), float).T, pixel_directions(5, 20).reshape(-1, 3), atol=FLOAT32
+    )
+
+
+def test_xml_and_depth(tmp_path: Path) -> None:
+    """From a scene file, with Mitsuba's own depth integrator: the distances to a sphere around the origin."""
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0">
+            <integrator type="depth"/>
+            <sensor type="wrf_perception_plane">
+                <string name="coverage" value="sphere"/>
+                <transform name="to_world"><rotate x="1" angle="90"/><translate x="1"/></transform>
+                <film type="hdrfilm">
+                    <integer name="width" value="24"/><integer name="height" value="12"/>
+                    <string name="pixel_format" value="luminance"/><rfilter type="box"/>
+                </film>
+                <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
+            </sensor>
+            <shape type="sphere"><float name="radius" value="3"/></shape>
+        </scene>"""
+    )
+    image = mi.render(mi.load_file(str(tmp_path / "scene.xml"))).numpy()[..., 0]
+    # |(1, 0, 0) + t d| = 3; x is the axis of rotation, so d_x is as in the receiver's frame.
+    x = equirectangular_sphere(12, 24)[..., 0]
+    np.testing.assert_allclose(image, -x + np.sqrt(x * x + 8), rtol=1e-5)
+
+
+def test_volpath_renders_through_it() -> None:
+    """A purely absorbing medium: Beer's law along each ray."""
+    absorbing = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.5}
+    ball = {"type": "sphere", "center": POSITION.tolist(), "radius": 2.0, "bsdf": {"type": "null"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 4},
+            "sensor": plane(3, 8, {"pixel_format": "luminance"}, medium={"type": "ref", "id": "air"}),
+            "air": absorbing | {"id": "air"},
+            "ball": ball | {"interior": {"type": "ref", "id": "air"}},
+            "light": {"type": "constant", "radiance": 1.0},
+        }
+    )
+    samples = 4096
+    image = mi.render(scene, spp=samples).numpy()
+    expected = np.exp(-0.5 * 2.0)
+    # Analogue tracking: each sample is 0 or 1.
+    deviation = np.sqrt(expected * (1 - expected) / samples)
+    assert np.abs(image - expected).max() < 5 * deviation
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ({"coverage": "half"}, "coverage 'half' is none of hemisphere, sphere"),
+        ({"to_world": mi.ScalarTransform4f().scale(2.0)}, "not a rotation and a translation"),
+        ({"to_world": mi.ScalarTransform4f().scale([1.0, 1.0, -1.0])}, "not a rotation and a translation"),
+    ],
+)
+def test_bad_input(more: dict[str, Any], text: str) -> None:
+    with pytest.raises(RuntimeError, match=text):  # Mitsuba wraps a plugin's error
+        mi.load_dict(plane(**more))
+
+
+def test_bad_pose() -> None:
+    with pytest.raises(InputError, match="unit quaternion"):
+        receiver_to_world(POSITION, [0, 0, 0, 2])
+    with pytest.raises(InputError, match="three finite coordinates"):
+        receiver_to_world([0, 0, np.nan], QUATERNION)
+    sensor = mi.load_dict(plane())
+    params = mi.traverse(sensor)
+    params["to_world"] = mi.AffineTransform4f().scale(3)
+    with pytest.raises(InputError, match="not a rotation and a translation"):
+        params.update()

@@ -1,0 +1,115 @@
+"""Sums over paths against sums written out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+
+from wrf_mi.core import Paths, Receiver
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.receivers import antenna_csi, channel, csi, element_signals, received_power, rssi_dbm
+
+EXACT = 1e-12
+
+
+def made(count: int = 40, n_tx: int = 4, n_rx: int = 3, seed: int = 0) -> Paths:
+    """Paths with random values; the last transmitter has none."""
+    rng = np.random.default_rng(seed)
+    tx, rx = rng.integers(0, n_tx - 1, count), rng.integers(0, n_rx, count)
+    length = rng.uniform(2, 900, count)
+    order = np.lexsort((length, tx, rx))
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return Paths(
+        tx=tx[order],
+        rx=rx[order],
+        gain=rng.normal(size=count) + 1j * rng.normal(size=count),
+        length_m=length[order],
+        departure=direction,
+        arrival=direction[::-1].copy(),
+        interactions=np.zeros((count, 1), np.uint8),
+        vertices_m=np.full((count, 1, 3), np.nan),
+        objects=np.full((count, 1), -1, np.int32),
+        object_names=(),
+        n_tx=n_tx,
+        n_rx=n_rx,
+    )
+
+
+def receivers(count: int = 3) -> list[Receiver]:
+    rng = np.random.default_rng(5)
+    return [Receiver(f"rx{k}", rng.normal(size=3), rng.normal(size=4)) for k in range(count)]
+
+
+def test_channel_coefficients():
+    paths, frequencies = made(), np.array([28.0e9, 28.1e9])
+    result = csi(paths, frequencies)
+    assert result.shape == (3, 4, 2)
+    expected = np.zeros_like(result)
+    for p in range(len(paths)):
+        for k, f in enumerate(frequencies):
+            wave = paths.gain[p] * np.exp(-2j * np.pi * f * paths.length_m[p] / speed_of_light)
+            expected[paths.rx[p], paths.tx[p], k] += wave
+    # 5e5 rad in float64 leave 1e-10: the phase is not taken in single precision.
+    np.testing.assert_allclose(result, expected, atol=1e-9)
+    assert (result[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("at_once", [1, 1 << 20])
+def test_channel_coefficients_at_antennas(at_once: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(channel, "WAVES_AT_ONCE", at_once)
+    paths, arrays, array_m = made(), receivers(), planar_array(2, 3, 0.06)
+    frequencies = 2.4e9 + 1e6 * np.array([0.0, 1.0, 3.0, 4.0, 2.0])  # gaps of several widths
+    result = antenna_csi(paths, arrays, array_m, frequencies)
+    expected = np.stack([element_signals(paths, arrays, array_m, f) for f in frequencies], axis=-1)
+    assert result.shape == (3, 4, 6, 5)
+    # 5e4 rad in float64 leave 1e-11, gone through once for each subcarrier.
+    np.testing.assert_allclose(result, expected, atol=1e-9)
+    assert (result[:, 3] == 0).all()
+
+
+def test_signal_strength():
+    paths = made()
+    power = np.zeros((3, 4))
+    for p in range(len(paths)):
+        power[paths.rx[p], paths.tx[p]] += abs(paths.gain[p]) ** 2
+    np.testing.assert_allclose(received_power(paths), power, rtol=EXACT)
+    strength = rssi_dbm(paths, tx_power_dbm=12.0)
+    np.testing.assert_allclose(strength[:, :3], 12 + 10 * np.log10(power[:, :3]), rtol=EXACT)
+    assert np.isnan(strength[:, 3]).all()
+    hops = np.array([2.402e9, 2.426e9, 2.48e9])
+    expected = 10 * np.log10((np.abs(csi(paths, hops)) ** 2).mean(axis=-1)[:, :3])
+    np.testing.assert_allclose(rssi_dbm(paths, frequencies_hz=hops)[:, :3], expected, rtol=EXACT)
+
+
+def test_two_equal_waves_in_opposite_phase_cancel_only_coherently():
+    wavelength = 0.5
+    frequency = speed_of_light / wavelength
+    paths = made(2, n_tx=2, n_rx=1)
+    paths = replace(
+        paths, tx=np.zeros(2, int), gain=np.ones(2, complex), length_m=np.array([10.0, 10.0 + wavelength / 2])
+    )
+    assert received_power(paths)[0, 0] == pytest.approx(2)
+    assert received_power(paths, frequency)[0, 0] == pytest.approx(0, abs=EXACT)
+    # Over a wide band the waves are independent.
+    band = np.linspace(frequency, 41 * frequency, 4000, endpoint=False)
+    assert received_power(paths, band)[0, 0] == pytest.approx(2, rel=1e-3)
+
+
+def test_signals_of_several_arrays_and_parts(monkeypatch: pytest.MonkeyPatch):
+    paths, everyone = made(), receivers()
+    array_m = planar_array(2, 3, 0.1)
+    signals = element_signals(paths, everyone, array_m, 1e9)
+    assert signals.shape == (3, 4, 6)
+    for k, receiver in enumerate(everyone):
+        own = paths.select(paths.rx == k)
+        alone = replace(own, rx=np.zeros_like(own.rx), n_rx=1)
+        np.testing.assert_allclose(element_signals(alone, receiver, array_m, 1e9)[0], signals[k], rtol=EXACT)
+    # An element at the origin sees the channel itself.
+    centre = element_signals(paths, everyone, [[0.0, 0, 0]], 1e9)[..., 0]
+    np.testing.assert_allclose(centre, csi(paths, 1e9)[..., 0], atol=1e-10)
+    coefficients = csi(paths, [1e9, 2e9])
+    monkeypatch.setattr(channel, "PAIRS_AT_ONCE", 20)
+    np.testing.assert_allclose(element_signals(paths, everyone, array_m, 1e9), signals, rtol=EXACT)
+    np.testing.assert_allclose(csi(paths, [1e9, 2e9]), coefficients, rtol=EXACT)

@@ -1,0 +1,299 @@
+"""Runs of baselines: what is in their folders, the command, folds, resuming, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from calling import call, contents, copied, damaged_models_refused, refused, scored_again_as_before, stored
+from made_channels import channels
+
+from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import load, make_splits, write_nerf2_csi
+from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
+from wrf_mi.runs.compare import compare
+from wrf_mi.runs.results import read_run
+from wrf_mi.training.checkpoint import read_checkpoint
+from wrf_mi.training.loop import Progress
+
+FILES = {"config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"}
+ROUNDING = 1e-4
+"""Powers of tens of dBm are stored in single precision."""
+
+
+@pytest.fixture(scope="module")
+def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
+
+
+def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
+    assert contents(run) == FILES
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    known = {"model": "mri", "dataset": str(flat_folder), "split": "official", "n_train": None, "seed": 0}
+    assert known.items() <= config.items()
+    assert config["settings"] == {"shared": False}
+    assert {"wrf-mi", "scipy", "scikit-learn"} <= set(config["versions"])
+    with np.load(run / "model.npz", allow_pickle=False) as arrays:
+        assert set(arrays) == {"run/format", "run/train_seconds", "heading", "0/law", "1/law"}
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("mri", "rssi", 24, 6)
+    assert metrics["train_seconds"] > 0
+    assert metrics["peak_memory_mb"] > 10
+    assert set(metrics["receivers"]) == {"anchor1", "anchor2"}
+    assert "inside_90" not in metrics
+    assert set(metrics["reference"]) == {"idw100"}
+
+
+@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+def test_stored_models_predict_what_was_scored(name: str, flat_folder: Path, tmp_path: Path) -> None:
+    """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
+    few = ("trees=20",) if name == "trees" else ()
+    out = train(flat_folder, tmp_path / "run", name, settings=few).folder
+    record, arrays, opened = load(flat_folder), stored(out), open_run(out)
+    assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
+    heading = record.tx_heading_rad[arrays["row"]]
+    for r in range(2):
+        found = opened.predict(arrays["tx_pos"], r, heading).mean
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, arrays["prediction"][r])
+    if name == "idw":
+        np.testing.assert_array_equal(arrays["prediction"], arrays["reference_idw100"])
+    elif name != "mri":
+        with pytest.raises(InputError, match="give heading_rad, or train with heading=false"):
+            opened.predict(arrays["tx_pos"], 0)
+    with pytest.raises(InputError, match="no receiver 2"):
+        opened.predict(arrays["tx_pos"], 2, heading)
+    with pytest.raises(InputError, match="predicts from positions"):
+        opened.predict(np.full((1, 3), np.nan), 0, heading[:1])
+
+
+def test_command_trains_as_the_function_does(
+    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    status, table, err = call(["train", flat_folder, "--model", "mri", "--out", out], capsys)
+    assert status == 0, err
+    lines = table.splitlines()
+    assert [line.split()[0] for line in lines] == ["absolute", "mri", "blend", "split", "results:"]
+    assert err.splitlines() == ["mri: receivers"]
+    np.testing.assert_array_equal(stored(out)["prediction"], stored(run)["prediction"])
+    chosen = ["--set", "shared=true", "--n-train", "0.5", "--seed", 4, "--split", "random"]
+    given = ["train", flat_folder, "--model", "mri", "--out", tmp_path / "few", "--json", *chosen]
+    status, table, _ = call(given, capsys)
+    metrics = json.loads(table)
+    assert (status, metrics["seed"], metrics["split"], metrics["n_train"]) == (0, 4, "random", 12)
+    with np.load(tmp_path / "few" / "model.npz") as arrays:
+        np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
+
+
+def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    again = scored_again_as_before(run, capsys)
+    other = evaluate_run(run, "random")
+    assert other["split"] == "random (rows unseen by official)"
+    record = load(json.loads((run / "metrics.json").read_text())["dataset"])
+    (drawn,) = make_splits(record, "random")
+    assert 0 < other["n_test"] == np.isin(drawn.test, stored(run)["row"]).sum() < len(drawn.test)
+    assert json.loads((run / "metrics.json").read_text()) == again
+
+
+def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = train(folder, tmp_path / "run", "kriging", split="blocked").folder
+    assert contents(out) == FILES - {"split.npz", "model.npz"} | {"fold0", "fold1", "fold2"}
+    whole = read_run(out)
+    assert sorted(whole.row) == list(range(24))
+    for name in ("model.npz", "metrics.json", "predictions.npz"):
+        (out / "fold1" / name).unlink()
+    (out / "metrics.json").unlink()
+    kept = (out / "fold0" / "model.npz").stat().st_mtime_ns
+    refused(["evaluate", out], "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    status, _, err = call(["train", "--resume", out], capsys)
+    assert (status, err.splitlines()) == (0, ["fold1: kriging: receivers"])
+    assert (out / "fold0" / "model.npz").stat().st_mtime_ns == kept
+    np.testing.assert_array_equal(read_run(out).prediction, whole.prediction)
+    (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
+    asked = ["--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.npz"]
+    refused(["predict", out, *asked], "one model for each block; choose one", capsys)
+    status, _, err = call(["predict", out / "fold0", *asked], capsys)
+    assert status == 0, err
+
+
+def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: Path) -> None:
+    out, stages = tmp_path / "run", list[str]()
+    with pytest.raises(Interrupted, match=rf"stopped in kriging: receivers; go on with: wrf-mi train --resume {out}"):
+        train(
+            folder,
+            out,
+            "kriging",
+            split="blocked",
+            listen=lambda stage, share, _: stages.append(stage),
+            stop=lambda: stages[-1].startswith("fold1"),
+        )
+    assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
+    assert sorted(read_run(resume(out).folder).row) == list(range(24))
+
+
+SHORT = ("steps=20", "checkpoint_every=8", "log_every=4", "validate_every=4", "optimiser.warm_up=2", "batch=6")
+TRAINED: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "vae": ("spectra", ("width=8", "last=8"), ("vae gateway1", "vae gateway2")),
+    "dcgan": ("spectra", ("hidden=4", "channels=8", "noise=2"), ("dcgan gateway1", "dcgan gateway2")),
+    "nerf2": ("spectra", ("rays=16", "samples=2", "networks.width=8", "networks.layers=2"), ("nerf2",)),
+    "fire": ("channels", ("sample=antenna", "width=8", "latent=2"), ("fire antenna",)),
+    "optml": ("channels", ("simulation.channels=30", "width=4", "rounds=1", "wavefront=plane"), ("paths",)),
+}
+"""Data, settings of a small version, and the networks that are trained in turn."""
+
+
+@pytest.mark.parametrize("name", list(TRAINED))
+def test_a_stopped_network_goes_on_to_the_same_bits(name: str, two_gateways: Record, tmp_path: Path) -> None:
+    """Stopped between two checkpoints of its last network, when the first of several has ended."""
+    data, own, networks = TRAINED[name]
+    record = two_gateways if data == "spectra" else channels()
+    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+    whole = train(record, tmp_path / "whole", name, **ends).folder
+    told: list[tuple[str, int]] = []
+
+    def listen(stage: str, share: float, progress: Progress | None) -> None:
+        if progress is not None:
+            told.append((stage, progress.step))
+
+    out = tmp_path / "run"
+    with pytest.raises(Interrupted, match=rf"stopped after step 12 of 20 of {networks[-1]}; .* --resume {out}"):
+        train(record, out, name, **ends, listen=listen, stop=lambda: told[-1:] == [(networks[-1], 12)])
+    assert (out / "checkpoint.npz").exists()
+    del told[:]
+    resume(out, record=record, listen=listen)
+    assert min(step for _, step in told) > 12, "no step is taken again"
+    assert {stage for stage, _ in told} == {networks[-1]}
+    assert not (out / "checkpoint.npz").exists()
+    with np.load(whole / "model.npz") as one, np.load(out / "model.npz") as other:
+        assert set(one) == set(other)
+        for key in set(one) - {"run/train_seconds"}:
+            np.testing.assert_array_equal(other[key], one[key], err_msg=key)
+
+
+def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record, tmp_path: Path) -> None:
+    _, own, networks = TRAINED["vae"]
+    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+
+    def kill(stage: str, share: float, progress: Progress | None) -> None:
+        if progress is not None and stage == networks[0] and progress.step == 16:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(two_gateways, tmp_path / "killed", "vae", **ends, listen=kill)
+    assert int(read_checkpoint(tmp_path / "killed")["step"]) == 8
+    resume(tmp_path / "killed", record=two_gateways)
+    train(two_gateways, tmp_path / "whole", "vae", **ends)
+    np.testing.assert_array_equal(stored(tmp_path / "killed")["prediction"], stored(tmp_path / "whole")["prediction"])
+
+
+def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    held_out = stored(run)
+    rows = [",".join(repr(float(v)) for v in p) for p in held_out["tx_pos"]]
+    (tmp_path / "tx.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
+    np.savez(tmp_path / "tx.npz", tx_pos=held_out["tx_pos"], heading_rad=np.zeros(len(rows)))
+    for given in (["--tx", tmp_path / "tx.csv"], ["--input", tmp_path / "tx.npz"]):
+        status, printed, err = call(["predict", run, *given, "--out", tmp_path / "out.npz", "--json"], capsys)
+        assert (status, err) == (0, "")
+        assert set(json.loads(printed)["arrays"]) == {"row", "prediction", "tx_pos", "receiver_name"}
+        with np.load(tmp_path / "out.npz") as arrays:
+            np.testing.assert_allclose(arrays["prediction"], held_out["prediction"], atol=ROUNDING)
+
+
+def test_comparison_shows_baselines_beside_the_blend(run: Path, flat_folder: Path, tmp_path: Path) -> None:
+    other = train(flat_folder, tmp_path / "idw", "idw").folder
+    compare([run, other], tmp_path / "page")
+    with (tmp_path / "page" / "compare.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["model"] for row in rows] == ["mri", "idw", "idw100"]
+    assert rows[1]["median"] == rows[2]["median"] != rows[0]["median"]
+
+
+def test_sweep_of_baselines(flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["sweep", flat_folder, "--vary", "model=mri,idw", "--out", tmp_path / "sweep"]
+    status, out, err = call([*given, "--json"], capsys)
+    assert status == 0, err
+    rows = json.loads(out)
+    assert [(row["model"], row["status"]) for row in rows] == [("mri", "done"), ("idw", "done")]
+    assert rows[1]["median"] == rows[1]["reference_median"]
+    refused(["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"], "vae serves spectrum", capsys)
+    assert not (tmp_path / "no").exists()
+
+
+# What is refused
+
+
+def test_calls_that_are_refused(
+    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unplaced_folder = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
+    out = ["--out", tmp_path / "out"]
+    train = ["train", flat_folder, "--model", "mri", *out]
+    for arguments, message in (
+        (
+            ["train", unplaced_folder, "--model", "mri", *out],
+            "unplaced: holds csi; mri serves rssi, so choose another model: ",
+        ),
+        (["train", unplaced_folder, "--model", "idw", *out], "positions are not known, from which idw predicts"),
+        (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
+        ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
+        ([*train, "--n-train", 0], "n_train 0; choose 1 to 24"),
+        ([*train, "--split", "nowhere"], "split 'nowhere'"),
+        ([*train, "--set", "steps=3"], "unknown setting steps"),
+        ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
+        (
+            ["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=0"],
+            "k = 0: the blend needs at least one",
+        ),
+        (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
+        (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
+        (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
+        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; leave --scene away"),
+        (
+            [*train, "--preset", "quick"],
+            "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
+        ),
+        (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
+        (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
+        (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
+        (["train", "--resume", run, "--model", "mri"], "leave data set and settings away"),
+        (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
+    ):
+        refused(arguments, message, capsys)
+        assert not (tmp_path / "out").exists(), arguments
+
+
+def test_what_cannot_be_fitted_leaves_nothing_behind(flat_folder: Path, tmp_path: Path) -> None:
+    record = load(flat_folder)
+    still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
+    with pytest.raises(InputError, match="rows at one distance"):
+        train(still, tmp_path / "run", "mri")
+    assert not (tmp_path / "run").exists()
+
+
+def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = copied(run, tmp_path / "run")
+    asked = ["evaluate", damaged]
+    damaged_models_refused(damaged, "1/law", capsys)
+    (damaged / "model.npz").unlink()
+    split = (damaged / "split.npz").read_bytes()
+    (damaged / "split.npz").write_bytes(b"")
+    refused(["train", "--resume", damaged], "split.npz: not a split file", capsys)
+    assert (damaged / "config.yaml").exists()  # a run that was there is never taken away
+    (damaged / "split.npz").write_bytes(split)
+    config = damaged / "config.yaml"
+    content = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump(content | {"settings": {"shared": 3}}))
+    refused(asked, "setting shared: expected bool, got 3", capsys)
+    config.write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "settings"}))
+    refused(asked, "config.yaml: not readable .*settings.*; restore it", capsys)
+    config.write_text(yaml.safe_dump(content | {"model": "no-such"}))
+    refused(asked, "model 'no-such': no such model; choose from", capsys)

@@ -1,0 +1,279 @@
+"""The comparison of runs, on run folders made here."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from wrf_mi.core import InputError
+from wrf_mi.runs import figures
+from wrf_mi.runs.compare import COLUMNS, compare
+from wrf_mi.runs.results import read_run
+from wrf_mi.tasks.scores import ssim, summary
+
+SHAPE = (10, 24)
+
+
+def make_run(
+    path, *, model="wrf-gs+", split="official", rows=range(6), noise=0.1, trained=True, receivers=None, seed=7
+):
+    """A run folder with random truth that depends on the row alone."""
+    path.mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    lead = () if receivers is None else (receivers,)
+    truth = np.stack([np.random.default_rng(r).random((*lead, *SHAPE)) for r in rows], axis=len(lead))
+    truth = truth.astype(np.float32)
+    prediction, blend = (np.clip(truth + s * rng.standard_normal(truth.shape), 0, 1) for s in (noise, 0.3))
+    np.savez(
+        path / "predictions.npz",
+        row=np.array(rows),
+        prediction=prediction.astype(np.float32),
+        truth=truth,
+        tx_pos=np.zeros((len(rows), 3)),
+        reference_idw4=blend.astype(np.float32),
+        **({} if receivers is None else {"receiver_name": [f"gateway{r}" for r in range(receivers)]}),
+    )
+    metrics = {
+        "task": "spectrum",
+        "dataset": "made/room",
+        "model": model,
+        "split": split,
+        "seed": seed,
+        "n_train": 20,
+        "n_test": len(rows),
+        "ssim": summary(ssim(prediction, truth)),
+        "ms_per_sample": 3.25,
+        "train_seconds": 61.5 if trained else 0.0,
+        "peak_memory_mb": 512.0,
+        "reference": {"idw4": {"median": summary(ssim(blend, truth))["median"]}},
+    }
+    (path / "metrics.json").write_text(json.dumps(metrics))
+    if trained:
+        write_log(path)
+    return path
+
+
+def write_log(path):
+    path.mkdir(exist_ok=True)
+    with (path / "log.jsonl").open("w") as file:
+        # The last score is of rows that are trained on by then: it belongs in no picture.
+        for step in range(5):
+            score = 0.2 * step if step else None
+            entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "validation_score": score, "gaussians": 5}
+            entry["held_out"] = step < 4
+            file.write(json.dumps(entry) + "\n")
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_table_holds_the_runs_own_figures(tmp_path):
+    good, bad = make_run(tmp_path / "good", seed=3), make_run(tmp_path / "bad", model="idw", noise=0.5, trained=False)
+    page = compare([good, bad], tmp_path / "out")
+    table = rows_of(tmp_path / "out" / "compare.csv")
+    assert list(table[0]) == list(COLUMNS)
+    metrics = json.loads((good / "metrics.json").read_text())
+    assert [row["run"] for row in table][:2] == ["good", "bad"]
+    assert [row["model"] for row in table] == ["wrf-gs+", "idw", "idw4", "idw4"]
+    assert [row["seed"] for row in table] == ["3", "7", "", ""]
+    for key in ("median", "mean", "p10", "p90"):
+        assert float(table[0][key]) == metrics["ssim"][key]
+    assert float(table[2]["median"]) == metrics["reference"]["idw4"]["median"]
+    assert float(table[0]["ms_per_sample"]) == 3.25
+    assert float(table[0]["median"]) > float(table[1]["median"])
+    assert page == tmp_path / "out" / "index.html"
+
+
+def test_page_shows_every_picture_that_was_written(tmp_path):
+    make_run(tmp_path / "a<b")
+    page = compare([tmp_path / "a<b"], tmp_path / "out").read_text()
+    assert "a&lt;b" in page
+    assert "a<b" not in page
+    names = ["room-cdf.png", "room-samples.png", "room-training.png"]
+    shown = re.findall(r'src="([^"]+)"', page)
+    assert len(shown) == len(names)
+    for source, name in zip(shown, names, strict=True):
+        # The page carries its pictures: it can be sent as one file.
+        kind, _, data = source.partition(",")
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(data) == (tmp_path / "out" / name).read_bytes()
+        with Image.open(tmp_path / "out" / name) as picture:
+            assert np.ptp(np.asarray(picture.convert("L"))) > 100
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted([*names, "compare.csv", "index.html"])
+
+
+def test_untrained_runs_have_no_training_picture(tmp_path):
+    page = compare([make_run(tmp_path / "idw", trained=False)], tmp_path / "out").read_text()
+    assert "<h3>Training</h3>" not in page
+    assert not (tmp_path / "out" / "room-training.png").exists()
+
+
+def test_blocked_run_brings_the_curves_of_its_folds(tmp_path):
+    run = make_run(tmp_path / "blocked", split="blocked", trained=False)
+    write_log(run / "fold0")
+    write_log(run / "fold1")
+    assert read_run(run).validation == {
+        f"fold{k}": [(10.0, 0.2), (20.0, 0.4), (30.0, pytest.approx(0.6))] for k in (0, 1)
+    }
+    assert "<h3>Training</h3>" in compare([run], tmp_path / "out").read_text()
+
+
+def captured(monkeypatch, name):
+    """Arguments of the last call of a drawing function, which still draws."""
+    calls = []
+    draw = getattr(figures, name)
+
+    def spy(*args, **kwargs):
+        calls.append(args)
+        return draw(*args, **kwargs)
+
+    monkeypatch.setattr(figures, name, spy)
+    return calls
+
+
+def test_pictures_show_rows_that_all_runs_predict(tmp_path, monkeypatch):
+    calls = captured(monkeypatch, "spectrum_table")
+    few, many = make_run(tmp_path / "few", rows=[8, 2, 4]), make_run(tmp_path / "many", rows=range(9), split="blocked")
+    compare([many, few], tmp_path / "out")
+    rows, columns = calls[-1]
+    assert {name for name, _ in rows} == {"row 2", "row 4", "row 8"}
+    assert columns[:3] == ["truth", "many", "few"]
+    for name, (truth, of_many, of_few, _) in rows:
+        r = int(name.split()[1])
+        assert np.array_equal(truth, np.random.default_rng(r).random(SHAPE).astype(np.float32))
+        assert np.array_equal(of_many, read_run(many).prediction[0, r])
+        assert np.array_equal(of_few, read_run(few).prediction[0, [8, 2, 4].index(r)])
+    scores = [read_run(many).score[0, int(name.split()[1])] for name, _ in rows]
+    assert scores == sorted(scores)
+
+
+def test_runs_without_common_rows_leave_places_empty(tmp_path, monkeypatch):
+    calls = captured(monkeypatch, "spectrum_table")
+    compare([make_run(tmp_path / "a", rows=[0, 1]), make_run(tmp_path / "b", rows=[5, 6])], tmp_path / "out")
+    for _, (_, of_a, of_b, _) in calls[-1][0]:
+        assert of_a is not None
+        assert of_b is None
+
+
+def test_blend_is_drawn_once_for_the_same_rows(tmp_path, monkeypatch):
+    calls = captured(monkeypatch, "score_cdf")
+    runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", noise=0.2), make_run(tmp_path / "c", rows=[3, 4])]
+    compare(runs, tmp_path / "out")
+    scores, references, label = calls[-1]
+    assert label == "SSIM"
+    assert list(scores) == ["a", "b", "c"]
+    assert list(references) == ["blend of 4 nearest, official", "blend of 4 nearest, official of c"]
+
+
+def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
+    calls, pictures = captured(monkeypatch, "score_cdf"), captured(monkeypatch, "spectrum_table")
+    run = make_run(tmp_path / "two", receivers=2)
+    score = read_run(run).score
+    assert score.shape == (2, 6)
+    compare([run], tmp_path / "out")
+    np.testing.assert_array_equal(np.sort(np.ravel(calls[-1][0]["two"])), np.sort(score.ravel()))
+    found = rows_of(tmp_path / "out" / "compare.csv")[0]
+    assert float(found["median"]) == pytest.approx(np.median(score), abs=1e-3)
+    assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
+
+
+def test_runs_of_the_same_name_are_told_apart(tmp_path):
+    compare([make_run(tmp_path / "x" / "run"), make_run(tmp_path / "y" / "run")], tmp_path / "out")
+    assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
+
+
+def remove(name):
+    return lambda run: (run / name).unlink()
+
+
+def replace(name, text):
+    return lambda run: (run / name).write_text(text)
+
+
+def edit_metrics(**changes):
+    def edit(run):
+        metrics = json.loads((run / "metrics.json").read_text()) | changes
+        kept = {key: value for key, value in metrics.items() if value is not ...}
+        (run / "metrics.json").write_text(json.dumps(kept))
+
+    return edit
+
+
+def drop_array(key):
+    def edit(run):
+        with np.load(run / "predictions.npz") as stored:
+            arrays = {name: stored[name] for name in stored if name != key}
+        np.savez(run / "predictions.npz", **arrays)
+
+    return edit
+
+
+def cut_truth(run):
+    with np.load(run / "predictions.npz") as stored:
+        arrays = dict(stored)
+    np.savez(run / "predictions.npz", **arrays | {"truth": arrays["truth"][:-1]})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (remove("metrics.json"), "no metrics.json, so no finished run"),
+        (remove("predictions.npz"), "predictions.npz: missing"),
+        (replace("metrics.json", "{"), "not readable as JSON"),
+        (replace("predictions.npz", "not a zip"), "predictions.npz: not readable"),
+        (
+            replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
+            "line 2 is no log entry",
+        ),
+        (replace("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),
+        (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
+        (edit_metrics(n_test=...), "no n_test"),
+        (edit_metrics(reference={}), "no reference idw4"),
+        (drop_array("reference_idw4"), "reference_idw4"),
+        (cut_truth, "shapes do not fit"),
+    ],
+)
+def test_damaged_run_is_named_in_one_line_and_nothing_is_written(tmp_path, damage, message):
+    run = make_run(tmp_path / "run")
+    damage(run)
+    with pytest.raises(InputError, match=message) as caught:
+        compare([run], tmp_path / "out")
+    assert str(run) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_repeated_or_no_folder_is_refused(tmp_path):
+    run = make_run(tmp_path / "run")
+    for runs, message in [
+        ([], "nothing to compare"),
+        ([run, tmp_path / "no"], "no such folder"),
+        ([run, run], "twice"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            compare(runs, tmp_path / "out")
+
+
+def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
+    """A bright spot at azimuth 90, elevation 60 is drawn straight above the centre, a third of the way out."""
+    spectrum = np.zeros((90, 360))
+    spectrum[55:66, 85:96] = 1
+    figure = Figure(figsize=(3, 3))
+    axes = figure.add_axes((0, 0, 1, 1), projection="polar")
+    figures.polar_spectrum(axes, spectrum)
+    axes.set_axis_off()
+    with Image.open(figures.save(figure, tmp_path / "polar.png", dpi=100)) as picture:
+        green = np.asarray(picture.convert("RGB")).astype(int)
+    yellow = (green[..., 0] > 200) & (green[..., 1] > 200) & (green[..., 2] < 120)
+    row, column = np.argwhere(yellow).mean(axis=0)
+    assert column == pytest.approx(150, abs=2)
+    assert row == pytest.approx(150 * (1 - 30 / 90), abs=2)

@@ -1,0 +1,198 @@
+"""Scores of signal strengths and channel coefficients: blocks of metrics, predictions, run folders and pooling."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.datasets import make_splits
+from wrf_mi.runs.evaluate import evaluate, pool, write_results
+from wrf_mi.runs.results import Results, read_run
+from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import abs_error_db, cea_db
+
+ROWS = 40
+FLOAT32 = 1e-5
+"""Rounding of tens of dBm, and of scores of some dB, in float32."""
+HEADER = {"dataset": "made-up", "model": "off", "split": "official", "train_seconds": 0.0, "peak_memory_mb": 1.0}
+FIELDS = {"median", "mean", "p10", "p90"}
+
+
+def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
+    rng = np.random.default_rng(5)
+    shape = (receivers, ROWS)
+    if task == "rssi":
+        observation = rng.uniform(-90, -40, shape).astype(np.float32)
+        observation[0, [1, 8, 39]] = np.nan
+        observation[-1, [2, 38, 39]] = np.nan
+    else:
+        shape = (*shape, subcarriers)
+        observation = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
+    return Record(
+        name="made-up",
+        task=task,
+        tx_pos_m=rng.normal(size=(ROWS, 3)),
+        receivers=tuple(Receiver(f"anchor{r}", rng.normal(size=3), np.array([0.0, 0, 0, 1])) for r in range(receivers)),
+        observation=observation,
+        official=(np.arange(30), np.arange(30, ROWS)),
+        folds=np.arange(ROWS) % 4,
+    )
+
+
+class Off:
+    """Knows the truth and departs from it: by 1 dB at the first receiver, 2 dB at the next; by a tenth in amplitude."""
+
+    def __init__(self, truth: Record) -> None:
+        self.truth = truth
+
+    def __call__(self, rows: np.ndarray, receiver: int) -> np.ndarray:
+        observed = self.truth.observation[receiver, rows]
+        if self.truth.task == "csi":
+            return observed * (1 + 0.1j)
+        return np.where(np.isnan(observed), -30.0, observed + 1 + receiver)
+
+
+def scored(task: str, receivers: int, split: str = "official") -> tuple[Record, list]:
+    truth = record(task, receivers)
+    return truth, [evaluate(truth, part, Off(truth)) for part in make_splits(truth, split)]
+
+
+def stored(folder: Path, metrics: dict, arrays: dict) -> Results:
+    folder.mkdir()
+    write_results(folder, HEADER | metrics, arrays)
+    return read_run(folder)
+
+
+def test_signal_strengths_of_one_receiver(tmp_path: Path):
+    truth, [(metrics, arrays)] = scored("rssi", 1)
+    assert metrics["task"] == "rssi"
+    assert metrics["abs_error_db"] == {key: pytest.approx(1, abs=FLOAT32) for key in FIELDS}
+    assert set(metrics["reference"]["idw100"]) == FIELDS
+    # Rows 38 and 39 of the one receiver were not received; row 39 was by none and is in no split.
+    assert (metrics["n_train"], metrics["n_test"]) == (27, 8)
+    assert "receivers" not in metrics
+    run = stored(tmp_path / "run", metrics, arrays)
+    with np.load(tmp_path / "run" / "predictions.npz") as file:
+        assert sorted(file) == ["prediction", "receiver_name", "reference_idw100", "row", "truth", "tx_pos"]
+        assert {key: file[key].dtype for key in ("prediction", "truth", "reference_idw100")} == dict.fromkeys(
+            ("prediction", "truth", "reference_idw100"), np.dtype(np.float32)
+        )
+        assert file["prediction"].shape == (8,)
+    assert (run.task, run.dataset, run.receivers) == ("rssi", "made-up", ("anchor0",))
+    assert run.prediction.shape == run.truth.shape == run.reference.shape == (1, 8)
+    np.testing.assert_array_equal(run.tx_pos_m, truth.tx_pos_m[run.row])
+    np.testing.assert_allclose(run.score, np.ones((1, 8)), atol=FLOAT32)
+    np.testing.assert_array_equal(run.reference_score, abs_error_db(run.reference, run.truth))
+
+
+def test_several_receivers_have_a_block_each_and_a_pooled_one(tmp_path: Path):
+    _, [(metrics, arrays)] = scored("rssi", 2)
+    assert list(metrics["receivers"]) == ["anchor0", "anchor1"]
+    for r, (name, count) in enumerate([("anchor0", 9), ("anchor1", 8)]):
+        block = metrics["receivers"][name]
+        assert block["abs_error_db"]["median"] == pytest.approx(1 + r, abs=FLOAT32)
+        assert set(block["reference"]["idw100"]) == FIELDS
+        assert block["n_test"] == count
+    # Every sample that was received counts once: 9 of 1 dB and 8 of 2 dB.
+    assert metrics["abs_error_db"]["mean"] == pytest.approx((9 * 1 + 8 * 2) / 17, abs=FLOAT32)
+    assert metrics["n_test"] == 9
+    run = stored(tmp_path / "run", metrics, arrays)
+    assert run.score.shape == (2, 9)
+    assert np.isnan(run.score).sum() == 1
+    assert np.isnan(run.score[1, run.row == 38]).all()
+    assert run.receivers == ("anchor0", "anchor1")
+
+
+def test_a_receiver_that_received_no_test_row_has_no_scores():
+    truth = record("rssi", 2)
+    truth.observation[1, 30:] = np.nan
+    metrics, _ = evaluate(truth, make_splits(truth, "official")[0], Off(truth))
+    assert metrics["receivers"]["anchor1"] == {"n_test": 0}
+    assert metrics["abs_error_db"]["median"] == pytest.approx(1, abs=FLOAT32)
+
+
+@pytest.mark.parametrize("receivers", [1, 2])
+def test_channel_coefficients(tmp_path: Path, receivers: int):
+    _, [(metrics, arrays)] = scored("csi", receivers)
+    assert metrics["task"] == "csi"
+    assert metrics["cea_db"] == {key: pytest.approx(20, abs=FLOAT32) for key in FIELDS}  # a tenth: 20 dB
+    assert metrics["n_test"] == 10
+    run = stored(tmp_path / "run", metrics, arrays)
+    assert run.prediction.shape == (receivers, 10, 3)
+    assert run.prediction.dtype == np.complex64
+    np.testing.assert_allclose(run.score, np.full((receivers, 10), 20), atol=FLOAT32)
+    blend = metrics["reference"]["idw4"]
+    assert blend["median"] == pytest.approx(np.median(cea_db(run.reference, run.truth)))
+    assert blend["median"] < 3, "white noise cannot be interpolated"
+
+
+@pytest.mark.parametrize("task", ["rssi", "csi"])
+@pytest.mark.parametrize("receivers", [1, 2])
+def test_folds_are_pooled(tmp_path: Path, task: str, receivers: int):
+    truth, parts = scored(task, receivers, "blocked")
+    metrics, arrays = pool(parts)
+    assert len(parts) == 4
+    received = ~np.isnan(truth.observation).reshape(receivers, ROWS, -1).all(axis=(0, 2))
+    assert sorted(arrays["row"].tolist()) == np.flatnonzero(received).tolist()
+    assert metrics["n_test"] == received.sum()
+    run = stored(tmp_path / "run", metrics, arrays)
+    assert run.metrics[TASKS[task].block]["mean"] == pytest.approx(np.nanmean(run.score))
+    np.testing.assert_array_equal(run.truth, truth.observation[:, run.row])
+
+
+def test_predictions_must_be_there_wherever_something_was_received():
+    truth = record("rssi", 1)
+    (split,) = make_splits(truth, "official")
+    with pytest.raises(InputError, match="8 of 8 values are not finite where the truth is known"):
+        evaluate(truth, split, lambda rows, receiver: np.full(len(rows), -np.inf))
+    with pytest.raises(InputError, match="differ in shape"):
+        evaluate(truth, split, lambda rows, receiver: np.zeros((len(rows), 2)))
+
+
+def test_what_cannot_be_scored_is_said_in_one_line():
+    truth = record("rssi", 2)
+    (split,) = make_splits(truth, "official")
+    with pytest.raises(InputError, match="split official: no test rows to score"):
+        evaluate(truth, replace(split, test=np.arange(0)), Off(truth))
+    truth.observation[1, :30] = np.nan
+    with pytest.raises(InputError, match="made-up, receiver anchor1: 28 training rows: none of them was received"):
+        evaluate(truth, make_splits(truth, "official")[0], Off(truth))
+
+
+@pytest.mark.parametrize(
+    ("task", "change", "message"),
+    [
+        ("rssi", {"task": "csi"}, "no cea_db or no reference idw4"),
+        ("csi", {"task": "rssi"}, "no abs_error_db or no reference idw100"),
+        ("rssi", {"task": "colour"}, "task 'colour'; known are spectrum, rssi, csi"),
+        ("rssi", {"reference": {"idw4": {"median": 1}}}, "no reference idw100"),
+    ],
+)
+def test_run_folders_of_another_task_are_named(tmp_path: Path, task: str, change: dict, message: str):
+    _, [(metrics, arrays)] = scored(task, 1)
+    stored(tmp_path / "run", metrics, arrays)
+    path = tmp_path / "run" / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=message):
+        read_run(tmp_path / "run")
+
+
+def test_predictions_of_another_shape_are_named(tmp_path: Path):
+    _, [(metrics, arrays)] = scored("rssi", 2)
+    stored(tmp_path / "run", metrics, arrays)
+    with np.load(tmp_path / "run" / "predictions.npz") as file:
+        kept = dict(file)
+    for wrong in (
+        {"truth": kept["truth"][:, 1:]},
+        {"prediction": kept["prediction"][..., None]},
+        {"receiver_name": kept["receiver_name"][:1]},
+        {"tx_pos": kept["tx_pos"][:, :2]},
+    ):
+        np.savez(tmp_path / "run" / "predictions.npz", **kept | wrong)
+        with pytest.raises(InputError, match=r"shapes do not fit together .*; run evaluate to write it anew"):
+            read_run(tmp_path / "run")

@@ -1,0 +1,58 @@
+"""Footprints drawn on the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from wrf_mi.core import Receiver, unit_vectors
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.gaussians.footprint_constants import LOW_PASS_RAD, NEAR_M
+from wrf_mi.gaussians.oracle import Projection, footprint, project
+from wrf_mi.runs import figures
+
+RECEIVER = Receiver("gateway1", np.array([1.0, 2.0, 3.0]), np.array([0.36, 0.48, 0.0, 0.8]))
+ROUND = np.array([[0.0, 0.0, 0.0, 1.0]])
+OUTLINE_TOLERANCE = 1e-9
+"""Rounding of a few float64 operations on numbers of order one."""
+
+
+def seen_from(azimuth_deg: float, elevation_deg: float, distance_m: float, scale_m: list[float]) -> Projection:
+    direction = unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg))
+    position = RECEIVER.position_m + RECEIVER.to_world @ (distance_m * direction)
+    return project(position[None], np.array([scale_m]), ROUND, RECEIVER)
+
+
+def outlines_of(figure: Figure) -> list[FloatArray]:
+    """Unit vectors along each outline in the right picture, in the order in which they are drawn."""
+    (lines,) = figure.axes[1].collections
+    return [unit_vectors(s[:, 0], np.radians(90 - s[:, 1])) for s in lines.get_segments()]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(90, 60), (0, 10), (200, 89), (359.5, 0)])
+def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elevation: float) -> None:
+    """Its angular radius is that of the scale seen from the receiver, low-pass included, seam and zenith or not."""
+    seen = seen_from(azimuth, elevation, 4.0, [0.4, 0.4, 0.4])
+    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
+    angle = np.arccos(outline @ unit_vectors(np.radians(azimuth), np.radians(elevation)))
+    assert angle == pytest.approx(np.arctan(np.hypot(0.4 / 4.0, LOW_PASS_RAD)), abs=OUTLINE_TOLERANCE)
+
+
+def test_outline_is_where_the_footprint_is_one_deviation() -> None:
+    seen = seen_from(40, 70, 2.0, [0.1, 0.3, 0.5])
+    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
+    assert footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
+
+
+def test_largest_weight_is_drawn_last_and_what_has_no_footprint_not_at_all() -> None:
+    directions = unit_vectors(np.radians([0, 90, 180, 270]), np.radians(45))
+    distance = np.array([3.0, 3.0, 3.0, NEAR_M / 2])
+    position = RECEIVER.position_m + (distance[:, None] * directions) @ RECEIVER.to_world.T
+    seen = project(position, np.full((4, 3), 0.1), np.repeat(ROUND, 4, axis=0), RECEIVER)
+    figure = figures.footprint_sky(np.zeros((9, 36)), seen, [0.5, 0.9, 0.1, 2.0])
+    centres = [outline[:-1].mean(axis=0) for outline in outlines_of(figure)]
+    azimuth = [round(np.degrees(np.arctan2(y, x))) % 360 for x, y, _ in centres]
+    assert azimuth == [180, 0, 90]
+    (lines,) = figure.axes[1].collections
+    assert lines.get_array().tolist() == [0.1, 0.5, 0.9]

@@ -1,0 +1,197 @@
+"""Gaussians and traced paths trained together by the command: scores, resuming, prediction, what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from calling import call
+from scipy.spatial.transform import Rotation
+from traced_rooms import SHOEBOX, write_xml
+
+import wrf_mi
+from wrf_mi.cli.main import main
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.settings import with_settings
+from wrf_mi.datasets import make_splits, write_spectrum_folder
+from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
+from wrf_mi.tasks import instrument_of
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.training.config import TrainConfig, default_config
+from wrf_mi.training.trainer import Trainer
+
+HZ = 920e6
+SIZE = (24, 48)
+WHOLE = SHOEBOX | {"ceiling": ("itu_metal", SHOEBOX["ceiling"][1])}
+KNOWN = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
+STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+ARRAY = Receiver("gateway1", np.array([5.2, 2.4, 1.1]), STANDING.as_quat(), array_m=planar_array(4, 4, 0.16))
+SETTINGS = (
+    "steps=300",
+    "validate_every=80",
+    "log_every=40",
+    "checkpoint_every=80",
+    "initial.gaussians=24",
+    "density.every=60",
+    "density.most=30",
+    "network.width=32",
+    "network.layers=2",
+    "traced.reflections=1",
+    "traced.depth=1",
+    "traced.rays=4096",
+    "deterministic=true",
+)
+FLOAT32_GREY = 1e-4
+"""Of greys that a batch of transmitters and a single one give: sums in single precision."""
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A room with a ceiling of metal, and what is known of it: floor and walls."""
+    folder = tmp_path_factory.mktemp("rooms")
+    return {"whole": write_xml(folder / "whole", WHOLE), "known": write_xml(folder / "known", KNOWN)}
+
+
+@pytest.fixture(scope="module")
+def data(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Spectra of the whole room, traced by Sionna RT; the test rows are on one side."""
+    tx = np.random.default_rng(4).uniform([1.7, 2.6, 1.4], [2.1, 3.2, 1.7], (60, 3))
+    tx = tx[np.argsort(tx[:, 0] + tx[:, 1])]
+    empty = np.zeros((1, len(tx), *SIZE), np.float32)
+    rows = np.arange(len(tx))
+    split = rows[12:], rows[:12]
+    record = Record("room", "spectrum", tx, (ARRAY,), empty, official=split, frequencies_hz=np.array([HZ]))
+    paths = trace_paths(open_scene(rooms["whole"], HZ), tx, ARRAY, TraceOptions(max_depth=2, rays=1 << 13)).paths
+    spectra = instrument_of(record).observe(paths)
+    return write_spectrum_folder(tmp_path_factory.mktemp("data") / "room", replace(record, observation=spectra))
+
+
+def config(*settings: str, with_scene: bool = True) -> TrainConfig:
+    return with_settings(default_config("spectrum", with_scene), [*SETTINGS, *settings])
+
+
+@pytest.fixture(scope="module")
+def run(rooms: dict[str, Path], data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "joint"
+    train(str(data), out, settings=config(), scene=rooms["known"])
+    return out
+
+
+def median(run: Path) -> float:
+    return float(json.loads((run / "metrics.json").read_text())["ssim"]["median"])
+
+
+def test_trained_together_they_predict_better_than_either_alone(
+    rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
+) -> None:
+    train(str(data), tmp_path / "field", settings=config(with_scene=False))
+    asked = ["trace", rooms["known"], data, "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"]
+    assert main([str(word) for word in asked]) == 0
+    assert median(run) > median(tmp_path / "field") + 0.03
+    assert median(run) > median(tmp_path / "traced") + 0.03
+
+
+def test_run_folder_states_the_scene_and_what_was_trained(rooms: dict[str, Path], run: Path) -> None:
+    stated = yaml.safe_load((run / "config.yaml").read_text())
+    assert stated["scene"] == str(rooms["known"])
+    params = open_run(run).field.params
+    moved = {name for name in params if name.startswith(("material", "receiver"))}
+    assert {"receiver.gateway1.gain", "material.itu_concrete.permittivity", "material.itu_brick.conductivity"} <= moved
+    # A pose is held unless a rate is given for it, and costs nothing.
+    assert not any("position" in name or "turn" in name for name in moved)
+    for name in ("receiver.gateway1.gain", "material.itu_concrete.permittivity"):
+        assert params[name].any()
+
+
+def test_predictions_are_those_that_were_scored(data: Path, run: Path) -> None:
+    before = (run / "predictions.npz").read_bytes()
+    score = median(run)
+    assert evaluate_run(run)["ssim"]["median"] == score
+    assert (run / "predictions.npz").read_bytes() == before
+    record = wrf_mi.load(str(data))
+    predictor = open_run(run).predictor()
+    with np.load(run / "predictions.npz") as stored:
+        rows, prediction = stored["row"], stored["prediction"]
+    np.testing.assert_allclose(predictor(record.tx_pos_m[rows[:3]], "gateway1"), prediction[:3], atol=FLOAT32_GREY)
+
+
+def test_stopped_and_resumed_is_the_same_bit_for_bit(
+    rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
+) -> None:
+    steps = 0
+
+    def stop() -> bool:
+        nonlocal steps
+        steps += 1
+        return steps == 100
+
+    with pytest.raises(Interrupted):
+        train(str(data), tmp_path / "run", settings=config(), scene=rooms["known"], stop=stop)
+    resume(tmp_path / "run")
+    one, other = (open_run(folder).field.arrays() for folder in (run, tmp_path / "run"))
+    for key in one:
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+def test_receivers_poses_are_trained_where_a_rate_is_given(rooms: dict[str, Path], data: Path, tmp_path: Path) -> None:
+    own = config("steps=20", "traced.position=0.001", "traced.turn=0.001", "traced.pattern_degree=1", "receiver=pixel")
+    train(str(data), tmp_path / "run", settings=own, scene=rooms["known"])
+    params = open_run(tmp_path / "run").field.params
+    for name in (
+        "receiver.gateway1.position",
+        "receiver.gateway1.turn",
+        "receiver.gateway1.pattern",
+        "pattern.transmitter",
+    ):
+        assert np.abs(params[name]).max() > 0, name
+
+
+def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, capsys: Any) -> None:
+    settings = [part for one in ("steps=20", *SETTINGS[1:]) for part in ("--set", one)]
+    asked = ["train", data, "--receiver", "array", "--out", tmp_path / "run", *settings]
+    status, _, err = call(asked, capsys)
+    assert status == 0, err
+    with np.load(tmp_path / "run" / "predictions.npz") as stored:
+        # The instrument's scale is part of this receiver.
+        np.testing.assert_allclose(stored["prediction"].max(axis=(1, 2)), 1, atol=1e-6)
+        np.testing.assert_allclose(stored["prediction"].min(axis=(1, 2)), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--material", "concrete"], "--material and antenna options belong to a scene"),
+        (["--rx-polarization", "H"], "--material and antenna options belong to a scene"),
+        (["--scene", "nowhere"], "nowhere: no such scene"),
+        (["--model", "kriging", "--receiver", "array"], "--receiver belongs to fields of spectra"),
+        (["--set", "receiver=horn"], "receiver model 'horn': unknown; choose from pixel, array"),
+        (["--set", "traced.pattern_degree=9"], "setting traced.pattern_degree: 9"),
+    ],
+)
+def test_what_does_not_belong_together_is_one_line(
+    data: Path, tmp_path: Path, capsys: Any, arguments: list[str], message: str
+) -> None:
+    status, _, err = call(["train", data, *arguments, "--out", tmp_path / "run"], capsys)
+    assert (status, err.count("\n")) == (2, 1), err
+    assert message in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scene_needs_array_and_carrier(rooms: dict[str, Path], data: Path) -> None:
+    record = wrf_mi.load(str(data)).with_array(None)
+    scene = open_scene(rooms["known"], HZ)
+    with pytest.raises(InputError, match="a scene needs the antenna array and the carrier"):
+        Trainer(record, make_splits(record, "official")[0], config(), scene=scene)
+
+
+def test_fields_alone_import_no_tracer() -> None:
+    code = "import sys, wrf_mi.training.trainer; sys.exit(any(name.startswith('sionna') for name in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,224 @@
+"""A sweep: which runs, their names and table, going on, a lost worker, and what is refused before anything starts."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from calling import SET, call, refused
+
+from wrf_mi.core import InputError
+from wrf_mi.runs import sweep as module
+from wrf_mi.runs.results import read_run
+from wrf_mi.runs.sweep import check_failures, plan_sweep, run_sweep, sweep_table
+
+SECONDS = 60
+"""For a worker to begin its part, on a busy machine."""
+NAMES = ["seed=0,structural_weight=0.1", "seed=0,structural_weight=0.2", "seed=1,structural_weight=0.1"]
+NAMES += ["seed=1,structural_weight=0.2"]
+VARY = ["--vary", "seed=0,1", "--vary", "structural_weight=0.1,0.2"]
+
+
+def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) -> None:
+    options = {"dataset": "rfid-lab", "model": "hybrid"}
+    plan = plan_sweep(tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["hold_out=0"], ["--flag"])
+    assert plan.varied == ["split", "steps"]
+    names = ["split=official,steps=1", "split=official,steps=2", "split=blocked-2,steps=1", "split=blocked-2,steps=2"]
+    assert [run.folder for run in plan.runs] == [tmp_path / name for name in names]
+    command = "train rfid-lab --model hybrid --split blocked:2 --flag --set hold_out=0 --set steps=1"
+    assert " ".join(plan.runs[2].arguments) == command
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ([], "nothing varies"),
+        (["seed"], "expected KEY=VALUE,VALUE"),
+        (["seed=1,,2"], "expected KEY=VALUE,VALUE"),
+        (["seed=1,2,1"], "a value is given twice"),
+        (["seed=1", "seed=2"], "seed is given already"),
+        (["steps=1"], "steps is given already"),
+        (["model=hybrid"], "model is given already"),
+        (["scene=a/b,a b"], "two runs would be named scene=a-b"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(vary: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        plan_sweep(tmp_path, vary, {"dataset": "x", "model": "wrf-gs"}, ["steps=3"])
+
+
+def test_bad_input_is_refused_before_anything_starts(
+    folder: Path, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "sweep"
+    for data, wrong, message in (
+        (folder, ["seed=0,x"], "--seed: invalid int value: 'x'"),
+        (folder, ["model=wrf-gs,other"], "--model: invalid choice: 'other'"),
+        (folder, ["no.such=1"], "unknown setting no.such"),
+        (folder, ["batch=1,0"], "batch: 0 is out of range"),
+        (folder, ["split=official,blocked:9"], "blocked"),
+        (folder, ["initial.points=nowhere.ply"], "nowhere.ply"),
+        (folder, ["scene=a,b"], "carrier frequency unknown"),
+        (folder, ["model=hybrid", "steps=1"], "steps"),
+        (folder, ["model=hybrid", "n-train=0,4"], "nothing to predict from"),
+        (
+            flat_folder,
+            ["model=vae", "seed=0,1"],
+            "holds rssi; vae serves spectrum, so choose another model",
+        ),
+        (flat_folder, ["model=ray-tracing", "scene=nowhere"], "nowhere"),
+        (tmp_path / "none", ["seed=0,1"], "none"),
+    ):
+        vary = [part for one in wrong for part in ("--vary", one)]
+        refused(["sweep", data, *vary, "--out", out], message, capsys)
+        assert not out.exists(), wrong
+
+
+@pytest.fixture(scope="module")
+def swept(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four runs, one after the other."""
+    out = tmp_path_factory.mktemp("sweeps") / "serial"
+    vary = [VARY[1], VARY[3]]
+    settings = [part for part in SET if part != "--set"]
+    rows = run_sweep(plan_sweep(out, vary, {"dataset": str(folder)}, settings, ["--deterministic"]))
+    assert [row["status"] for row in rows] == ["done"] * 4
+    return out
+
+
+def test_table_holds_what_the_runs_scored(swept: Path) -> None:
+    assert sorted(path.name for path in swept.iterdir() if path.is_dir()) == NAMES
+    with (swept / "scores.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["seed"], row["structural_weight"]) for row in rows] == [
+        ("0", "0.1"),
+        ("0", "0.2"),
+        ("1", "0.1"),
+        ("1", "0.2"),
+    ]
+    for row, full in zip(rows, json.loads((swept / "scores.json").read_text()), strict=True):
+        run = read_run(row["run"])
+        assert full["metrics"] == run.metrics
+        assert (row["score"], float(row["median"])) == ("SSIM", pytest.approx(np.median(run.score)))
+        assert float(row["reference_median"]) == pytest.approx(np.median(run.reference_score))
+    lines = (swept / "scores.md").read_text().splitlines()
+    assert len(lines) == 6
+    assert lines[0].startswith("| seed | structural_weight | score | median |")
+    assert len({len(line.split("|")) for line in lines}) == 1
+
+
+def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
+    folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command on two workers, of which one is killed while it trains."""
+    out, killed = tmp_path / "sweep", []
+
+    def kill_one() -> None:
+        until = time.monotonic() + SECONDS
+        while not killed and time.monotonic() < until:
+            for worker in psutil.Process().children(recursive=True):
+                try:
+                    busy = any("wrf_mi.parallel.child" in " ".join(c.cmdline()) for c in worker.children())
+                except psutil.Error:
+                    continue
+                if busy and any(out.glob("seed=*")):
+                    os.kill(worker.pid, signal.SIGKILL)
+                    killed.append(worker.pid)
+                    return
+            time.sleep(0.02)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    command = ["sweep", folder, *SET, "--deterministic", *VARY, "--out", out, "--scheduler", "local:2", "--json"]
+    status, printed, err = call(command, capsys)
+    killer.join()
+    assert status == 0, err
+    assert killed
+    rows = json.loads(printed)
+    assert [Path(row["run"]).name for row in rows] == NAMES
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == NAMES
+    assert len(err.splitlines()) == 4
+    for name in NAMES:
+        one, other = read_run(swept / name), read_run(out / name)
+        np.testing.assert_array_equal(other.row, one.row)
+        np.testing.assert_array_equal(other.prediction, one.prediction)
+        steps = [json.loads(line)["step"] for line in (out / name / "log.jsonl").read_text().splitlines()]
+        assert steps == [2, 4]
+
+
+def test_finished_runs_are_kept_and_others_added_or_done_again(
+    folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = shutil.copytree(swept, tmp_path / "sweep")
+    for file in ("metrics.json", "predictions.npz"):  # as if stopped while it was scored
+        (out / NAMES[0] / file).unlink()
+    (out / NAMES[1] / "config.yaml").unlink()  # as if stopped before it began
+    (out / NAMES[1] / "metrics.json").unlink()
+    dates = {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]}
+    command = ["sweep", folder, *SET, "--deterministic", *VARY, "--out", out, "--json"]
+    status, printed, err = call(command, capsys)
+    assert status == 0, err
+    assert [row["status"] for row in json.loads(printed)] == ["done", "done", "kept", "kept"]
+    assert {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]} == dates
+    for name in NAMES:
+        np.testing.assert_array_equal(read_run(out / name).prediction, read_run(swept / name).prediction)
+    refused([*command, "--set", "hold_out=0"], "holds a sweep with other settings", capsys)
+    refused([*command[:-2], folder], "holds no sweep", capsys)
+
+
+def test_sweep_goes_on_with_the_same_data_and_versions_alone(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = shutil.copytree(folder, tmp_path / "data")
+    monkeypatch.setattr(module, "run_module", lambda *call: (1, "not run"))
+
+    def again(*values: str) -> list[str]:
+        plan = plan_sweep(tmp_path / "sweep", ["seed=0,1", *values], {"dataset": str(data)})
+        return [row["status"] for row in run_sweep(plan)]
+
+    assert again() == again() == ["not run"] * 2
+    original = (data / "gateway_info.yml").read_bytes()
+    (data / "gateway_info.yml").write_bytes(original + b"\n")
+    with pytest.raises(InputError, match=rf"holds a sweep with other content of {data}; choose another --out"):
+        again()
+    (data / "gateway_info.yml").write_bytes(original)
+    versions = module.package_versions()
+    monkeypatch.setattr(module, "package_versions", lambda: versions | {"drjit": "0.1"})
+    with pytest.raises(InputError, match="holds a sweep by other versions of drjit; choose another --out"):
+        again()
+    path = tmp_path / "sweep" / "sweep.json"
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in stored.items() if key != "versions"}))
+    with pytest.raises(InputError, match="by other versions of what it does not state"):
+        again()
+
+
+def test_failed_run_is_told_and_the_others_go_on(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = plan_sweep(tmp_path / "sweep", ["seed=0,1"], {"dataset": str(folder)})
+    seen = []
+
+    def run(name: str, arguments: tuple[str, ...]) -> tuple[int, str]:
+        seen.append(arguments)
+        return (1, "wrf-mi: out of | memory") if "0" in arguments else (-6, "")
+
+    monkeypatch.setattr(module, "run_module", run)
+    rows = run_sweep(plan)
+    assert len(seen) == 2
+    assert [row["status"] for row in rows] == ["out of | memory", "ended with status -6"]
+    assert "| out of \\| memory |" in sweep_table(rows, plan.varied)
+    with pytest.raises(module.SweepFailed, match=r"2 of 2 runs failed: seed=0: out of \| memory; seed=1: ended"):
+        check_failures(rows)
+    status, _, err = call(["sweep", folder, "--vary", "seed=0,1", "--out", tmp_path / "other"], capsys)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("wrf-mi: sweep: 2 of 2 runs failed: ")

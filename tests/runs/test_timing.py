@@ -1,0 +1,203 @@
+"""How calls are timed, split and compared, on calls whose cost is known."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+from wrf_mi_bench.scaling import rows, scale, verdict
+from wrf_mi_bench.scaling_axes import Axis
+from wrf_mi_scenes.divided import cluttered_room, divided_room
+
+from wrf_mi.runs import timing
+from wrf_mi.runs.timing import (
+    Interval,
+    bootstrap,
+    exponent,
+    interleaved,
+    larger_half,
+    measure,
+    memory_mb,
+    n_log_n,
+    ratio,
+    split,
+)
+
+BUSY_S = 0.02
+ARRAY_MB = 64
+SLACK_MB = 16
+"""What NumPy, Dr.Jit and Python's own allocator may take beside an array."""
+PAGES_MB = 1
+"""Pages of the process that an array may take over."""
+
+
+def busy() -> None:
+    time.sleep(BUSY_S)
+
+
+def array() -> np.ndarray:
+    return np.ones(ARRAY_MB * 1_000_000 // 8)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Time that stands still but for what calls add to it."""
+    now = [0.0]
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
+    rng = np.random.default_rng(0)
+    few, many = (bootstrap(rng.normal(5, 1, n)) for n in (20, 2000))
+    assert few.low < few.value < few.high
+    assert few.low < 5 < few.high
+    assert many.high - many.low < 0.3 * (few.high - few.low)
+    assert bootstrap([3.0]) == Interval(3.0, 3.0, 3.0)
+    with pytest.raises(ValueError, match="one at least"):
+        bootstrap([])
+
+
+def test_calls_take_turns_and_warm_up_is_not_timed(clock: list[float]) -> None:
+    order: list[str] = []
+
+    def call(name: str, cost: float) -> None:
+        order.append(name)
+        # The first call of each compiles.
+        clock[0] += cost if order.count(name) > 1 else 100.0
+
+    calls = {"a": lambda: call("a", 0.002), "b": lambda: call("b", 0.001)}
+    times = interleaved(calls, repeats=4, warm_up=1)
+    assert order == [*"ab", *"abba" * 2]
+    np.testing.assert_allclose(times["a"], [2] * 4)
+    np.testing.assert_allclose(times["b"], [1] * 4)
+
+
+def test_rounds_end_when_time_is_up_but_three_are_timed(clock: list[float]) -> None:
+    def slow() -> None:
+        clock[0] += 10
+
+    assert len(interleaved({"slow": slow}, repeats=50, warm_up=1, most_s=5)["slow"]) == 3
+    assert len(interleaved({"slow": slow}, repeats=50, warm_up=1, most_s=75)["slow"]) == 7
+
+
+def test_what_slows_both_calls_leaves_their_ratio(clock: list[float]) -> None:
+    load = itertools.count(1)
+    calls = {"ours": 0.003, "theirs": 0.001}
+
+    def cost(seconds: float) -> None:
+        clock[0] += seconds * ((next(load) + 1) // 2)  # the same within a round, ever more
+
+    times = interleaved({name: lambda s=s: cost(s) for name, s in calls.items()}, repeats=20, warm_up=1)
+    assert times["ours"].max() > 5 * times["ours"].min()
+    found = ratio(times["ours"], times["theirs"])
+    np.testing.assert_allclose([found.low, found.value, found.high], 3)
+    with pytest.raises(ValueError, match="as many of both"):
+        ratio([1, 2], [1])
+
+
+def test_python_counts_as_tracing_and_kernels_as_execution() -> None:
+    waited = split(busy)
+    assert waited.tracing >= 1e3 * BUSY_S
+    assert waited.kernels == waited.execution == waited.code_generation == 0
+    import drjit as dr
+    import mitsuba as mi
+
+    def kernel() -> object:
+        return dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25)
+
+    split(kernel)
+    warm = split(kernel)
+    assert warm.kernels == 1
+    assert warm.compiled == 0
+    assert warm.execution > 0
+
+
+def test_memory_is_what_a_call_needs_beyond_what_was_there() -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    held = array()
+    for _ in range(2):  # the second time, Dr.Jit has freed arrays in store
+        assert ARRAY_MB - PAGES_MB <= memory_mb(array) < ARRAY_MB + SLACK_MB
+        own = memory_mb(lambda: dr.arange(mi.Float, ARRAY_MB * 1_000_000 // 4) + 1)
+        assert ARRAY_MB - PAGES_MB <= own < ARRAY_MB + SLACK_MB
+    assert memory_mb(lambda: None) < SLACK_MB
+    assert held.nbytes == 1e6 * ARRAY_MB
+
+
+def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    monkeypatch.setattr(timing, "RESET_PEAK", tmp_path / "missing")
+
+    def call() -> None:
+        kept = array()
+        time.sleep(BUSY_S)  # at least one look
+        del kept
+
+    assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
+
+
+def test_measure_has_all_of_it() -> None:
+    found = measure(busy, repeats=3)
+    assert len(found.times_ms) == 3
+    assert found.ms.low >= 1e3 * BUSY_S
+    assert found.plain()["warm"]["tracing"] >= 1e3 * BUSY_S
+
+
+def test_exponent_is_that_of_the_larger_half() -> None:
+    sizes = [10**k for k in range(1, 7)]
+    cost = [[1000 + n**1.5] * 3 for n in sizes]  # the overhead hides the growth at first
+    found = exponent(sizes, cost)
+    np.testing.assert_allclose([found.low, found.value, found.high], 1.5, atol=0.01)
+    assert larger_half(6) == slice(3, 6)
+    assert larger_half(4) == slice(1, 4)
+    assert larger_half(3) == slice(1, 3)
+    assert larger_half(2) == slice(0, 2)
+    with pytest.raises(ValueError, match="two or more"):
+        exponent([10], [[1.0]])
+
+
+def test_exponent_is_less_sure_of_noisy_times() -> None:
+    rng, sizes = np.random.default_rng(0), [10, 100, 1000, 10000]
+    calm, noisy = (exponent(sizes, [n * rng.lognormal(0, s, 9) for n in sizes]) for s in (0.01, 0.5))
+    assert noisy.high - noisy.low > 10 * (calm.high - calm.low)
+    assert noisy.low < 1 < noisy.high
+
+
+def test_growth_beyond_n_log_n_is_said(clock: list[float]) -> None:
+    def axis(power: float) -> Axis:
+        def make(n: int):
+            def call() -> None:
+                clock[0] += 1e-7 * n**power
+
+            return call
+
+        return Axis("a", "made up", "things", (10, 100, 1000, 10000), make)
+
+    for power, said in ((1.0, "holds"), (2.0, "does not hold")):
+        found = scale(axis(power))
+        assert found["sizes"] == [10, 100, 1000, 10000]
+        assert rows([found])[0]["asked"].endswith(f": {said}")
+    assert verdict(Interval(1.1, 1.0, 1.3), n_log_n([100, 1000])) == "holds within its interval"
+    # What would take too long is left out, and said.
+    slow = scale(axis(2.0), call_s=1e-3)
+    assert slow["left_out"] == [1000, 10000]
+    assert "1,000 left out" in rows([slow])[0]["what"]
+
+
+@pytest.mark.parametrize("count", [12, 100, 5000])
+def test_rooms_of_a_number_of_triangles(count: int) -> None:
+    walls = divided_room(count)
+    assert count <= len(walls.faces) <= 1.6 * count
+    np.testing.assert_allclose(walls.area, divided_room(12).area)
+    np.testing.assert_allclose(walls.bounds, [[0, 0, 0], [9, 7, 3]])
+    if count < 24:
+        return
+    clear = np.array([[2.0, 3.0, 1.5]])
+    clutter = cluttered_room(count, clear)
+    assert abs(len(clutter.faces) - count) <= 12
+    corners = np.asarray(clutter.vertices)[len(divided_room(12).vertices) :]
+    assert np.linalg.norm(corners - clear, axis=1).min() > 1.0
+    np.testing.assert_allclose(clutter.area - walls.area, 60, rtol=1e-6)

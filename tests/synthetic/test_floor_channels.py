@@ -1,0 +1,207 @@
+"""Channels between a base station and walking users: made once, right at each antenna and frequency, noisy as told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.constants import speed_of_light
+from scipy.spatial import cKDTree
+from wrf_mi_scenes.furnished import measured_parts, write_scene
+
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.datasets import make_splits, read_nerf2_csi
+from wrf_mi.receivers import csi, element_signals
+from wrf_mi.runs.evaluate import evaluate
+from wrf_mi.synthetic import load_record, walked_channels
+from wrf_mi.synthetic.floor_channels import CARRIER_HZ, DOWNLINK_HZ, PLACES, UPLINK_HZ, Walk, users_way, with_noise
+from wrf_mi.tasks import instrument_of
+from wrf_mi.tasks.scores import cea_db
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.array_channels import array_channels
+from wrf_mi.tracing.devices import check_devices
+from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.tracer import RayTracer
+
+SMALL = Walk(rows=2, columns=3, users=1, places=4, depth=3, reflections=1, rays=1 << 12, scattered_rays=1 << 6)
+FLOAT64 = 1e-9
+"""Products of 51 turns in place of exponentials, against the largest coefficient."""
+MIDDLE = 0.01
+"""Reflection coefficients at the array's middle in place of each element's, 0.09 m away: a wall at 3 m is met at angles
+that differ by 0.015 rad at most."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("walked") / "flat"
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> Record:
+    return walked_channels("flat", folder, SMALL)
+
+
+def test_it_is_made_once_and_the_same_each_time(folder: Path, record: Record, tmp_path: Path) -> None:
+    before = (folder / "csidata.npy").stat().st_mtime_ns
+    again = walked_channels("flat", folder, SMALL)
+    assert (folder / "csidata.npy").stat().st_mtime_ns == before
+    np.testing.assert_array_equal(again.observation, record.observation)
+    moved = walked_channels("flat", tmp_path / "moved", replace(SMALL, seed=2))
+    assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
+    walked_channels("flat", tmp_path / "moved", SMALL)
+    back = read_nerf2_csi(tmp_path / "moved")
+    for key in ("observation", "uplink", "scored"):
+        np.testing.assert_array_equal(getattr(back, key), getattr(record, key))
+
+
+def test_what_it_holds(record: Record) -> None:
+    rows = len(PLACES["flat"]().routes) * SMALL.places
+    assert (record.name, record.task, len(record)) == ("traced-csi-flat", "csi", rows)
+    assert record.truth is not None
+    assert record.observation.shape == record.truth.shape == (1, rows, 6, 26)
+    assert record.uplink is not None
+    assert record.uplink.shape == (rows, 6, 26)
+    assert record.has_positions
+    assert np.abs(record.truth).max(axis=(0, 2, 3)).min() > 0
+    np.testing.assert_array_equal(record.uplink_hz, UPLINK_HZ)
+    np.testing.assert_array_equal(record.frequencies_hz, DOWNLINK_HZ)
+    assert record.official is not None
+    assert [len(part) for part in record.official] == [16, 4]
+    np.testing.assert_allclose(record.receivers[0].position_m, PLACES["flat"]().station_m)
+    np.testing.assert_allclose(record.receivers[0].to_world[:, 2], [1, 0, 0], atol=FLOAT64)
+    for rule in ("official", "random", "blocked", "trajectory"):
+        for split in make_splits(record, rule, n_train=5):
+            assert len(split.all_train) == 5
+
+
+def test_scores_are_held_against_the_channel_without_noise(record: Record) -> None:
+    (split,) = make_splits(record, "official")
+    assert record.truth is not None
+    truth, observed = record.truth, record.observation
+    exact, _ = evaluate(record, split, lambda rows, receiver: truth[receiver, rows])
+    noisy, _ = evaluate(record, split, lambda rows, receiver: observed[receiver, rows])
+    assert exact["cea_db"]["median"] > 100
+    # At one antenna, which may receive less than the mean over them.
+    assert SMALL.snr_db - 6 < noisy["cea_db"]["median"] < SMALL.snr_db + 3
+
+
+def test_noise_is_as_strong_as_stated() -> None:
+    rng = np.random.default_rng(3)
+    channel = (rng.standard_normal((2, 100, 100)) + 1j) * np.array([1.0, 1e-5])[:, None, None]
+    noise = with_noise(channel, 25.0, rng) - channel
+    power = (np.abs(noise) ** 2).mean(axis=(1, 2)) / (np.abs(channel) ** 2).mean(axis=(1, 2))
+    # 10,000 values: 1 % of the power, 0.04 dB, is one standard deviation.
+    np.testing.assert_allclose(-10 * np.log10(power), 25, atol=0.25)
+    real, imaginary = noise[0].real, noise[0].imag
+    assert abs(real.var() / imaginary.var() - 1) < 0.1
+    assert abs((real * imaginary).mean()) < 0.1 * real.var()
+
+
+def bare_room(tmp_path: Path) -> tuple[object, Receiver, np.ndarray, np.ndarray]:
+    """An empty room with an array, its elements, and users in it."""
+    write_scene(tmp_path, measured_parts(0.0, 0), "test")
+    receiver = Receiver("array", np.array([1.5, 3.2, 1.7]), np.array([0.5, 0.5, 0.5, 0.5]))
+    users = np.array([[4.2, 3.0, 1.2], [4.5, 1.6, 1.7], [3.0, 5.0, 1.0]])
+    return open_scene(tmp_path, CARRIER_HZ), receiver, planar_array(2, 4, speed_of_light / CARRIER_HZ / 2), users
+
+
+def ends_of(users: np.ndarray) -> list[Receiver]:
+    return [Receiver(str(row), place, np.array([0.0, 0, 0, 1])) for row, place in enumerate(users)]
+
+
+OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
+
+
+def test_specular_channels_are_those_of_the_other_direction(tmp_path: Path) -> None:
+    scene, receiver, array_m, users = bare_room(tmp_path)
+    frequencies = np.concatenate([UPLINK_HZ[::5], DOWNLINK_HZ[::5]])
+    there = trace_paths(scene, users, receiver, OPTIONS).paths
+    back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS).paths
+    expected = np.stack([element_signals(there, receiver, array_m, one)[0] for one in frequencies], axis=-1)
+    found = array_channels(back, receiver, array_m, frequencies)
+    assert np.abs(found - expected).max() < FLOAT64 * np.abs(expected).max()
+    parts = np.concatenate([array_channels(back, receiver, array_m[k : k + 1], frequencies) for k in range(8)], axis=1)
+    assert np.abs(found - parts).max() < FLOAT64 * np.abs(found).max()
+
+
+def test_channels_are_those_traced_to_each_element(tmp_path: Path) -> None:
+    scene, receiver, array_m, users = bare_room(tmp_path)
+    frequencies = np.array([UPLINK_HZ[0], DOWNLINK_HZ[-1]])
+    places = receiver.position_m + array_m @ receiver.to_world.T
+    expected = csi(trace_paths(scene, users, ends_of(places), OPTIONS).paths, frequencies).swapaxes(0, 1)
+    back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS).paths
+    found = array_channels(back, receiver, array_m, frequencies)
+    assert np.abs(found - expected).max() < MIDDLE * np.abs(expected).max()
+
+
+def test_a_tracer_of_the_same_floor_reports_much_of_it(record: Record, tmp_path: Path) -> None:
+    """By another way: rays from the other side, waves by their arrival; what it lacks is diffuse reflection."""
+    write_scene(tmp_path, PLACES["flat"]().parts, "test")
+    options = TraceOptions(transmission=True, max_depth=SMALL.depth, max_reflections=SMALL.reflections, rays=SMALL.rays)
+    tracer = RayTracer(tmp_path, instrument_of(record), options)
+    reported = tracer(record.tx_pos_m)
+    assert reported.shape == record.observation.shape
+    # 18 dB here; a wrong turn, frequency or side of the array leaves 0.
+    assert np.median(cea_db(reported, record.scored)) > 12
+    with pytest.raises(InputError, match="positions unknown, so there is nothing to trace between"):
+        instrument_of(replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan)))
+    with pytest.raises(InputError, match=r"state frequencies_hz in base-station\.yml"):
+        instrument_of(replace(record, frequencies_hz=None))
+
+
+def crossings(triangles: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Which segments [n] meet a triangle: Moeller and Trumbore's test."""
+    corner, edges = triangles[:, 0], (triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    met = np.zeros(len(start), bool)
+    for row, (origin, way) in enumerate(zip(start, end - start, strict=True)):
+        across = np.cross(way, edges[1])
+        volume = (edges[0] * across).sum(axis=1)
+        crossed = np.abs(volume) > 1e-12
+        scale, off = 1 / np.where(crossed, volume, 1), origin - corner
+        turned = np.cross(off, edges[0])
+        u, v = (off * across).sum(axis=1) * scale, (turned * way).sum(axis=1) * scale
+        t = (edges[1] * turned).sum(axis=1) * scale
+        met[row] = (crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)).any()
+    return met
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_users_walk_in_the_open_and_through_doors(place: str) -> None:
+    plan, walk, rng = PLACES[place](), Walk(), np.random.default_rng(0)
+    mesh = trimesh.util.concatenate([mesh for _, mesh in plan.parts.values()])
+    tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 1e-3), seed=1)[0])
+    for route in plan.routes:
+        way = users_way(route, walk, rng)
+        assert way.shape == (walk.places, 3)
+        assert tree.query(way)[0].min() > 0.15  # a person's half width
+        assert not crossings(mesh.triangles, way, np.roll(way, -1, axis=0)).any()
+        steps = np.linalg.norm(way - np.roll(way, 1, axis=0), axis=1)
+        assert steps.max() < 2 * np.median(steps)
+    wall = crossings(mesh.triangles, np.array([[1.0, 1.0, 1.2]]), np.array([[1.0, -1.0, 1.2]]))
+    assert wall.all()
+    assert tree.query([plan.station_m])[0] > 0.15
+
+
+def test_a_doorway_is_no_surface(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    plan = PLACES["flat"]()
+    write_scene(tmp_path, plan.parts, "test")
+    surfaces = scene_surfaces(open_scene(tmp_path, CARRIER_HZ))
+    middle, edge = [2.95, 3.6, 1.2], [2.505, 3.6, 1.2]
+    check_devices(surfaces, np.array([middle]), ["middle"])
+    assert not caplog.text
+    check_devices(surfaces, np.array([middle, edge]), ["middle", "edge"])
+    assert "1 of 2 antennas stand within 1 cm of a surface (first: edge)" in caplog.text
+
+
+def test_names_are_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked = []
+    monkeypatch.setattr("wrf_mi.synthetic.walked_channels", lambda place, progress: asked.append(place))
+    load_record("traced-csi-flat")
+    load_record("traced-csi-office")
+    assert asked == ["flat", "office"]
+    with pytest.raises(InputError, match="place 'garden': unknown; give one of flat, office"):
+        walked_channels("garden", tmp_path)

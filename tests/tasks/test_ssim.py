@@ -1,0 +1,197 @@
+"""Structural similarity and the spectrum loss against scikit-image and finite differences."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from skimage.metrics import structural_similarity
+
+from wrf_mi.backend.device import on_device, to_float
+from wrf_mi.core import InputError
+from wrf_mi.tasks.spectrum_loss import spectrum_loss
+from wrf_mi.tasks.ssim import ssim
+
+Float64 = dr.float64_array_t(mi.Float)
+
+SINGLE = 1e-5
+"""Required of the float32 form on every image."""
+DOUBLE = 1e-12
+"""float64 sums of 49 pixels and at most 32,400 windows."""
+DIFFERENCES = 1e-6
+"""Relative; central differences of step 1e-5 in float64 leave about (1e-5)^2 times the third derivative / C2."""
+
+
+def reference(prediction, truth):
+    return np.array([structural_similarity(t, p, data_range=1.0) for p, t in zip(prediction, truth, strict=True)])
+
+
+def ours(prediction, truth, float_type=None):
+    float_type = float_type or mi.Float
+    return np.array(ssim(on_device(prediction, float_type), on_device(truth, float_type), *prediction.shape))
+
+
+def smooth(rng, shape):
+    b, h, w = shape
+    row, column = np.mgrid[:h, :w]
+    f = rng.uniform(0.01, 0.1, (b, 2, 1, 1))
+    return 0.5 + 0.5 * np.sin(f[:, 0] * row + f[:, 1] * column + rng.uniform(0, 6, (b, 1, 1)))
+
+
+def pairs(shape):
+    """Image pairs by name: easy ones, and flat, dark and bright ones where float32 cancels."""
+    rng = np.random.default_rng(1)
+    noise = rng.random(shape)
+    flat = np.ones(shape)
+    return {
+        "random": (noise, rng.random(shape)),
+        "smooth": (smooth(rng, shape), smooth(rng, shape)),
+        "near": (smooth(rng, shape), smooth(rng, shape) * 0.5 + 0.01 * noise),
+        "constant": (0.3 * flat, 0.7 * flat),
+        "same": (noise, noise),
+        "dark flat": (0.02 + 1e-4 * noise, 0.02 + 1e-4 * rng.random(shape)),
+        "bright flat": (0.98 + 1e-3 * noise, 0.98 + 1e-3 * rng.random(shape)),
+        "zero": (0 * flat, noise),
+        "beyond the range": (3 * noise - 1, rng.random(shape)),
+    }
+
+
+@pytest.mark.parametrize("name", pairs((1, 7, 7)))
+@pytest.mark.parametrize("shape", [(3, 20, 33), (1, 90, 360), (2, 7, 7)])
+def test_equals_scikit_image(name, shape):
+    prediction, truth = pairs(shape)[name]
+    expected = reference(prediction, truth)
+    assert ours(prediction, truth) == pytest.approx(expected, abs=SINGLE)
+    assert ours(prediction, truth, Float64) == pytest.approx(expected, abs=DOUBLE)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(7, 12), st.integers(7, 12), st.floats(0, 1), st.floats(1e-4, 1), st.integers(0, 2**32 - 1))
+def test_equals_scikit_image_at_any_level_and_contrast(height, width, level, contrast, seed):
+    rng = np.random.default_rng(seed)
+    prediction = level + contrast * rng.random((2, height, width))
+    truth = level + contrast * rng.random((2, height, width))
+    assert ours(prediction, truth) == pytest.approx(reference(prediction, truth), abs=SINGLE)
+
+
+def test_equals_scikit_image_on_real_spectra():
+    if "WRF_MI_DATA" not in os.environ:
+        pytest.skip("WRF_MI_DATA is not set: no real spectra")
+    folder = Path(os.environ["WRF_MI_DATA"]) / "rfid-lab" / "spectrum"
+    images = np.stack([np.asarray(Image.open(folder / f"{i:05d}.png"), float) / 255 for i in range(1, 11)])
+    truth = np.roll(images, 1, axis=0)
+    assert ours(images, truth) == pytest.approx(reference(images, truth), abs=SINGLE)
+
+
+def loss_of(prediction, truth, eta=0.2):
+    loss, _ = spectrum_loss(Float64(prediction.ravel()), Float64(truth.ravel()), *prediction.shape, eta)
+    return loss[0]
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("eta", [0.2, 1.0])
+@pytest.mark.parametrize("shape", [(2, 9, 14), (1, 7, 7)])
+def test_gradient_equals_finite_differences(shape, eta):
+    rng = np.random.default_rng(2)
+    prediction, truth = rng.random(shape), rng.random(shape)
+    variable = Float64(prediction.ravel())
+    dr.enable_grad(variable)
+    loss, _ = spectrum_loss(variable, Float64(truth.ravel()), *shape, eta)
+    dr.backward(loss)
+    gradient = np.array(dr.grad(variable)).reshape(shape)
+    step = 1e-5
+    expected = np.zeros(shape)
+    for index in np.ndindex(shape):
+        nudge = np.zeros(shape)
+        nudge[index] = step
+        high, low = loss_of(prediction + nudge, truth, eta), loss_of(prediction - nudge, truth, eta)
+        expected[index] = (high - low) / (2 * step)
+    assert gradient == pytest.approx(expected, abs=DIFFERENCES * np.abs(expected).max())
+
+
+@pytest.mark.gradcheck
+def test_forward_and_reverse_derivatives_of_each_image_agree():
+    shape = (3, 12, 10)
+    rng = np.random.default_rng(3)
+    truth, direction = Float64(rng.random(np.prod(shape))), rng.standard_normal(np.prod(shape))
+    weights = np.array([1.0, -2.0, 0.5])
+    variable = Float64(rng.random(np.prod(shape)))
+    dr.enable_grad(variable)
+    dr.set_grad(variable, Float64(direction))
+    similarity = ssim(variable, truth, *shape)
+    dr.forward_to(similarity)
+    forward = np.array(dr.grad(similarity)) @ weights
+
+    variable = dr.detach(variable)
+    dr.enable_grad(variable)
+    dr.backward(dr.sum(ssim(variable, truth, *shape) * Float64(weights)))
+    assert np.array(dr.grad(variable)) @ direction == pytest.approx(forward, rel=DOUBLE * 1e2)
+
+
+def test_float32_gradient_stays_close_on_flat_images():
+    """Single precision must not drown the gradient where the variances are small."""
+    shape = (1, 16, 16)
+    prediction, truth = pairs(shape)["bright flat"]
+    gradients = []
+    for float_type in (mi.Float, Float64):
+        variable = on_device(prediction, float_type)
+        dr.enable_grad(variable)
+        dr.backward(dr.sum(ssim(variable, on_device(truth, float_type), *shape)))
+        gradients.append(np.array(dr.grad(variable)))
+    # Inputs near one differ by 6e-8 between the types, 6e-5 of the contrast.
+    assert gradients[0] == pytest.approx(gradients[1], abs=1e-3 * np.abs(gradients[1]).max())
+
+
+def test_loss_is_the_stated_mix():
+    shape = (2, 10, 11)
+    rng = np.random.default_rng(4)
+    prediction, truth = rng.random(shape), rng.random(shape)
+    expected = 0.8 * np.abs(prediction - truth).mean() + 0.2 * (1 - reference(prediction, truth).mean())
+    assert loss_of(prediction, truth) == pytest.approx(expected, abs=DOUBLE)
+    _, similarity = spectrum_loss(Float64(prediction.ravel()), Float64(truth.ravel()), *shape)
+    assert np.array(similarity) == pytest.approx(reference(prediction, truth), abs=DOUBLE)
+
+
+def test_frozen_function_gives_the_same_as_the_plain_one():
+    shape = (2, 12, 13)
+
+    def step(prediction, stack, choice):
+        size = shape[1] * shape[2]
+        i = dr.arange(mi.UInt32, shape[0] * size)
+        truth = dr.gather(mi.Float, stack, choice * size + i)
+        variable = mi.Float(prediction)
+        dr.enable_grad(variable)
+        loss, _ = spectrum_loss(variable, truth, *shape)
+        dr.backward(loss)
+        return loss, dr.grad(variable)
+
+    frozen = dr.freeze(step)
+    rng = np.random.default_rng(5)
+    stack = to_float(rng.random(4 * 12 * 13))
+    for k in range(3):
+        prediction = to_float(rng.random(np.prod(shape)))
+        choice = dr.opaque(mi.UInt32, k)
+        for a, b in zip(frozen(prediction, stack, choice), step(prediction, stack, choice), strict=True):
+            assert np.array(a) == pytest.approx(np.array(b), rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 6, 20), (1, 20, 6)])
+def test_image_smaller_than_the_window_is_refused(shape):
+    image = dr.zeros(mi.Float, int(np.prod(shape)))
+    with pytest.raises(InputError, match="at least 7 x 7"):
+        ssim(image, image, *shape)
+
+
+def test_arrays_of_another_size_or_type_are_refused():
+    image = dr.zeros(mi.Float, 100)
+    with pytest.raises(InputError, match="truth has 99 values"):
+        ssim(image, dr.zeros(mi.Float, 99), 1, 10, 10)
+    with pytest.raises(InputError, match="convert"):
+        ssim(image, dr.zeros(Float64, 100), 1, 10, 10)

@@ -1,0 +1,334 @@
+"""Traced paths against closed forms, reciprocity, and what must not change them."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.constants import epsilon_0, speed_of_light
+from scipy.optimize import linear_sum_assignment
+from traced_rooms import (
+    FREQUENCY_HZ,
+    HEIGHT,
+    LENGTH,
+    PARTITION,
+    SHOEBOX,
+    THICKNESS_M,
+    WAVELENGTH_M,
+    WIDTH,
+    image_lengths,
+    inside,
+    receiver,
+    room,
+)
+from wrf_mi_scenes.build_laboratory import sheet
+from wrf_mi_scenes.mitsuba_xml import PERFECT
+
+from wrf_mi import backend
+from wrf_mi.core import InputError, Paths
+from wrf_mi.tracing import TraceOptions, recompute, trace_paths
+from wrf_mi.tracing import images as images_module
+from wrf_mi.tracing import search as search_module
+from wrf_mi.tracing import solve as solve_module
+from wrf_mi.tracing.image_method import image_sources, meeting_point
+from wrf_mi.tracing.materials import perfect_reflector
+
+SINGLE = 2e-4
+"""Relative; Sionna RT's gains are single precision."""
+EXACT_M = 1e-12
+"""Lengths are float64 where the planes are: those of the shoebox are whole numbers."""
+OFF_SURFACE = 2e-3
+"""Of the largest gain; Sionna RT's own points are some 1e-4 m off the surfaces."""
+EDGE_OF_TWO = 0.05
+"""Of the largest gain; which face of an edge diffracts depends on the ray that comes first."""
+UPRIGHT = TraceOptions()
+
+
+@pytest.fixture(scope="module")
+def shoebox(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return room(tmp_path_factory.mktemp("shoebox"))
+
+
+@pytest.fixture(scope="module")
+def divided(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The shoebox with a partition that leaves gaps."""
+    return room(tmp_path_factory.mktemp("divided"), {**SHOEBOX, **PARTITION})
+
+
+@pytest.fixture(scope="module")
+def empty() -> Any:
+    backend.init()
+    from sionna import rt
+
+    scene = rt.load_scene()
+    scene.frequency = FREQUENCY_HZ
+    return scene
+
+
+def equal(a: Paths, b: Paths) -> None:
+    for field in fields(Paths):
+        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), field.name)
+
+
+def test_free_space_is_friis(empty: Any):
+    tx = np.array([[3.0, 4.0, 0.0], [0.0, 30.0, 0.0]])
+    paths = trace_paths(empty, tx, receiver([0, 0, 0]), UPRIGHT).paths
+    np.testing.assert_allclose(paths.length_m, [5, 30], atol=EXACT_M)
+    np.testing.assert_allclose(np.abs(paths.gain), WAVELENGTH_M / (4 * np.pi * paths.length_m), rtol=SINGLE)
+    np.testing.assert_allclose(paths.departure, -paths.arrival, atol=EXACT_M)
+    np.testing.assert_allclose(paths.arrival[0], [0.6, 0.8, 0], atol=EXACT_M)
+    assert paths.interactions.shape == (2, 3)
+    assert (paths.objects == -1).all()
+    assert np.isnan(paths.vertices_m).all()
+
+
+def test_lengths_in_a_shoebox_are_those_of_the_mirror_images(shoebox: Any):
+    tx, rx = inside(4, 11), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 12))]
+    paths = trace_paths(shoebox, tx, rx, UPRIGHT).paths
+    for i in range(4):
+        for k in range(2):
+            own = paths.length_m[(paths.tx == i) & (paths.rx == k)]
+            np.testing.assert_allclose(own, image_lengths(tx[i], rx[k].position_m, 3), atol=EXACT_M)
+    order = np.lexsort((paths.length_m, paths.tx, paths.rx))
+    np.testing.assert_array_equal(order, np.arange(len(paths)))
+
+
+def test_images_in_a_corner_and_where_the_line_to_them_meets_a_plane():
+    """Three perpendicular planes reflect a point through their corner; a chain may end, or begin, with no plane."""
+    normal, offset = np.eye(3)[[2, 0, 1]], np.array([3.0, 1.0, 2.0])
+    source, target = np.array([0.2, 0.3, 0.5]), np.array([[0.7, 1.1, 1.4]])
+    images = image_sources(normal, offset, np.array([[0, 1, 2], [1, -1, -1], [-1, -1, 1]]), source)
+    np.testing.assert_allclose(images[0, [0, 1, 3]], [source, [0.2, 0.3, 5.5], [1.8, 3.7, 5.5]], rtol=1e-15)
+    np.testing.assert_allclose(images[1:, -1], [[1.8, 0.3, 0.5]] * 2, rtol=1e-15)
+    point, near, far = meeting_point(target, images[1:2, -1], normal[[1]], offset[[1]])
+    np.testing.assert_allclose([near, far], [[-0.3], [0.8]], rtol=1e-14)
+    np.testing.assert_allclose(point, target + 3 / 11 * (images[1, -1] - target), rtol=1e-14)
+    np.testing.assert_array_equal(meeting_point(target, target + np.eye(3)[1], normal[[1]], offset[[1]])[0], target)
+
+
+def test_points_of_reflection_lie_on_the_walls_that_are_named(shoebox: Any):
+    paths = trace_paths(shoebox, inside(3), receiver([1.0, 1.0, 1.5]), UPRIGHT).paths
+    walls = {"floor": (2, 0), "ceiling": (2, HEIGHT), "west": (0, 0), "east": (0, LENGTH), "south": (1, 0)}
+    walls["north"] = (1, WIDTH)
+    for index, name in enumerate(paths.object_names):
+        axis, at = walls[name]
+        here = paths.vertices_m[paths.objects == index]
+        assert len(here)
+        np.testing.assert_allclose(here[:, axis], at, atol=EXACT_M)
+    assert (np.isnan(paths.vertices_m[..., 0]) == (paths.interactions == 0)).all()
+
+
+def test_two_rays_over_a_perfect_ground(tmp_path: Path):
+    """A vertical field keeps its sign in the image below a perfect conductor, but for the angle of both ends."""
+    from sionna import rt
+
+    scene = room(tmp_path, {"ground": ("itu_metal", sheet(2, 0.0, (-300.0, 300.0), (-300.0, 300.0)))})
+    scene.objects["ground"].radio_material = perfect_reflector()
+    assert isinstance(scene.objects["ground"].radio_material, rt.RadioMaterial)
+    tx, rx = np.array([[200.0, 0, 1.5]]), receiver([0, 0, 2.0])
+    paths = trace_paths(scene, tx, rx, UPRIGHT).paths
+    lengths = np.hypot(200, [0.5, 3.5])
+    np.testing.assert_allclose(paths.length_m, lengths, atol=EXACT_M)
+    np.testing.assert_allclose(paths.gain, WAVELENGTH_M / (4 * np.pi * lengths), rtol=10 * SINGLE)
+    assert scene.objects["ground"].radio_material.name == PERFECT
+
+
+def slab(thickness_m: float, permittivity: float, conductivity: float) -> tuple[complex, complex]:
+    """Reflection at and transmission through a slab in air at normal incidence.
+
+    Source: ITU-R P.2040-3, equations 37, 43 and 44.
+    """
+    eta = permittivity - 1j * conductivity / (2 * np.pi * FREQUENCY_HZ * epsilon_0)
+    r = (1 - np.sqrt(eta)) / (1 + np.sqrt(eta))
+    through = np.exp(-2j * np.pi * FREQUENCY_HZ / speed_of_light * thickness_m * np.sqrt(eta))
+    return r * (1 - through**2) / (1 - r**2 * through**2), (1 - r**2) * through / (1 - r**2 * through**2)
+
+
+def test_a_slab_at_normal_incidence(tmp_path: Path):
+    scene = room(tmp_path, {"wall": ("itu_brick", sheet(0, 0.0, (-50.0, 50.0), (-50.0, 50.0)))})
+    brick = scene.radio_materials["itu_brick"]
+    expected = slab(0.1, float(brick.relative_permittivity[0]), float(brick.conductivity[0]))
+    options = replace(UPRIGHT, transmission=True, max_depth=1)
+    beside, behind = (trace_paths(scene, [[x, 0.0, 0.0]], receiver([2.0, 0, 0]), options).paths for x in (4.0, -4.0))
+    assert beside.interactions.tolist() == [[0], [1]]
+    assert behind.interactions.tolist() == [[4]]
+    for gain, length, factor in ((beside.gain[1], 6.0, expected[0]), (behind.gain[0], 6.0, expected[1])):
+        assert abs(gain) == pytest.approx(WAVELENGTH_M / (4 * np.pi * length) * abs(factor), rel=SINGLE)
+    # A vertical field is parallel to the wall: the phase is that of the coefficient.
+    assert np.angle(beside.gain[1] / expected[0]) == pytest.approx(0, abs=SINGLE)
+    assert np.angle(behind.gain[0] / expected[1]) == pytest.approx(0, abs=SINGLE)
+
+
+def test_paths_go_through_walls_only_if_they_may(divided: Any):
+    tx, rx = [[1.0, 1.0, 1.0]], receiver([5.0, 1.0, 1.0])
+    closed = trace_paths(divided, tx, rx, replace(UPRIGHT, max_depth=1)).paths
+    opened = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, max_depth=2)).paths
+    assert (closed.interactions == 1).all()  # over the partition and round it
+    straight = opened.length_m == opened.length_m.min()
+    assert opened.interactions[straight].tolist() == [[4, 0]]
+    np.testing.assert_allclose(opened.vertices_m[straight][0, 0], [3, 1, 1], atol=EXACT_M)
+    through = opened.select((opened.interactions == 4).any(axis=1))
+    assert {tuple(types) for types in through.interactions} == {(4, 0), (1, 4), (4, 1)}
+    few = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, max_depth=3, max_reflections=1)).paths
+    assert (few.interactions == 1).sum(axis=1).max() == 1
+
+
+@pytest.mark.parametrize("transmission", [False, True])
+def test_reciprocity(divided: Any, transmission: bool):
+    here, there = inside(5, 3), [receiver(p, f"rx{k}") for k, p in enumerate(inside(3, 4))]
+    options = replace(UPRIGHT, transmission=transmission)
+    forth = trace_paths(divided, here, there, options)
+    back = trace_paths(
+        divided, np.stack([r.position_m for r in there]), [receiver(p, f"rx{k}") for k, p in enumerate(here)], options
+    )
+    assert forth.from_receivers
+    assert not back.from_receivers
+    a, b = forth.paths, back.paths
+    order = np.lexsort((b.length_m, b.rx, b.tx))
+    np.testing.assert_allclose(b.length_m[order], a.length_m, atol=1e-9)
+    np.testing.assert_allclose(b.gain[order], a.gain, atol=10 * SINGLE * np.abs(a.gain).max())
+    np.testing.assert_allclose(b.arrival[order], a.departure, atol=1e-6)
+    np.testing.assert_array_equal(np.count_nonzero(b.interactions[order], axis=1), a.bounces)
+
+
+def test_the_same_seed_gives_the_same_paths_in_any_parts(divided: Any, monkeypatch: pytest.MonkeyPatch):
+    tx, rx = inside(12, 5), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 6))]
+    options = replace(UPRIGHT, transmission=True, rays=1 << 13)
+    whole = trace_paths(divided, tx, rx, options).paths
+    equal(trace_paths(divided, tx, rx, options).paths, whole)
+    monkeypatch.setattr(solve_module, "TARGETS_AT_ONCE", 5)
+    monkeypatch.setattr(images_module, "CANDIDATES_AT_ONCE", 37)
+    monkeypatch.setattr(search_module, "PAIRS_AT_ONCE", 100)
+    monkeypatch.setattr(search_module, "RAYS_AT_ONCE", 1000)
+    monkeypatch.setattr("wrf_mi.tracing.fields.PATHS_AT_ONCE", 50)
+    parts = trace_paths(divided, tx, rx, options).paths
+    np.testing.assert_allclose(parts.gain, whole.gain, rtol=1e-5)  # other widths of vector instructions
+    equal(replace(parts, gain=whole.gain), whole)
+
+
+def test_one_position_is_traced_as_it_is_among_others(divided: Any):
+    tx, rx = inside(6, 7), receiver([1.0, 4.0, 2.0])
+    together = trace_paths(divided, tx, rx, UPRIGHT).paths
+    alone = trace_paths(divided, tx[3:4], rx, UPRIGHT).paths
+    own = together.select(together.tx == 3)
+    np.testing.assert_array_equal(own.length_m, alone.length_m)
+    np.testing.assert_allclose(own.gain, alone.gain, rtol=1e-5)
+
+
+def test_what_is_off_is_not_searched(shoebox: Any, empty: Any, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("searched")
+
+    for name in ("_shoot", "count_crossings"):
+        monkeypatch.setattr(search_module, name, refuse)
+    monkeypatch.setattr(solve_module, "sampled_paths", refuse)
+    tx, rx = inside(2), receiver([1.0, 1.0, 1.0])
+    assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, reflection=False)).paths) == 2
+    assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, max_depth=0)).paths) == 2
+    assert len(trace_paths(empty, tx, rx, replace(UPRIGHT, scattering=True, rays="auto")).paths) == 2
+    with pytest.raises(AssertionError, match="searched"):
+        trace_paths(shoebox, tx, rx, UPRIGHT)
+    without = replace(UPRIGHT, line_of_sight=False, reflection=False)
+    assert not len(trace_paths(shoebox, tx, rx, without).paths)
+
+
+def test_rays_by_convergence(shoebox: Any, divided: Any):
+    tx, rx = inside(5), receiver([1.0, 1.0, 1.0])
+    found = trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays="auto", max_depth=2))
+    assert found.rays == solve_module.FIRST_RAYS  # a shoebox is easy
+    assert found.options.rays == "auto"
+    equal(found.paths, trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays=found.rays, max_depth=2)).paths)
+
+
+def sionna_paths(scene: Any, tx: np.ndarray, rx: np.ndarray, **kinds: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths and gains of Sionna RT's own solver, sorted by length."""
+    import mitsuba as mi
+    from sionna import rt
+
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.add(rt.Transmitter("tx", mi.Point3f(tx.tolist())))
+    scene.add(rt.Receiver("rx", mi.Point3f(rx.tolist())))
+    try:
+        paths = rt.PathSolver(deterministic=True)(
+            scene, max_depth=3, samples_per_src=30_000, max_num_paths_per_src=100_000, seed=1, **kinds
+        )
+    finally:
+        scene.remove(["tx", "rx"])
+    real, imaginary = (part.numpy()[0, 0, 0, 0] for part in paths.a)
+    valid = paths.valid.numpy()[0, 0]
+    length = paths.tau.numpy()[0, 0][valid].astype(float) * speed_of_light
+    order = np.argsort(length)
+    return length[order], (real + 1j * imaginary)[valid][order]
+
+
+def all_found(paths: Paths, length: np.ndarray, gain: np.ndarray, tolerance: float) -> None:
+    near = np.abs(paths.length_m[None] - length[:, None])
+    apart = np.where(near < 1e-4, np.abs(paths.gain[None] - gain[:, None]), np.inf)  # its lengths are float32
+    ours, theirs = linear_sum_assignment(np.minimum(apart, 1.0))[::-1]
+    assert len(ours) == len(length)
+    assert apart[theirs, ours].max() < tolerance * np.abs(gain).max()
+
+
+@pytest.mark.parametrize("transmission", [False, True])
+def test_every_path_of_sionna_rt_is_found(divided: Any, transmission: bool):
+    tx, rx = np.array([1.1, 2.3, 1.2]), np.array([4.6, 1.7, 1.9])
+    length, gain = sionna_paths(divided, tx, rx, refraction=transmission)
+    paths = trace_paths(divided, tx[None], receiver(rx), replace(UPRIGHT, transmission=transmission)).paths
+    all_found(paths, length, gain, OFF_SURFACE)
+
+
+def test_diffraction_is_that_of_sionna_rt(divided: Any):
+    tx, rx = np.array([1.1, 1.3, 1.2]), np.array([4.6, 1.7, 1.9])
+    length, gain = sionna_paths(divided, tx, rx, refraction=False, diffraction=True, edge_diffraction=True)
+    options = replace(UPRIGHT, diffraction=True, rays=30_000)
+    traced = trace_paths(divided, np.array([tx, [2.0, 2.0, 1.0]]), receiver(rx), options)
+    paths = traced.paths.select(traced.paths.tx == 0)
+    assert (paths.interactions == 8).any(axis=1).sum() > 10
+    assert not traced.from_receivers
+    all_found(paths, length, gain, EDGE_OF_TWO)
+    again = recompute(traced, divided).paths.gain
+    np.testing.assert_allclose(again, traced.paths.gain, rtol=1e-6)
+    # The bent wave reaches where nothing else does.
+    dark = trace_paths(divided, [[2.9, 1.0, 0.5]], receiver([3.1, 1.0, 0.5]), replace(options, max_depth=1)).paths
+    assert (dark.interactions == 8).any()
+
+
+def test_scattering_takes_power_from_reflections(shoebox: Any):
+    tx, rx = inside(3), receiver([1.0, 1.0, 1.0])
+    plain = trace_paths(shoebox, tx, rx, replace(UPRIGHT, max_depth=1)).paths
+    options = replace(UPRIGHT, max_depth=1, scattering=True, scattering_coefficient=0.6, rays=10_000)
+    traced = trace_paths(shoebox, tx, rx, options)
+    diffuse = (traced.paths.interactions == 2).any(axis=1)
+    mirrored = traced.paths.select(~diffuse)
+    np.testing.assert_array_equal(mirrored.length_m, plain.length_m)
+    np.testing.assert_allclose(
+        np.abs(mirrored.gain / plain.gain), np.where(plain.bounces == 1, np.sqrt(1 - 0.6**2), 1), rtol=SINGLE
+    )
+    power = [float((np.abs(traced.paths.gain[diffuse & (traced.paths.tx == i)]) ** 2).sum()) for i in range(3)]
+    direct = np.abs(plain.gain[plain.bounces == 0]) ** 2
+    assert (np.array(power) > 0).all()
+    assert (np.array(power) < direct).all()
+    assert all(float(m.scattering_coefficient[0]) == 0 for m in shoebox.radio_materials.values())
+    np.testing.assert_allclose(recompute(traced, shoebox).paths.gain, traced.paths.gain, rtol=1e-6)
+
+
+def test_wrong_arguments(empty: Any):
+    for wrong in ([[1.0, 2]], [[1.0, 2, np.nan]]):
+        with pytest.raises(ValueError, match="finite"):
+            trace_paths(empty, wrong, receiver([0, 0, 0]))
+    for tx, rx in (([[0.0, 0, 1]], []), (np.zeros((0, 3)), [receiver([0, 0, 0])])):
+        with pytest.raises(InputError, match="give one at least"):
+            trace_paths(empty, tx, rx)
+    for setting in (
+        {"max_depth": -1},
+        {"max_depth": 99},
+        {"max_reflections": -1},
+        {"rays": 0},
+        {"rays": "many"},
+        {"seed": -1},
+        {"scattering_coefficient": 0.0},
+    ):
+        with pytest.raises(InputError, match=next(iter(setting))):
+            TraceOptions(**setting)
+    assert THICKNESS_M["itu_brick"] == 0.1

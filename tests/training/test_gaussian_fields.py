@@ -1,0 +1,391 @@
+"""WRF-GS, WRF-GS+ and factorised fields for signal strengths and channels: against the operator, round trips."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.core.settings import with_settings
+from wrf_mi.gaussians import FIELDS
+from wrf_mi.gaussians.parameters import by_component
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.graph.operator import SectorOperator
+from wrf_mi.models.method import inputs_of
+from wrf_mi.models.networks import nerf2
+from wrf_mi.models.networks.nerf2_field import Nerf2Settings
+from wrf_mi.models.networks.nerf2_march import Networks
+from wrf_mi.runs.api import train
+from wrf_mi.tasks import TASKS
+from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint
+from wrf_mi.training.config import TrainConfig, default_config
+from wrf_mi.training.predictor import TOGETHER, Predictor
+from wrf_mi.training.session import FitSession
+from wrf_mi.training.state import FitState
+from wrf_mi.training.step import TrainingData, device_pose
+from wrf_mi.training.targets import targets_of
+from wrf_mi.training.trainer import Trainer
+
+MODELS = tuple(FIELDS)
+SMALL = (
+    "steps=500",
+    "batch=8",
+    "hold_out=0.5",
+    "optimiser.network=2e-3",
+    "optimiser.warm_up=20",
+    "optimiser.averaging=0.98",
+    "initial.gaussians=12",
+    "network.layers=2",
+    "network.width=16",
+    "view.height=6",
+    "view.columns=24",
+    "view.components=3",
+)
+THREADED = 1e-2
+"""Of the largest value: ten steps of Adam, whose gradients are summed by threads in any order."""
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+TURNED = np.array([0.5, -0.5, 0.5, 0.5])
+ROUNDING = 2e-3
+"""dB: float32 sums of 288 directions that partly cancel, in another order than the operator's."""
+
+
+def receivers(count: int) -> tuple[Receiver, ...]:
+    turns = (UPRIGHT, TURNED)
+    return tuple(Receiver(f"rx{r}", np.array([2.0 * r, 1.0, 0.5]), turns[r % 2]) for r in range(count))
+
+
+def strengths(count: int = 2, rows: int = 60) -> Record:
+    rng = np.random.default_rng(0)
+    along = rng.permutation(np.linspace(-3, 3, rows))
+    tx, places = np.stack([along, 2 + np.sin(along), np.full(rows, 0.3)], axis=1), receivers(count)
+    distance = np.stack([np.linalg.norm(tx - r.position_m, axis=1) for r in places])
+    power = -40 - 20 * np.log10(distance)
+    power[0, :3] = np.nan
+    return Record("made", "rssi", tx, places, power.astype(np.float32), frequencies_hz=np.array([2.4e9]))
+
+
+def channels(rows: int = 60, antennas: int = 3, subcarriers: int = 8) -> Record:
+    """Two paths whose delays go with one coordinate: the downlink follows from the uplink."""
+    rng = np.random.default_rng(1)
+    along = rng.uniform(0, 1, (rows, antennas, 1))
+    band = np.arange(2 * subcarriers) / subcarriers
+    h = np.exp(-2j * np.pi * band * (0.2 + 0.3 * along)) + 0.4 * np.exp(-2j * np.pi * band * (0.6 - 0.2 * along))
+    h = (3e-4 * h).astype(np.complex64)
+    nowhere = np.full((rows, 3), np.nan)
+    return Record(
+        "made", "csi", nowhere, receivers(1), h[None, ..., subcarriers:], uplink=h[..., :subcarriers], uplink_hz=None
+    )
+
+
+def halves(record: Record, validation: int = 6) -> Split:
+    rows = np.arange(len(record))
+    return Split("halves", 0, rows[: 40 - validation], rows[40 - validation : 40], rows[40:])
+
+
+def config(record: Record, *settings: str) -> TrainConfig:
+    return with_settings(default_config(record.task), [*SMALL, *settings])
+
+
+def fitted(record: Record, split: Split, *settings: str) -> Predictor:
+    trainer = Trainer(record, split, config(record, *settings))
+    trainer.run()
+    return trainer.predictor()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_power_is_that_of_the_operator_over_the_full_sphere(model: str) -> None:
+    record = strengths()
+    trainer = Trainer(record, halves(record), config(record, f"model={model}"))
+    trainer.state.set_param("level", np.array([[-0.3, 0.7]], np.float32))
+    params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
+    arrays = {name: value.numpy() for name, value in params.items()}
+    predict = Predictor(trainer.field, arrays, record.receivers, 6, 24, graph=trainer.graph)
+    for r, receiver in enumerate(record.receivers):
+        found = predict(record.tx_pos_m[:1], r)[0]
+        gaussians = trainer.field.gaussians(params, to_tensor(record.tx_pos_m[:1].T))
+        operator = SectorOperator.of(gaussians, device_pose(receiver), perception_plane(6, 24, mi.Float))
+        re, im = (part.numpy() for part in gaussians.signal)
+        level_db = 20 / np.log(10) * (-0.3, 0.7)[r]
+        assert found == pytest.approx(level_db + operator.power_db((re + 1j * im)[None])[0], abs=ROUNDING)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_fit_begins_at_the_level_of_what_each_receiver_observed(model: str) -> None:
+    record = strengths()
+    louder = replace(record, observation=record.observation + np.array([[0], [-35]], np.float32))
+    predict = Trainer(louder, halves(louder), config(louder, f"model={model}")).predictor()
+    rows = halves(louder).all_train
+    for r in range(2):
+        found = predict(louder.tx_pos_m[rows], r).mean()
+        assert found == pytest.approx(np.nanmean(louder.observation[r, rows]), abs=1.0)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_component_has_an_image_of_its_own(model: str) -> None:
+    record = channels()
+    trainer = Trainer(record, halves(record), config(record, f"model={model}", "initial.gaussians=5"))
+    params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
+    given = trainer.field.gaussians(params, to_tensor(np.random.default_rng(0).normal(size=(16, 4))))
+    found = by_component(given, 3)
+    assert (found.batch, found.count) == (12, 5)
+    shared = dr.width(given.scale[0]) == 5
+    for component in range(3):
+        for part, half in ((0, 0), (1, 3)):
+            signal = found.signal[part].numpy().reshape(4, 3, 5)[:, component]
+            np.testing.assert_array_equal(signal, given.signal[half + component].numpy().reshape(4, 5))
+        if not shared:
+            for wide, narrow in zip((*found.scale, found.opacity), (*given.scale, given.opacity), strict=True):
+                one = wide.numpy().reshape(4, 3, 5)[:, component]
+                np.testing.assert_array_equal(one, narrow.numpy().reshape(4, 5), strict=True)
+
+
+def test_components_hold_what_channels_are_made_of() -> None:
+    rng = np.random.default_rng(0)
+    modes = rng.normal(size=(2, 8)) + 1j * rng.normal(size=(2, 8))
+    h = ((rng.normal(size=(60, 2)) + 1j * rng.normal(size=(60, 2))) @ modes)[None].astype(np.complex64)
+    tx = rng.uniform(-2, 2, (60, 3))
+    record = Record("made", "csi", tx, receivers(1), h)
+    basis = Trainer(record, halves(record), config(record, "view.components=2")).graph.form.basis
+    assert basis is not None
+    np.testing.assert_allclose(basis @ basis.conj().T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose((h[0] @ basis.conj().T) @ basis, h[0], atol=1e-5)
+
+
+@pytest.mark.all_threads
+@pytest.mark.parametrize("model", MODELS)
+def test_strengths_are_learned_and_kept(model: str, tmp_path) -> None:
+    record = strengths()
+    split = halves(record)
+    run = train(record, tmp_path / "run", model, split=split, settings=SMALL)
+    with np.load(tmp_path / "run" / "predictions.npz") as stored:
+        scored = stored["prediction"]
+    for r in range(2):
+        found, truth = run.predict(record.tx_pos_m[split.test], r).mean, record.observation[r, split.test]
+        mean = np.abs(np.nanmean(record.observation[r, split.all_train]) - truth)
+        assert np.median(np.abs(found - truth)) < np.median(mean)
+        np.testing.assert_array_equal(scored[r], found)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_channels_are_learned_from_the_uplink_and_kept(model: str, tmp_path) -> None:
+    record = channels()
+    split = halves(record)
+    own = (*SMALL, "steps=400", "batch=32", "optimiser.network=3e-3")
+    run = train(record, tmp_path / "run", model, split=split, settings=own)
+    assert record.uplink is not None
+    uplink, truth = record.uplink[split.test], record.observation[0, split.test]
+    found = run.predict(uplink=uplink).mean
+    assert found.shape == truth.shape
+
+    def error(prediction):
+        return np.median(np.square(np.abs(prediction - truth)).sum((1, 2)) / np.square(np.abs(truth)).sum((1, 2)))
+
+    assert error(found) < 0.3 * error(uplink)
+    with np.load(tmp_path / "run" / "predictions.npz") as stored:
+        np.testing.assert_array_equal(stored["prediction"], found)
+    with pytest.raises(InputError, match="the rows to predict have none; give `uplink`"):
+        run.predict(record.tx_pos_m[split.test])
+
+
+@pytest.mark.parametrize("known", [(), ("position_m",), ("orientation_xyzw",)])
+def test_an_uplink_needs_no_pose_of_the_station(known: tuple[str, ...]) -> None:
+    record = channels()
+    lost = {"position_m": np.full(3, np.nan), "orientation_xyzw": np.full(4, np.nan)}
+    for name in known:
+        del lost[name]
+    unknown = replace(record, receivers=(replace(record.receivers[0], **lost),))
+    assert unknown.uplink is not None
+    predict = fitted(unknown, halves(record), "steps=5")
+    assert np.isfinite(predict(unknown.tx_pos_m[:3], 0, unknown.uplink[:3])).all()
+
+
+def two_stations(rows: int = 60, antennas: int = 1) -> Record:
+    """Channels over positions; the second station's are 20 dB weaker and orthogonal to the first's, some unheard."""
+    rng = np.random.default_rng(4)
+    tx = np.column_stack([rng.uniform(-2, 2, (rows, 2)), np.full(rows, 0.3)])
+    modes = np.exp(2j * np.pi * np.outer([1, 3], np.arange(8)) / 8)
+    h = np.exp(1j * tx[:, :1]) * modes[:, None] * np.array([1e-3, 1e-4])[:, None, None]
+    h[0, :5] = np.nan
+    h[1, 3:9] = np.nan
+    if antennas > 1:
+        h = h.reshape(2, rows, antennas, -1)
+    return Record("made", "csi", tx, receivers(2), h.astype(np.complex64))
+
+
+@pytest.mark.parametrize("antennas", [1, 2])
+def test_a_second_receiver_with_other_components_is_learned(antennas: int) -> None:
+    record = two_stations(antennas=antennas)
+    split = halves(record)
+    predict = fitted(record, split, "view.components=2", "steps=700", "batch=16", "optimiser.network=3e-3")
+    for r in range(2):
+        truth, found = record.observation[r, split.test], predict(record.tx_pos_m[split.test], r)
+        assert found.shape == truth.shape
+        size = tuple(range(1, truth.ndim))
+        error = np.square(np.abs(found - truth)).sum(axis=size) / np.square(np.abs(truth)).sum(axis=size)
+        assert np.median(error) < 0.2, "in components of the other receiver alone it is 1 at least"
+
+
+@pytest.mark.all_threads
+@pytest.mark.parametrize("model", [*MODELS, "nerf2"])
+def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
+    """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""
+    record, weak = two_stations(), 2.0**-7
+    fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
+    split = halves(record)
+    small = Nerf2Settings(steps=12, sphere_batch=8, sphere_rays=16, networks=Networks(layers=2, width=8))
+
+    def predicted(one: Record):
+        if model == "nerf2":
+            kept = nerf2.METHOD.fit(one, split, small, 0, FitSession())
+            return kept.predict(inputs_of(one, split.test), 1)
+        own = f"model={model}", "view.components=2", "steps=10", "patience=0"
+        return fitted(one, split, *own)(one.tx_pos_m[split.test], 1)
+
+    plain, faint = predicted(record), predicted(fainter)
+    assert np.abs(plain).max() > 1e-6
+    np.testing.assert_allclose(faint, weak * plain, rtol=0, atol=THREADED * weak * np.abs(plain).max())
+
+
+def test_any_number_of_rows_is_predicted_alike() -> None:
+    record = strengths(1, 2 * TOGETHER + 53)
+    split = Split("all", 0, np.arange(40), np.arange(40, 50), np.arange(50, len(record)))
+    predict = fitted(record, split, "steps=10")
+    everything = predict(record.tx_pos_m, 0)
+    chosen = [0, TOGETHER, len(record) - 1]
+    np.testing.assert_array_equal(everything[chosen], [predict(record.tx_pos_m[i : i + 1], 0)[0] for i in chosen])
+
+
+@pytest.mark.parametrize("hold_out", [0.5, 1.0])
+def test_a_fit_goes_on_from_its_best_moment(hold_out: float) -> None:
+    """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
+    record = strengths()
+    own = config(record, "steps=160", "validate_every=10", "patience=2", f"hold_out={hold_out}", "deterministic=true")
+    given, seen, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), [], {}
+    trainer = Trainer(record, halves(record), own)
+    trainer.validate = lambda: next(given)  # type: ignore[method-assign]
+
+    def listen(progress) -> None:
+        if progress.validation_score is not None:
+            seen.append((progress.step, progress.held_out))
+        if progress.step == 30:
+            kept.update(trainer.state.params())
+
+    trainer.run(listen)
+    left = 80 * 30 // 80 if hold_out < 1 else 0
+    assert [step for step, held_out in seen if held_out] == [10, 20, 30, 40, 50]
+    assert trainer.state.chosen == 30
+    assert trainer.state.step == 160
+    first = [step for step, held_out in seen if not held_out]
+    assert first == list(range(160 - left + 10, 161, 10))
+    if not left:
+        for name, values in trainer.state.params().items():
+            np.testing.assert_array_equal(values, kept[name])
+
+
+@pytest.mark.parametrize("stop", [25, 45, 150])
+def test_a_stopped_fit_chooses_as_one_that_was_not(stop: int, tmp_path) -> None:
+    record = strengths()
+    own = config(record, "steps=160", "validate_every=10", "patience=2", "deterministic=true")
+    whole, part = (Trainer(record, halves(record), own) for _ in range(2))
+    whole.run()
+    part.run(save=lambda: write_checkpoint(tmp_path, part), stop=lambda: part.state.step >= stop)
+    again = Trainer(record, halves(record), own, state=FitState.from_arrays(read_checkpoint(tmp_path)))
+    again.run()
+    assert again.state.chosen == whole.state.chosen
+    for name, values in whole.state.mean_params().items():
+        np.testing.assert_array_equal(again.state.mean_params()[name], values)
+
+
+def test_rows_that_were_not_received_are_learned_from_at_no_receiver() -> None:
+    record = strengths()
+    targets = targets_of(record, np.arange(40))
+    assert set(range(40)) - set(targets.received(0, np.arange(40))) == {0, 1, 2}
+    np.testing.assert_array_equal(targets.received(1, np.arange(40)), np.arange(40))
+    trainer = Trainer(record, halves(record), config(record))
+    assert not set(trainer.schedule.rows[trainer.schedule.receiver == 0].ravel()) & {0, 1, 2}
+
+
+def test_differences_are_divided_by_the_stated_noise() -> None:
+    record, rows = strengths(rows=20), np.arange(4, 20)
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 4, record.observation.shape)
+    targets = targets_of(replace(record, std=std), rows)
+    weight, received = targets.weight, np.isfinite(record.observation[:, rows])
+    assert weight is not None
+    np.testing.assert_allclose((weight * std)[:, rows], (weight * std)[0, 4])
+    np.testing.assert_allclose(weight[:, rows][received].mean(), 1)
+    readings = rng.integers(1, 9, record.observation.shape)
+    of_means = targets_of(replace(record, n_readings=readings), rows).weight
+    assert of_means is not None
+    np.testing.assert_allclose((of_means / np.sqrt(readings))[:, rows], of_means[0, 4] / np.sqrt(readings[0, 4]))
+    assert targets_of(record, rows).weight is None
+    np.testing.assert_array_equal(targets_of(replace(record, std=np.full_like(std, 3)), rows).weight, 1)
+    batch, scale = rng.permutation(rows)[:6], 1 / targets.unit
+    data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(scale), to_float(weight))
+    for r in (0, 1):
+        number = mi.UInt32(batch.tolist())
+        truth, factor = data.select(number, r, 1)[1], data.factor(number, r, 1)
+        found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), structural_weight=0.0)
+        # Everything is 2 dB too high; the sum of two numbers near -50 in single precision.
+        np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
+
+
+def test_rows_of_much_stated_noise_are_learned_from_less() -> None:
+    record = strengths(1)
+    record = replace(record, observation=np.nan_to_num(record.observation, nan=-50))
+    split, wrong = halves(record), np.zeros(record.observation.shape, bool)
+    wrong[0, split.all_train[::2]] = True
+    louder = replace(record, observation=np.where(wrong, record.observation + 20, record.observation))
+
+    def error(own: Record) -> float:
+        trainer = Trainer(own, split, config(own, "steps=300"))
+        assert trainer.run()
+        found = trainer.predictor().of_rows(record, split.test, 0)
+        return float(np.median(np.abs(found - record.observation[0, split.test])))
+
+    assert error(replace(louder, std=np.where(wrong, 40.0, 1.0))) < 0.5 * error(louder)
+
+
+def test_readings_and_noise_that_do_not_fit_are_refused(tmp_path) -> None:
+    record = strengths()
+    std = np.ones(record.observation.shape)
+    for change, message in (
+        ({"std": std[:1]}, r"std \[1, 60\] beside observations \[2, 60\]"),
+        ({"std": 0 * std}, "receiver rx0, row 3: std is 0; give a number above 0"),
+        ({"n_readings": np.zeros(std.shape, int)}, "receiver rx0, row 3: n_readings is 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            train(replace(record, **change), tmp_path / "run", "idw", split=halves(record))
+    with pytest.raises(InputError, match="std belongs to signal strengths, not to csi"):
+        train(replace(channels(), std=std), tmp_path / "run", "idw", split=halves(record))
+
+
+def test_what_cannot_be_learned_from_is_refused() -> None:
+    record = strengths()
+    nowhere = replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan))
+    with pytest.raises(InputError, match="no position in row 0"):
+        Trainer(nowhere, halves(record), config(record))
+    deaf = replace(record, observation=np.full_like(record.observation, np.nan))
+    with pytest.raises(InputError, match="receiver rx0: received none of 40 training rows"):
+        Trainer(deaf, halves(record), config(record))
+
+
+@pytest.mark.parametrize("model", [*MODELS, "nerf2"])
+@pytest.mark.parametrize("lost", ["position_m", "orientation_xyzw"])
+def test_receivers_without_a_pose_are_refused_where_positions_tell(model: str, lost: str) -> None:
+    record = strengths()
+    unknown = replace(record.receivers[1], **{lost: np.full(3 if lost == "position_m" else 4, np.nan)})
+    record = replace(record, receivers=(record.receivers[0], unknown))
+    quick = Nerf2Settings(steps=3, batch=4)
+
+    def fit():
+        if model == "nerf2":
+            return nerf2.METHOD.fit(record, halves(record), quick, 0, FitSession())
+        return Trainer(record, halves(record), config(record, f"model={model}"))
+
+    with pytest.raises(InputError, match=r"made: the pose of receiver rx1 is not known.*give its position") as error:
+        fit()
+    assert "\n" not in str(error.value)

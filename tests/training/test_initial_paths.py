@@ -1,0 +1,135 @@
+"""Gaussians that start from traced paths or from a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+from scipy.spatial.distance import cdist
+from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room, write_xml
+
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.core import InputError, Paths, Record
+from wrf_mi.core.settings import with_settings
+from wrf_mi.gaussians import WrfGsPlus
+from wrf_mi.tracing import TraceOptions, trace_paths
+from wrf_mi.training.config import InitialConfig, TrainConfig
+from wrf_mi.training.initial import initial_gaussians
+from wrf_mi.training.initial_paths import gaussians_from_mesh, gaussians_from_paths
+
+
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]:
+    scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
+    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(max_depth=1, rays=1 << 12)).paths, tx
+
+
+def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -> None:
+    paths, tx = traced
+    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 40, np.random.default_rng(0))
+    assert start.count == 40
+    # Clusters mix points of one wall; in a convex room their means are inside it.
+    assert (start.position_m > -0.3).all()
+    assert (start.position_m < np.array([LENGTH, WIDTH, HEIGHT]) + 0.3).all()
+    on_wall = np.abs(start.position_m[:, :, None] - np.array([[0, LENGTH], [0, WIDTH], [0, HEIGHT]])).min(axis=(1, 2))
+    assert (on_wall < 0.1).mean() > 0.4
+    # What carries most power is a direct path, and starts as the strongest and least transparent.
+    strongest = int(np.abs(start.signals).argmax())
+    assert np.linalg.norm(tx - start.position_m[strongest], axis=1).min() < 1.0
+    assert start.opacities.argmax() == strongest
+    assert np.isclose(np.abs(start.signals).max(), 0.3)
+
+
+def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndarray]) -> None:
+    paths, tx = traced
+    wall = paths.object_names.index("west")
+    own = paths.select(paths.objects[:, 0] == wall)
+    start = gaussians_from_paths(own, tx, (receiver([3.0, 2.0, 1.0]),), 1, np.random.default_rng(0))
+    image = np.column_stack([tx, np.ones(len(tx))]) @ start.image_map[0].T
+    assert np.allclose(image, tx * [-1, 1, 1], atol=1e-4)  # float32 corners of the wall at x = 0
+
+
+@pytest.mark.parametrize("kind", [mi.Float, mi.Float64])
+def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarray], kind: Any) -> None:
+    paths, tx = traced
+    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
+    plain = WrfGsPlus(layers=2, width=8, skip=1)
+    turning = replace(plain, phase_hz=FREQUENCY_HZ)
+    weights = turning.init(start, np.random.default_rng(0))
+    params = {name: to_tensor(value, kind) for name, value in weights.items()}
+    there = to_tensor(tx[:3].T.astype(np.float32), kind)
+    signals = []
+    for field in (plain, turning):
+        re, im = field.gaussians(params, there).signal
+        signals.append((re.numpy() + 1j * im.numpy()).reshape(3, 20))
+    x, place = tx[:3].astype(np.float32).astype(float), weights["position"].T.astype(float)
+    affine = weights["image"].T.reshape(20, 3, 4).astype(float)
+    image = np.einsum("nij,bj->bni", affine, np.column_stack([x, np.ones(3)]))
+    phase = -2 * np.pi * FREQUENCY_HZ / speed_of_light * np.linalg.norm(image - place, axis=2)
+    single = kind is mi.Float
+    # Distances of 10 m in float32: 1e-6 m, 5e-5 rad at this wavelength, in some operations.
+    np.testing.assert_allclose(signals[1], signals[0] * np.exp(1j * phase), atol=3e-4 if single else 1e-9)
+    assert np.abs(signals[1] - signals[0]).max() > 0.1
+
+
+def test_a_field_starts_with_them(traced: tuple[Paths, np.ndarray]) -> None:
+    paths, tx = traced
+    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
+    weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
+    assert weights["opacity"].shape == (1, 20)
+    assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
+    assert np.isfinite(weights["opacity"]).all()
+    assert np.ptp(weights["opacity"]) > 0
+
+
+def test_more_gaussians_than_points_are_spread(traced: tuple[Paths, np.ndarray]) -> None:
+    paths, tx = traced
+    one = paths.select(np.arange(2))
+    start = gaussians_from_paths(one, tx, (receiver([3.0, 2.0, 1.0]),), 9, np.random.default_rng(0))
+    assert len(np.unique(start.position_m, axis=0)) == 9
+    with pytest.raises(InputError, match="no path"):
+        gaussians_from_paths(paths.select(np.arange(0)), tx, (receiver([3.0, 2.0, 1.0]),), 4, np.random.default_rng(0))
+
+
+def test_a_mesh_is_covered_by_area(tmp_path: Path) -> None:
+    triangles = np.concatenate([mesh.triangles for _, mesh in SHOEBOX.values()])
+    start = gaussians_from_mesh(triangles, 2000, np.random.default_rng(0))
+    floor = np.abs(start.position_m[:, 2]) < 1e-9
+    share = LENGTH * WIDTH / (2 * (LENGTH * WIDTH + LENGTH * HEIGHT + WIDTH * HEIGHT))
+    assert abs(floor.mean() - share) < 4 * np.sqrt(share * (1 - share) / 2000)  # four deviations of a draw
+    with pytest.raises(InputError, match="no surface"):
+        gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
+
+
+def test_settings_name_surfaces_or_paths(tmp_path: Path) -> None:
+    scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
+    own = receiver([3.0, 2.0, 1.0])
+    record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))
+    rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
+
+    def start(config: InitialConfig, record: Record = record) -> np.ndarray:
+        return initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+
+    def from_a_wall(position: np.ndarray) -> np.ndarray:
+        return np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
+
+    assert from_a_wall(start(InitialConfig(40, mesh=scene))).max() < 1e-5  # float32 of some metres
+    # A mesh without materials has surfaces as well.
+    assert from_a_wall(start(InitialConfig(40, mesh=str(tmp_path / "floor.ply")))).max() < 1e-5
+    found = start(InitialConfig(200, paths=scene))
+    # Direct paths begin at transmitters: at those of the training rows, and at none of the others.
+    standing = found[from_a_wall(found) > 0.25]
+    assert len(standing) > 5
+    assert cdist(standing, tx[rows]).min(axis=1).max() < 0.5
+    assert standing[:, 0].max() < LENGTH / 2
+    with pytest.raises(InputError, match="room states no carrier frequency"):
+        start(InitialConfig(paths=scene), replace(record, frequencies_hz=None))
+    with pytest.raises(InputError, match=r"is a mesh without radio materials; .*wrf-mi mesh room.ply --out DIR"):
+        start(InitialConfig(paths="room.ply"))
+    with pytest.raises(InputError, match="Gaussians start from one"):
+        with_settings(TrainConfig(), ["initial.mesh=a", "initial.paths=b"])

@@ -1,0 +1,88 @@
+"""Spectra of a field at any receiver, pose and size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_spectra import RECEIVERS, SIZE, true_field
+from small_fits import official, settings
+
+from wrf_mi.core import InputError, Receiver, Record, rotation_matrix
+from wrf_mi.training.predictor import Predictor
+from wrf_mi.training.trainer import Trainer
+
+FLOAT32_TOLERANCE = 1e-4
+"""Greys of one field computed on two ways: float32 rounding, and footprints' cut-off, which is worth 0.01."""
+
+
+def still(params: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Parameters of a WRF-GS+ whose network says nothing: the same field for all transmitters."""
+    heads = ("deform.signal.", "deform.rotation.", "deform.scale.")
+    return {k: np.zeros_like(v) if k.startswith(heads) else v for k, v in params.items()}
+
+
+def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Quaternion product q p, order x, y, z, w."""
+    v, w = np.cross(q[:3], p[:3]) + q[3] * p[:3] + p[3] * q[:3], q[3] * p[3] - q[:3] @ p[:3]
+    return np.append(v, w)
+
+
+def test_only_the_pose_between_field_and_receiver_counts() -> None:
+    """Field and receiver moved and turned together give the same spectrum."""
+    field, params = true_field("wrf-gs+")
+    params = still(params)
+    rng = np.random.default_rng(3)
+    params["rotation"] = rng.standard_normal(params["rotation"].shape).astype(np.float32)
+    turn, shift = np.array([0.5, -0.1, 0.7, 0.5]) / np.linalg.norm([0.5, -0.1, 0.7, 0.5]), np.array([3.0, -2.0, 5.0])
+    before = Receiver("a", np.array([0.1, 0.2, -0.1]), np.array([0.0, 0.6, 0.0, 0.8]))
+    after = Receiver("b", rotation_matrix(turn) @ before.position_m + shift, product(turn, before.orientation_xyzw))
+    moved = params | {
+        "position": (rotation_matrix(turn) @ params["position"] + shift[:, None]).astype(np.float32),
+        "rotation": np.stack([product(turn, q) for q in params["rotation"].T], axis=1).astype(np.float32),
+    }
+    tx = np.zeros((1, 3))
+    expected = Predictor(field, params, [before], *SIZE)(tx)
+    assert expected.max() > 0.1
+    np.testing.assert_allclose(Predictor(field, moved, [after], *SIZE)(tx), expected, atol=FLOAT32_TOLERANCE)
+
+
+def test_predictor_of_other_receivers_and_sizes() -> None:
+    field, params = true_field("wrf-gs")
+    tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
+    both = Predictor(field, params, RECEIVERS, *SIZE)
+    for r, receiver in enumerate(RECEIVERS):
+        alone = Predictor(field, params, [receiver], *SIZE)(tx)
+        np.testing.assert_array_equal(both(tx, r), alone)
+        np.testing.assert_array_equal(both(tx, receiver.name), alone)
+        # Pixels are points: twice the size has the same directions at every other pixel.
+        double = Predictor(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
+        np.testing.assert_allclose(double[:, ::2, ::2], alone, atol=FLOAT32_TOLERANCE)
+    assert np.abs(both(tx, 0) - both(tx, 1)).max() > 0.01
+    # One by one or together.
+    np.testing.assert_array_equal(np.concatenate([both(t[None], 0) for t in tx]), both(tx, 0))
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (np.zeros(3), r"expected shape \[m, 3\], got \[3\]"),
+        (np.zeros((2, 4)), r"expected shape \[m, 3\], got \[2, 4\]"),
+        (np.array([[0, 0, 0], [0, np.nan, 0]]), "row 2: not a finite number"),
+    ],
+)
+def test_positions_that_cannot_be_predicted(positions: np.ndarray, message: str) -> None:
+    field, params = true_field("wrf-gs+")
+    with pytest.raises(InputError, match=message):
+        Predictor(field, params, RECEIVERS, *SIZE)(positions)
+
+
+def test_predictions_are_recorded_once(one_gateway: Record) -> None:
+    """For one transmitter or many, before training and after."""
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"))
+    predictor = trainer.predictor()
+    before = predictor(one_gateway.tx_pos_m[:3])
+    trainer.run()
+    assert trainer.predictor() is predictor
+    after = predictor(one_gateway.tx_pos_m[:3])
+    assert np.abs(after - before).max() > 0
+    assert predictor._predict.n_recordings <= 2  # new ones for other memory layouts are no harm

@@ -1,0 +1,186 @@
+"""How far from training rows Gaussians correct paths, and channels of zero."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from traced_rooms import SHOEBOX, write_xml
+
+from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core.settings import with_settings
+from wrf_mi.tracing import open_scene
+from wrf_mi.training.config import default_config
+from wrf_mi.training.reach import Reach, choose_reach, hold_out_groups
+from wrf_mi.training.trainer import Trainer
+
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+ORIGIN = (np.zeros((1, 3)),)
+SMALL = ("steps=60", "validate_every=20", "initial.gaussians=12", "network.width=16", "network.layers=2", "batch=8")
+FLOAT32 = 1e-5
+"""Relative, of sums in single precision."""
+
+
+def at(*distances_m: float) -> np.ndarray:
+    return np.array([[0.0, distance, 0.0] for distance in distances_m])
+
+
+def test_weight_is_a_gaussian_of_the_distance_from_the_nearest_known_transmitter() -> None:
+    two = Reach((np.array([[0.0, 0, 0], [0, 3.0, 0]]),), 0.5)
+    expected = np.exp(-np.square([0, 0.5, 1.5, 0.2]) / 0.25)
+    np.testing.assert_allclose(two.weight(at(0, 0.5, 1.5, 2.8), 0), expected, rtol=FLOAT32)
+    assert (two.weight(at(10.0), 0) == 0).all()  # and where it is negligible, none
+
+
+def test_reach_of_zero_trusts_nowhere_and_an_infinite_one_everywhere() -> None:
+    places = at(0, 0.1, 1e6)
+    assert not Reach(ORIGIN, 0.0).weight(places, 0).any()
+    assert (Reach(ORIGIN, np.inf).weight(places, 0) == 1).all()
+
+
+def test_receiver_that_observed_nothing_has_no_trusted_transmitter() -> None:
+    assert not Reach((np.zeros((0, 3)),), 1.0).weight(at(0, 1), 0).any()
+
+
+@given(st.floats(0.01, 100), st.floats(0.01, 100), st.floats(0, 100))
+def test_weight_rises_with_the_reach(one: float, other: float, distance: float) -> None:
+    low, high = (float(Reach(ORIGIN, r).weight(at(distance), 0)[0]) for r in sorted((one, other)))
+    assert 0 <= low <= high <= 1
+
+
+@given(st.integers(2, 80), st.integers(0, 20), st.integers(0, 99))
+def test_held_out_groups_leave_rows_that_train(train: int, validation: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(train + validation + 5)
+    split = Split("own", seed, np.sort(rows[:train]), np.sort(rows[train : train + validation]), np.sort(rows[-5:]))
+    position = rng.normal(size=(len(rows), 3))
+    held = hold_out_groups(split, position)
+    assert len(held.train)
+    assert set(split.validation) <= set(held.validation)
+    assert sorted([*held.train, *held.validation]) == sorted([*split.train, *split.validation])
+    again = hold_out_groups(split, position)
+    np.testing.assert_array_equal(held.validation, again.validation)
+    assert len(held.train) >= len(split.train) / 2 or train < 20
+
+
+def test_held_out_groups_are_clusters_of_positions() -> None:
+    """Rows of one cluster of ten are held out together, those of the others train."""
+    centre = np.repeat(10.0 * np.arange(10), 8)
+    position = np.stack([centre, 0 * centre, 0 * centre], 1) + np.random.default_rng(0).normal(0, 0.1, (80, 3))
+    held = hold_out_groups(Split("own", 1, np.arange(80), np.empty(0, int), np.empty(0, int)), position)
+    for cluster in np.arange(80).reshape(10, 8):
+        assert len(set(cluster) & set(held.validation)) in (0, 8)
+    assert 8 <= len(held.validation) <= 24
+
+
+@pytest.mark.parametrize("higher_is_better", [True, False])
+def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better: bool) -> None:
+    """The truth is a correction that falls off within half a metre: weights of that reach have no error."""
+    held = [at(0.05, 0.2, 0.5, 1.0)]
+    reach = Reach(ORIGIN, 0.0)
+    lengths = reach.lengths(held)
+    truth = replace(reach, length_m=lengths[3]).weight(held[0], 0)
+
+    def score(receiver: int, weight: Sequence[float]) -> np.ndarray:
+        return np.abs(weight - truth) * (-1 if higher_is_better else 1)
+
+    assert choose_reach(reach, lengths, held, score, higher_is_better) == (lengths[3], 0.0)
+
+
+def test_nothing_held_out_leaves_the_reach_as_it_is() -> None:
+    found, score = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w, True)
+    assert found == 2.0
+    assert np.isnan(score)
+
+
+def channels(channel: np.ndarray, position: np.ndarray) -> Record:
+    receiver = (Receiver("rx", np.array([5.2, 2.4, 1.1]), UPRIGHT),)
+    return Record("own", "csi", position, receiver, channel[None].astype(np.complex64), frequencies_hz=np.array([9e8]))
+
+
+def test_channels_that_nothing_tells_are_predicted_as_zero() -> None:
+    """Phases are independent from row to row: whatever is predicted for a new row is worse than nothing."""
+    rng = np.random.default_rng(0)
+    record = channels(np.exp(2j * np.pi * rng.random((60, 1))), rng.uniform(1, 4, (60, 3)))
+    rows = np.arange(60)
+    config = with_settings(default_config("csi"), SMALL)
+    trainer = Trainer(record, Split("own", 0, rows[:40], rows[40:45], rows[45:]), config)
+    trainer.run()
+    assert trainer.state.reach_m == 0
+    assert trainer.state.chosen
+    assert not trainer.predictor()(record.tx_pos_m[45:]).any()
+
+
+def test_far_from_training_rows_a_joint_fit_predicts_what_its_paths_do(tmp_path: Path) -> None:
+    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+    rng = np.random.default_rng(0)
+    record = channels(np.exp(2j * np.pi * rng.random((60, 1))), rng.uniform([1.5, 2, 1], [2, 2.5, 1.5], (60, 3)))
+    rows = np.arange(60)
+    config = with_settings(default_config("csi", True), [*SMALL, "traced.depth=1", "traced.rays=4096"])
+    trainer = Trainer(record, Split("own", 0, rows[:45], rows[45:50], rows[50:]), config, scene=scene)
+    trainer.run()
+    trainer.state.reach_m = 0.1
+    far, predict = np.array([[4.5, 3.5, 1.2]]), trainer.predictor()
+    known = predict(record.tx_pos_m[:1])
+    both = predict(far)
+    trainer.state.reach_m = 0.0
+    predict = trainer.predictor()
+    np.testing.assert_allclose(both, predict(far), rtol=FLOAT32)
+    assert np.abs(both).max() > 0
+    assert np.abs(known - predict(record.tx_pos_m[:1])).max() > 0
+
+
+def test_gaussians_that_are_not_trusted_are_not_evaluated(tmp_path: Path) -> None:
+    """Far from the training rows a joint fit launches the kernels of its paths alone."""
+    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+    position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (40, 3))
+    record, rows = channels(np.ones((40, 1)), position), np.arange(40)
+    config = with_settings(default_config("csi", True), [*SMALL, "steps=2", "traced.depth=1", "traced.rays=4096"])
+    trainer = Trainer(record, Split("own", 0, rows[:25], rows[25:30], rows[30:]), config, scene=scene)
+
+    def kernels(reach_m: float) -> int:
+        trainer.state.reach_m = reach_m
+        predict = trainer.predictor()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            predict(np.array([[4.5, 3.5, 1.2]]))
+            return len(dr.kernel_history([dr.KernelType.JIT]))
+
+    far, everywhere = kernels(0.1), kernels(np.inf)
+    assert far == kernels(0.0)
+    assert far < everywhere
+
+
+def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+    position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (12, 3))
+    record, rows = channels(np.ones((12, 1)), position), np.arange(12)
+    config = with_settings(default_config("csi", True), [*SMALL, "traced.depth=1", "traced.rays=4096"])
+    trainer = Trainer(record, Split("own", 0, rows[:6], rows[6:7], rows[7:]), config, scene=scene)
+    trainer.run()
+    assert trainer.state.reach_m == 0
+    assert "6 training rows do not tell how far Gaussians hold" in caplog.text
+    assert np.abs(trainer.predictor()(position[7:])).max() > 0
+
+
+@pytest.mark.parametrize(("hold_out", "known"), [(0.7, 45), (1.0, None)])
+def test_rows_that_never_train_are_not_known(hold_out: float, known: int | None) -> None:
+    """Kept out to the end, held-out rows are judged by their distance from those that trained."""
+    rng = np.random.default_rng(0)
+    record, rows = channels(np.ones((60, 1)), rng.uniform(1, 2, (60, 3))), np.arange(60)
+    config = with_settings(default_config("csi"), [*SMALL, f"hold_out={hold_out}"])
+    trainer = Trainer(record, Split("own", 0, rows[:40], rows[40:45], rows[45:]), config)
+    trainer.run()
+    reach = trainer.reach()
+    assert trainer.state.chosen
+    assert reach is not None
+    assert len(reach.known_m[0]) == (known or len(trainer._choosing.train))
+    assert len(trainer._choosing.train) < 40

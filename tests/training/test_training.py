@@ -1,0 +1,321 @@
+"""Fits of small fields to spectra that a known field made."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from made_spectra import RECEIVERS, SIZE, small_field
+from small_fits import official, settings, stop_after
+
+from wrf_mi.backend.device import to_float
+from wrf_mi.core import InputError, Record
+from wrf_mi.gaussians import FIELDS, random_gaussians
+from wrf_mi.tasks.scores import ssim
+from wrf_mi.tasks.spectrum_loss import spectrum_loss
+from wrf_mi.training.adam import NumericsError
+from wrf_mi.training.loop import Progress
+from wrf_mi.training.predictor import Predictor
+from wrf_mi.training.state import FitState
+from wrf_mi.training.trainer import Trainer
+
+pytestmark = pytest.mark.all_threads
+
+FLOAT32_TOLERANCE = 1e-4
+"""Greys of one field computed on two ways: float32 rounding, and footprints' cut-off, which is worth 0.01."""
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> None:
+    heard: list[Progress] = []
+    split = official(one_gateway)
+    trainer = Trainer(one_gateway, split, settings("steps=120", "hold_out=0.5", "validate_every=40", model=model))
+    assert trainer.run(heard.append)
+    assert [p.step for p in heard] == list(range(5, 121, 5))
+    assert heard[-1].loss < 0.8 * heard[0].loss
+    scores = [p.validation_score for p in heard if p.validation_score is not None]
+    assert len(scores) == 3
+    assert scores[-1] > scores[0] + 0.05
+    assert [p.held_out for p in heard] == [p.step <= 60 for p in heard]
+    assert all(a.seconds < b.seconds and a.left_s > b.left_s for a, b in zip(heard[:2], heard[-2:], strict=True))
+    # What training calls its score is what scikit-image says of the same predictions.
+    rows = split.validation
+    expected = np.median(ssim(trainer.predictor()(one_gateway.tx_pos_m[rows]), one_gateway.observation[0, rows]))
+    assert scores[-1] == pytest.approx(expected, abs=1e-5)
+
+
+def test_density_rounds_within_a_run(one_gateway: Record) -> None:
+    heard: list[Progress] = []
+    own = (
+        "steps=100", "density.every=10", "density.start=0", "density.stop=0.4", "density.grow=0.5", "density.most=20"
+    )  # fmt: skip
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*own))
+    trainer.run(heard.append)
+    # 8, 12, 18, then no more than 20; unseen Gaussians may have been removed meanwhile.
+    counts = {p.step: p.gaussians for p in heard}
+    assert counts[5] == 8
+    assert counts[10] > 8
+    assert 12 < counts[100] <= 20
+    assert counts[40] == counts[100]
+    # Growth disturbs what was learned; after the last round it is learned again.
+    losses = {p.step: p.loss for p in heard}
+    assert losses[100] < 0.9 * losses[45]
+    # The recordings are those for this number of Gaussians: a new predictor of the same parameters agrees.
+    tx = one_gateway.tx_pos_m[:2]
+    again = Predictor(trainer.field, trainer.state.mean_params(), RECEIVERS[:1], *SIZE)
+    np.testing.assert_allclose(trainer.predictor()(tx), again(tx), atol=FLOAT32_TOLERANCE)
+
+
+def test_a_round_that_changes_nothing_changes_nothing(one_gateway: Record) -> None:
+    """Parameters, momentum and mean go through a round and a new recording as they are."""
+    states = []
+    for own in ("density.every=0", "density.every=10"):
+        config = settings(
+            "steps=30", "deterministic=true", own, "density.start=0", "density.stop=1", "density.grow=0"
+        )  # fmt: skip
+        trainer = Trainer(one_gateway, official(one_gateway), config)
+        trainer.run()
+        states.append(trainer.state.arrays())
+    for name, values in states[0].items():
+        if not name.startswith("urge"):
+            np.testing.assert_array_equal(states[1][name], values, err_msg=name)
+
+
+def test_opacity_reset_within_a_run(one_gateway: Record) -> None:
+    """Opacities right after the reset, before a step changes them."""
+    own = ("steps=11", "density.every=10", "density.start=0", "density.stop=1", "density.grow=0", "initial.opacity=0.5")
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*own, "density.reset_every=1"))
+    trainer.run(stop=stop_after(10))
+    opacity = 1 / (1 + np.exp(-trainer.state.params()["opacity"]))
+    np.testing.assert_allclose(opacity, 0.05, rtol=1e-5)
+
+
+def test_a_loss_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
+    def loss(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return dr.select(dr.max(truth) > 1.5, np.nan, spectrum_loss(prediction, truth, batch, height, width)[0])
+
+    marked = replace(one_gateway, observation=one_gateway.observation.copy())
+    split = official(marked)
+    row = split.train[0]
+    marked.observation[0, row, 4, 5] = 2
+    trainer = Trainer(marked, split, settings("steps=40"), loss=loss)
+    with pytest.raises(NumericsError, match="not finite") as caught:
+        trainer.run()
+    assert "\n" not in str(caught.value)
+    # Steps on that row were not taken; nothing has spread.
+    for group in (trainer.state.params(), trainer.state.mean_params(), *trainer.state.moments()[:2]):
+        for name, values in group.items():
+            assert np.isfinite(values).all(), name
+    assert np.isfinite(trainer.state.urge.numpy()).all()
+    reached = int(trainer.schedule.rows[:, 0].tolist().index(row)) + 1
+    assert reached % 5 != 0  # not where a line of the log is due
+    assert trainer.state.step == reached
+    assert str(caught.value).startswith(f"step {reached}: not finite: loss")
+
+
+def test_a_gradient_that_is_not_a_number_changes_nothing(one_gateway: Record) -> None:
+    def broken(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return dr.sum(prediction) * float("nan")
+
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"), loss=broken)
+    before = trainer.state.params()
+    with pytest.raises(NumericsError, match="step 1: not finite: loss"):
+        trainer.run()
+    for name, values in trainer.state.params().items():
+        np.testing.assert_array_equal(values, before[name], err_msg=name)
+    assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
+    assert not trainer.state.urge.numpy().any()
+
+
+def test_what_broke_is_reported_before_a_stop_is_asked_for(one_gateway: Record) -> None:
+    def broken(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return dr.sum(prediction) * float("nan")
+
+    saved: list[bool] = []
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"), loss=broken)
+    with pytest.raises(NumericsError, match="step 1: not finite: loss"):
+        trainer.run(save=lambda: saved.append(True), stop=stop_after(2))
+    assert trainer.state.step == 1
+    assert not saved
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_parameters_that_are_not_numbers_are_named(model: str, one_gateway: Record) -> None:
+    """In each group, at the first step; a Gaussian without a place or shape is not seen, and the loss stays finite."""
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5", model=model))
+    good = trainer.state.params()
+    names = (*trainer.field.per_gaussian, next(n for n in good if n.endswith(".bias")))
+    for k, name in enumerate(names):
+        params = {key: values.copy() for key, values in good.items()}
+        params[name][0, -1] = np.inf if k % 2 else np.nan
+        trainer.state = FitState(params)
+        trainer.record_functions()
+        with pytest.raises(NumericsError, match=f"^step 1: parameters or their moments not finite: .*{name}"):
+            trainer.run()
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_nothing_is_compiled_after_the_first_steps(model: str, two_gateways: Record) -> None:
+    """Twenty further steps, at either receiver, run kernels that are there already, from one recording."""
+    own = ("steps=40", "log_every=1000", "validate_every=1000")
+    trainer = Trainer(two_gateways, official(two_gateways), settings(*own, model=model))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
+        trainer.run(stop=stop_after(10))
+        recordings = sum(step.n_recordings for step in trainer._steps.values())
+        dr.kernel_history_clear()
+        trainer.run(stop=stop_after(20))
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert trainer.state.step == 30
+    assert len(history) >= 20
+    assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
+    assert sum(step.n_recordings for step in trainer._steps.values()) == recordings
+
+
+def test_garbage_waits_while_a_function_is_recorded(one_gateway: Record) -> None:
+    """A user's array that wraps NumPy's memory, freed then by Python's collector, would end the process."""
+    seen: list[bool] = []
+
+    def watch(phase: str, info: dict[str, int]) -> None:
+        if phase == "start":
+            seen.append(dr.flag(dr.JitFlag.FreezingScope))
+
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=2", "log_every=1", "validate_every=1"))
+    before = gc.get_threshold()
+    gc.callbacks.append(watch)
+    gc.set_threshold(1)
+    try:
+        trainer.run()
+    finally:
+        gc.set_threshold(*before)
+        gc.callbacks.remove(watch)
+    assert len(seen) > 100
+    assert not any(seen)
+
+
+def test_device_memory_is_not_numpys() -> None:
+    """What is wrapped instead of copied changes with its source."""
+    values = np.arange(6, dtype=np.float32)
+    own = to_float(values)
+    values[:] = 7
+    np.testing.assert_array_equal(own.numpy(), np.arange(6))
+
+
+def test_every_part_can_be_replaced(one_gateway: Record) -> None:
+    """A model, starting values and a loss of one's own."""
+    rng = np.random.default_rng(0)
+    start = random_gaussians(RECEIVERS[:1], 8, rng, size_deg=20.0)
+    calls = []
+
+    def squares(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        calls.append((batch, height, width))
+        return dr.mean(dr.square(prediction - truth))
+
+    heard: list[Progress] = []
+    config = settings("steps=1", "batch=2", "log_every=1", "hold_out=1")
+    split = official(one_gateway)
+    trainer = Trainer(one_gateway, split, config, field=small_field("wrf-gs"), initial=start, loss=squares)
+    np.testing.assert_allclose(trainer.state.params()["position"].T, start.position_m, rtol=1e-6)
+    rows = trainer.schedule.rows[0]
+    greys = trainer.predictor()(one_gateway.tx_pos_m[rows])
+    trainer.run(heard.append)
+    assert calls == [(2, *SIZE)]
+    expected = np.mean((greys - one_gateway.observation[0, rows]) ** 2)
+    assert heard[0].loss == pytest.approx(expected, rel=1e-4)
+
+
+def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
+    """On the batch's rows at the batch's receiver, before the step; with 8, 12 and 18 Gaussians too."""
+    heard: list[Progress] = []
+    own = ("density.every=3", "density.start=0", "density.stop=0.7", "density.grow=0.5", "density.most=18")
+    trainer = Trainer(two_gateways, official(two_gateways), settings("steps=10", "batch=3", "log_every=1", *own))
+    expected = []
+    for t in range(10):
+        rows, r = trainer.schedule.rows[t], int(trainer.schedule.receiver[t])
+        field, params = trainer.field, trainer.state.params()
+        greys = Predictor(field, params, two_gateways.receivers, *SIZE)(two_gateways.tx_pos_m[rows], r)
+        truth = two_gateways.observation[r, rows]
+        expected.append(0.8 * np.abs(greys - truth).mean() + 0.2 * (1 - ssim(greys, truth).mean()))
+        trainer.run(heard.append, stop=stop_after(1))
+    np.testing.assert_allclose([p.loss for p in heard], expected, rtol=1e-4)
+    assert [p.gaussians for p in heard] == [8, 8, 12, 12, 12, 18, 18, 18, 18, 18]
+
+
+def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
+    levels = replace(one_gateway, task="rssi", observation=one_gateway.observation[..., 0, 0])
+    with pytest.raises(InputError, match="receiver model array does not report rssi; choose from power"):
+        Trainer(levels, official(levels), settings("receiver=array"))
+    with pytest.raises(InputError, match="model 'nerf2' cannot be trained here"):
+        Trainer(one_gateway, official(one_gateway), settings("model=nerf2"))
+
+
+def test_points_as_a_start(one_gateway: Record, tmp_path: Path) -> None:
+    cloud = np.random.default_rng(0).normal((0, 0, 3), size=(30, 3))
+    np.savez(tmp_path / "cloud.npz", points=cloud)
+    own = (f"initial.points={tmp_path / 'cloud.npz'}", "initial.opacity=0.3", "steps=1")
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*own))
+    position = trainer.state.params()["position"].T
+    assert np.abs(position[:, None] - cloud).sum(axis=2).min(axis=1).max() < 1e-6
+    np.testing.assert_allclose(1 / (1 + np.exp(-trainer.state.params()["opacity"])), 0.3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_the_group_that_broke_is_named(model: str, one_gateway: Record) -> None:
+    """The loss is finite; one group's gradient alone is not, from the third step on."""
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=20", "log_every=20", model=model))
+    trainer.run(stop=stop_after(2))
+    name = "position" if model == "factorised" else next(n for n in trainer.state.params() if n.endswith(".bias"))
+    _break_gradient_of(trainer, name)
+    before, mean = trainer.state.params(), trainer.state.mean_params()
+    with pytest.raises(NumericsError) as caught:
+        trainer.run()
+    assert str(caught.value).startswith(f"step 3: not finite: {name};")
+    for found, kept in ((trainer.state.params(), before), (trainer.state.mean_params(), mean)):
+        for key, values in found.items():
+            np.testing.assert_array_equal(values, kept[key], err_msg=key)
+
+
+def _break_gradient_of(trainer: Trainer, name: str) -> None:
+    """Give one parameter a further use whose derivative at its value is infinite, and whose value is 0."""
+    gaussians = trainer.field.gaussians
+
+    class Broken(type(trainer.field)):  # type: ignore[misc]
+        def gaussians(self, params: dict[str, Any], tx_pos: Any) -> Any:
+            found = gaussians(params, tx_pos)
+            own = params[name].array
+            zero = dr.sum(dr.sqrt(own - dr.detach(own)))  # 0, and 1 / 0 in reverse
+            found.signal = [s + zero for s in found.signal]
+            return found
+
+    trainer.graph.field = Broken(**{f: getattr(trainer.field, f) for f in trainer.field.__dataclass_fields__})
+    trainer.record_functions()
+
+
+def test_squares_of_gradients_that_overflow_are_reported(one_gateway: Record) -> None:
+    def steep(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
+        return 1e25 * dr.mean(prediction)
+
+    trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5"), loss=steep)
+    with pytest.raises(NumericsError, match=r"^step 1: not finite: .*signal"):
+        trainer.run()
+    assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
+
+
+def test_no_checkpoint_holds_what_is_not_finite(one_gateway: Record) -> None:
+    saved: list[dict[str, np.ndarray]] = []
+    own = (
+        "steps=30",
+        "checkpoint_every=3",
+        "log_every=30",
+        "validate_every=30",
+        "optimiser.network=1e38",
+        "optimiser.warm_up=0",
+    )
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*own))
+    with pytest.raises(NumericsError, match=r"step [0-9]+: "):
+        trainer.run(save=lambda: saved.append(trainer.state.params()))
+    assert all(np.isfinite(values).all() for params in saved for values in params.values())

@@ -1,0 +1,214 @@
+"""What was found on this machine, what is missing, and the remedy for it.
+
+``python -m wrf_mi.cli.doctor [--install-llvm] [--json]`` works where the command is not installed yet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from wrf_mi.backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
+from wrf_mi.backend.probe import Verdict, try_cuda, try_llvm
+from wrf_mi.backend.remedy import install_commands, package_manager
+
+_PACKAGES = ("wrf-mi", "mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image")
+_DATA_VARIABLE = "WRF_MI_DATA"
+
+
+def report() -> dict[str, Any]:
+    """Looks at everything, and tries each LLVM and the GPU anew. Dr.Jit is not imported.
+
+    Returns:
+        JSON-able: ``ok`` (a backend works and all packages are there), ``python``, ``system``, ``versions``
+        (package to version or None), ``threads`` (cores this process may use), ``backend`` (the fields of
+        `wrf_mi.backend.Backend`, or None), ``llvm`` (a list of path, version, usable, reason), ``gpu`` (driver,
+        usable, reason, device), ``data`` (home, cache, sets: a list of name, task, folder or None) and ``problems`` (a
+        list of problem, remedy).
+    """
+    problems: list[dict[str, str]] = []
+    versions = {name: _version(name) for name in _PACKAGES}
+    for name, found in versions.items():
+        if found is None:
+            problems.append({"problem": f"the package {name} is not installed", "remedy": "pip install -e ."})
+    complete = not problems
+    llvm = [_llvm(library) for library in find_llvm(ignore_variable=True)]
+    gpu = _gpu()
+    backend = None
+    try:
+        backend = vars(choose())
+    except BackendError as error:
+        problem, _, remedy = str(error).rpartition(": ")
+        problems.append({"problem": problem, "remedy": remedy})
+    if gpu["driver"] and not gpu["usable"]:
+        problems.append({"problem": f"the GPU cannot be used: {gpu['driver']} {gpu['reason']}", "remedy": "nvidia-smi"})
+    return {
+        "ok": complete and backend is not None,
+        "python": f"{platform.python_version()} ({sys.executable})",
+        "system": platform.platform(),
+        "versions": versions,
+        "threads": _threads(),
+        "backend": backend,
+        "llvm": llvm,
+        "gpu": gpu,
+        "data": _data(problems),
+        "problems": problems,
+    }
+
+
+def render(found: dict[str, Any]) -> str:
+    """The report for a reader, several lines of text."""
+    backend = found["backend"]
+    lines = [
+        ("backend", f"{backend['name']} ({backend['variant']}) on {backend['device']}" if backend else "none"),
+        ("threads", str(found["threads"])),
+        ("GPU", found["gpu"]["device"] or found["gpu"]["reason"]),
+    ]
+    for library in found["llvm"] or [None]:
+        lines.append(("LLVM", _llvm_line(library, backend) if library else "none found"))
+    lines.append(("Python", found["python"]))
+    lines.append(("system", found["system"]))
+    lines += [(name, text or "not installed") for name, text in found["versions"].items()]
+    lines.append(("data", found["data"]["home"]))
+    lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in found["data"]["sets"]]
+    width = max(len(label) for label, _ in lines) + 2
+    text = [f"{label:<{width}}{value}" for label, value in lines]
+    for entry in found["problems"]:
+        text += ["", entry["problem"], f"  remedy: {entry['remedy']}"]
+    return "\n".join(text)
+
+
+def install_llvm() -> None:
+    """Installs an LLVM that works, with apt, dnf or brew; does nothing if there is a working backend.
+
+    Runs as root, or with a ``sudo`` that asks for no password. The package manager's own output appears.
+
+    Raises:
+        BackendError: it may not, or it did not help: one line with the command that a person can run.
+    """
+    try:
+        choose()
+        return
+    except BackendError as error:
+        # A library that the variable names is the user's own business, and no package takes its place.
+        if os.environ.get("DRJIT_LIBLLVM_PATH") or not install_commands():
+            raise
+        prefix = _privilege()
+        if prefix is None:
+            raise
+        reason = error
+    # The second round is for package lists that are empty, or so old that their files are gone.
+    for refresh in (False, True):
+        if refresh and package_manager() == "apt-get":
+            _run([*prefix, "apt-get", "update"])
+        for command in install_commands():
+            if _run([*prefix, *command]):
+                try:
+                    choose("llvm", fresh=True)
+                    return
+                except BackendError as error:
+                    reason = error
+    raise BackendError(f"installing LLVM did not help: {reason}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line of this module; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m wrf_mi.cli.doctor", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--install-llvm", action="store_true", help="install LLVM if no backend works, and say nothing else"
+    )
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+    options = parser.parse_args(arguments)
+    try:
+        if options.install_llvm:
+            install_llvm()
+            return 0
+    except BackendError as error:
+        print(error, file=sys.stderr)
+        return 1
+    found = report()
+    print(json.dumps(found, indent=2) if options.json else render(found))
+    return 0 if found["ok"] else 1
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    return {"usable": verdict.usable, "reason": verdict.reason}
+
+
+def _llvm(library: LlvmLibrary) -> dict[str, Any]:
+    verdict = try_llvm(library, fresh=True)
+    number = verdict.version or ".".join(map(str, library.version))
+    return {"path": str(library.path), "version": number, **_verdict(verdict)}
+
+
+def _gpu() -> dict[str, Any]:
+    driver = find_cuda()
+    if driver is None:
+        return {"driver": None, "usable": False, "reason": "no NVIDIA GPU with its driver", "device": ""}
+    verdict = try_cuda(driver, fresh=True)
+    return {"driver": str(driver), **_verdict(verdict), "device": verdict.device}
+
+
+def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
+    """Where data sets are looked for and which of the known ones are there; a problem for what can be fetched."""
+    # Imported late: installing LLVM must not need the packages that read data.
+    from wrf_mi.datasets import data_home, datasets, user_cache
+
+    home = data_home()
+    if os.environ.get(_DATA_VARIABLE) and not home.is_dir():
+        problems.append({"problem": f"{_DATA_VARIABLE}={home} is not a folder", "remedy": f"unset {_DATA_VARIABLE}"})
+    sets = []
+    for entry in datasets():
+        name, folder = entry.dataset.name, entry.location
+        sets.append({"name": name, "task": entry.dataset.task, "folder": str(folder) if folder else None})
+        if folder is None and entry.dataset.base_url is not None:
+            remedy = f"wrf-mi data fetch {name}"
+            problems.append({"problem": f"the data set {name} is not on this machine", "remedy": remedy})
+    return {"home": str(home), "cache": str(user_cache()), "sets": sets}
+
+
+def _threads() -> int:
+    """Cores this process may use, which is how many threads Dr.Jit starts."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _llvm_line(library: dict[str, Any], backend: dict[str, Any] | None) -> str:
+    chosen = backend is not None and backend["llvm_path"] == library["path"]
+    state = "in use" if chosen else "works" if library["usable"] else library["reason"]
+    return f"{library['version'] or '?'} {library['path']}: {state}"
+
+
+def _privilege() -> list[str] | None:
+    """What goes before a command that changes the system; None if it may not be changed from here."""
+    if package_manager() == "brew" or os.geteuid() == 0:
+        return []
+    sudo = shutil.which("sudo")
+    if sudo and subprocess.run([sudo, "-n", "true"], capture_output=True).returncode == 0:
+        return [sudo, "-n"]
+    return None
+
+
+def _run(command: list[str]) -> bool:
+    print("+", *command, file=sys.stderr, flush=True)
+    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
+    return subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode == 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""Downloading known data sets: from their public originals, at fixed commits, checked by SHA-256.
+
+Where ours is made from an original file of which only the content is known (the pickles of NeWRF), the arrays that it
+gives are checked in place of the file. Such a pickle is not unpickled: `wrf_mi.datasets.pickled_table` reads it as data
+and runs nothing of what it names. It is not kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import sys
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib.resources import files
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pooch
+import requests
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..core import InputError
+from ..core.files import atomic_folder, one_line, write_arrays
+from .newrf import KEYS, arrays_sha256, read_arrays
+from .newrf_original import convert_newrf
+from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, locate, remote_files
+
+THREADS = 8
+"""Downloads under way at once: the files are small, so waiting is what takes the time."""
+RETRIES = 2
+"""How often a file is tried again after a failure."""
+TIMEOUT_S = 30
+"""Seconds without an answer after which a download counts as failed."""
+
+
+def fetch(
+    name: str,
+    *,
+    home: str | Path | None = None,
+    base_url: str | None = None,
+    retries: int = RETRIES,
+    progress: bool = True,
+) -> Path:
+    """Download a known data set, or check it where it is there already.
+
+    Every file, or the arrays in it where it is converted, must have the published SHA-256. The folder appears complete
+    or not at all.
+
+    Args:
+        name: of a known data set.
+        home: folder to put ``<name>/`` in; by default that of ``WRF_MI_DATA``, or else the user's cache.
+        base_url: a mirror of the public original.
+        retries: how often a file is tried again.
+        progress: show a progress bar, and what a user has to know of the data, on standard error.
+
+    Returns:
+        The data set's folder.
+
+    Raises:
+        InputError: unknown name, no network, a file that is not the published one, or a folder that cannot be written.
+    """
+    dataset = known(name)
+    if dataset.base_url is None:
+        raise InputError(f"data set {name}: is not downloaded but {dataset.origin}")
+    place = Path(home) if home else data_home()
+    target = locate(name, place) or place / name
+    folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    if progress and dataset.note:
+        print(f"{name}: {dataset.note}", file=sys.stderr)
+    return folder
+
+
+def download(
+    dataset: DataSet,
+    entries: list[RemoteFile],
+    target: Path,
+    base_url: str,
+    retries: int = RETRIES,
+    progress: bool = False,
+) -> Path:
+    """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds; see `fetch`."""
+    if target.exists():
+        damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry)]
+        if damaged:
+            text = f"is not the published file ({len(damaged)} of {len(entries)} are not)"
+            raise InputError(f"{target / damaged[0]}: missing or {text}; remove {target} and fetch it again")
+        return target
+    with atomic_folder(target) as part:
+        urls = {entry.path: f"{base_url.rstrip('/')}/{entry.remote}" for entry in entries}
+        hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
+        for entry in entries:  # pooch makes folders too, but not if two threads do at once
+            (part / entry.path).parent.mkdir(parents=True, exist_ok=True)
+        store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=retries)
+        _fetch_all(store, dataset.name, progress)
+        for entry in entries:
+            if entry.converted:
+                _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
+        if dataset.folds is not None:
+            folds = (files(__package__) / "data" / dataset.folds).read_bytes()
+            (part / "blocked_folds.txt").write_bytes(folds)
+        source = f"{dataset.name}: {dataset.origin}\nLicence: {dataset.licence}\n{dataset.note}".strip()
+        (part / "SOURCE.txt").write_text(f"{source}\n", encoding="utf-8")
+    return target
+
+
+def _convert(path: Path, entry: RemoteFile, source: str) -> None:
+    """Put our file in the place of the original's."""
+    remedy = f"nothing was kept; set {DATA_VARIABLE} to a folder that holds {path.name} in this form"
+    try:
+        arrays = convert_newrf(path)
+    except InputError as error:
+        raise InputError(f"{source} cannot be converted ({str(error).removeprefix(f'{path}: ')}); {remedy}") from None
+    if arrays_sha256(arrays) != entry.sha256:
+        raise InputError(f"{source} does not hold the published arrays, {remedy}")
+    write_arrays(path, arrays, compressed=True)
+
+
+def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
+    downloader = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+    logger = pooch.get_logger()
+    level = logger.level
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with (
+        Progress(*columns, console=Console(stderr=True), disable=not progress) as bar,
+        ThreadPoolExecutor(THREADS) as pool,
+    ):
+        task = bar.add_task(f"fetching {name}", total=len(store.registry))
+        logger.setLevel(logging.WARNING)  # one line per file otherwise
+        jobs = {pool.submit(store.fetch, path, downloader=downloader): path for path in store.registry}
+        try:
+            for job in as_completed(jobs):
+                _result(job.exception(), name, store.get_url(jobs[job]))
+                bar.advance(task)
+        finally:
+            pool.shutdown(cancel_futures=True)
+            logger.setLevel(level)
+
+
+def _result(error: BaseException | None, name: str, url: str) -> None:
+    if isinstance(error, requests.exceptions.HTTPError):
+        raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
+    if isinstance(error, requests.exceptions.RequestException):
+        remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
+        raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
+    if isinstance(error, ValueError):  # how pooch reports a wrong hash
+        raise InputError(f"data set {name}: {url} has not the published SHA-256, nothing was kept; try again") from None
+    if isinstance(error, OSError):
+        raise InputError(f"data set {name}: cannot be written ({one_line(error)}); choose another folder") from None
+    if error is not None:
+        raise error
+
+
+def _is_intact(path: Path, entry: RemoteFile) -> bool:
+    if not path.is_file():
+        return False
+    if not entry.converted:
+        return hashlib.sha256(path.read_bytes()).hexdigest() == entry.sha256
+    try:
+        return arrays_sha256(read_arrays(path, KEYS)) == entry.sha256
+    except InputError:
+        return False

@@ -1,0 +1,220 @@
+"""The layout of NeRF2's channel coefficients: uplink and downlink of a base station with many antennas.
+
+Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, class ``CSI_dataset`` of its
+``dataloader.py``):
+
+- ``csidata.npy``: complex [n, antennas, subcarriers]; the first half of the subcarriers is the uplink, the second the
+  downlink. (The authors' data: 8 antennas, 26 and 26 subcarriers of the ArgosV2 traces.)
+- ``base-station.yml``: ``base_station``, a list of x, y, z in metres, one for each antenna.
+- ``train_index.txt``, ``test_index.txt``, optional: samples, counted from 0, one per line. Both or neither.
+
+Optional and ours: in ``base-station.yml`` ``orientation`` of the array (unit quaternion x, y, z, w, array's frame to
+world), ``frequencies_hz`` of all subcarriers, and ``antenna`` and ``tx_antenna`` as in ``gateway_info.yml`` (see
+`wrf_mi.datasets.spectrum_folder`); ``tx_pos.csv`` with the positions of the moving ends;
+``downlink_truth.npy``, the downlink without noise [n, antennas, subcarriers / 2], where it is synthetic.
+
+NeRF2 divides all coefficients, test rows included, by the largest magnitude among them, and takes each antenna for a
+sample of its own with real and imaginary parts side by side. Neither is done here: a record holds what was measured,
+and normalising belongs to a method, from its training rows alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..core import InputError, Receiver, Record
+from ..core.angles import FloatArray
+from ..core.files import atomic_folder, one_line
+from .folder_files import (
+    INDEX_FILES,
+    POSITIONS,
+    TX_ANTENNA_WORDS,
+    antenna_entry,
+    fits_single,
+    numbers_of,
+    read_antenna,
+    read_official,
+    read_positions,
+    read_yaml,
+    refuse_unstated,
+    shown,
+    unit_quaternion,
+    write_lines,
+    write_positions,
+)
+
+CHANNELS, STATION, TRUTH = "csidata.npy", "base-station.yml", "downlink_truth.npy"
+FEWEST = 2
+"""Samples: one to train on and one to score."""
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
+    """Read and check a folder in the layout of NeRF2's channel coefficients (see this module's head).
+
+    Args:
+        path: the folder.
+        name: the record's name; the folder's own by default.
+        frequencies_hz: of all subcarriers, uplink and downlink, in Hz, where ``base-station.yml`` does not tell.
+
+    Returns:
+        A record with ``task="csi"`` and one receiver at the middle of the antennas: ``observation``
+        [1, n, antennas, subcarriers / 2] of the downlink, ``uplink`` [n, antennas, subcarriers / 2], positions NaN
+        where there is no ``tx_pos.csv``.
+
+    Raises:
+        InputError: anything missing, unreadable or inconsistent; one line with the file and the sample.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: not a folder; give one that holds {CHANNELS} and {STATION}")
+    channel = read_channels(folder / CHANNELS)
+    n, antennas, subcarriers = channel.shape
+    if n < FEWEST:
+        raise InputError(f"{folder / CHANNELS}: {n} sample; give {FEWEST} at least, to train on and to score")
+    if subcarriers % 2:
+        text = f"{subcarriers} subcarriers do not halve into uplink and downlink"
+        raise InputError(f"{folder / CHANNELS}: {text}; give as many of each")
+    half = subcarriers // 2
+    station = folder / STATION
+    info = read_yaml(station)
+    receiver = _read_station(station, info, antennas)
+    asked = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
+    frequencies = None if asked is None else _frequencies(station, asked, subcarriers)
+    return Record(
+        name=name or folder.resolve().name,
+        task="csi",
+        tx_pos_m=_read_places(folder / POSITIONS, n),
+        receivers=(receiver,),
+        observation=channel[None, :, :, half:],
+        official=read_official(folder, n, first=0, source=CHANNELS),
+        frequencies_hz=None if frequencies is None else frequencies[half:],
+        uplink=channel[:, :, :half],
+        uplink_hz=None if frequencies is None else frequencies[:half],
+        truth=_read_truth(folder / TRUTH, (n, antennas, half)),
+        tx_antenna=read_antenna(station, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS),
+        source=str(folder),
+    )
+
+
+def write_nerf2_csi(
+    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str] | None = None
+) -> Path:
+    """Write a record in the layout of NeRF2's channel coefficients; the folder appears complete or not at all.
+
+    Args:
+        path: the folder to make.
+        record: of ``task="csi"`` with one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
+            the downlink.
+        replace: take the place of an existing folder.
+        extra: further text files to put into the folder, by their names.
+
+    Raises:
+        InputError: the folder exists or cannot be written, or the record lacks what the layout holds.
+    """
+    down, up, array_m = record.observation, record.uplink, record.receivers[0].array_m
+    if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
+        need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
+        raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
+    refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz")
+    receiver = record.receivers[0]
+    info: dict[str, Any] = {
+        "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),
+        "orientation": receiver.orientation_xyzw.tolist(),
+    }
+    if record.uplink_hz is not None and record.frequencies_hz is not None:
+        info["frequencies_hz"] = [*record.uplink_hz.tolist(), *record.frequencies_hz.tolist()]
+    antennas = {"antenna": antenna_entry(receiver.antenna), "tx_antenna": antenna_entry(record.tx_antenna)}
+    info |= {key: value for key, value in antennas.items() if value}
+    with atomic_folder(Path(path), replace) as part:
+        np.save(part / CHANNELS, np.concatenate([up, down[0]], axis=-1).astype(np.complex64))
+        text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
+        (part / STATION).write_text(text, encoding="utf-8")
+        if np.isfinite(record.tx_pos_m).all():
+            write_positions(part / POSITIONS, record.tx_pos_m)
+        if record.truth is not None:
+            np.save(part / TRUTH, record.truth[0].astype(np.complex64))
+        if record.official is not None:
+            for file, rows in zip(INDEX_FILES, record.official, strict=True):
+                write_lines(part / file, [str(row) for row in rows])
+        for file, content in (extra or {}).items():
+            (part / file).write_text(content, encoding="utf-8")
+    return Path(path)
+
+
+def read_channels(path: Path) -> NDArray[np.complex64]:
+    """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file.
+
+    Raises:
+        InputError: missing, damaged, of another shape or type, or not finite, in single precision too.
+    """
+    try:
+        values = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
+    except Exception as error:  # numpy raises several kinds on damaged files
+        raise InputError(f"{path}: not readable as .npy ({one_line(error)}); write it again with numpy.save") from None
+    if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:
+        shape = list(getattr(values, "shape", ()))
+        raise InputError(f"{path}: shape {shape}; give complex numbers [samples, antennas, subcarriers]")
+    if values.dtype.kind != "c":
+        raise InputError(f"{path}: holds {values.dtype}; give complex numbers [samples, antennas, subcarriers]")
+    with np.errstate(over="ignore"):
+        single = values.astype(np.complex64)
+    bad = ~np.isfinite(single)
+    if bad.any():
+        sample, antenna, subcarrier = (int(k) for k in np.argwhere(bad)[0])
+        where = f"sample {sample}, antenna {antenna}, subcarrier {subcarrier} (from 0)"
+        value = values[sample, antenna, subcarrier]
+        text = f"{value} is {'too large for single precision' if np.isfinite(value) else 'not finite'}"
+        raise InputError(f"{path}: {where}: {text}; correct or remove the sample")
+    return single
+
+
+def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> Receiver:
+    places = info.get("base_station")
+    elements = numbers_of(places)
+    if elements.ndim != 2 or elements.shape[1] != 3 or not fits_single(elements):
+        raise InputError(f"{path}: base_station is {shown(places)}; give x, y, z in metres of each antenna")
+    if len(elements) != antennas:
+        text = f"{len(elements)} positions in base_station, but {CHANNELS} has {antennas} antennas"
+        raise InputError(f"{path}: {text}; give one for each")
+    orientation = unit_quaternion(path, "base_station", info.get("orientation", list(IDENTITY)))
+    antenna = read_antenna(path, "antenna", info.get("antenna"))
+    receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
+    return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
+
+
+def _frequencies(path: Path, values: object, subcarriers: int) -> FloatArray:
+    frequencies = numbers_of(values)
+    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
+        raise InputError(f"{path}: frequencies_hz is {shown(values)}; give a list of frequencies in Hz")
+    if len(frequencies) != subcarriers:
+        text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
+        raise InputError(f"{path}: {text}; give one for each, the uplink's first")
+    return frequencies
+
+
+def _read_places(path: Path, rows: int) -> FloatArray:
+    if not path.exists():
+        return np.full((rows, 3), np.nan)
+    positions = read_positions(path)
+    if len(positions) != rows:
+        raise InputError(f"{path}: {len(positions)} rows, but {CHANNELS} has {rows} samples; give one for each")
+    return positions
+
+
+def _read_truth(path: Path, shape: tuple[int, int, int]) -> NDArray[np.complex64] | None:
+    if not path.exists():
+        return None
+    truth = read_channels(path)
+    if truth.shape != shape:
+        raise InputError(f"{path}: shape {list(truth.shape)}, expected {list(shape)}, as the downlink of {CHANNELS}")
+    return truth[None]

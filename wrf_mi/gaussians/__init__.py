@@ -1,0 +1,27 @@
+"""The learned fields: Gaussian parameters, starting values, networks."""
+
+from ..backend import init
+
+# Dr.Jit loads an LLVM of its own choice when it is imported: ours must be chosen before.
+init()
+
+from .factorised import Factorised
+from .fields import Encoding, WrfGs, WrfGsPlus
+from .initial import InitialGaussians, gaussians_from_points, random_gaussians
+from .parameters import Gaussians, rows
+
+FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus, "factorised": Factorised}
+"""Field classes by the name that `wrf-mi train --model` takes."""
+
+__all__ = [
+    "FIELDS",
+    "Encoding",
+    "Factorised",
+    "Gaussians",
+    "InitialGaussians",
+    "WrfGs",
+    "WrfGsPlus",
+    "gaussians_from_points",
+    "random_gaussians",
+    "rows",
+]

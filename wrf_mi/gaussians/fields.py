@@ -1,0 +1,230 @@
+"""The two fields of the paper: WRF-GS and WRF-GS+.
+
+A field is a description without arrays: ``init`` makes its parameters as NumPy arrays, ``gaussians`` maps
+parameters (a dictionary of Dr.Jit tensors) and transmitter positions to `Gaussians`. Both work in
+whatever float type the tensors have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+from scipy.constants import speed_of_light
+
+from .encoding import encode, encoded_size
+from .initial import InitialGaussians
+from .network import Params, Weights, dense, dense_of_pairs, init_layer, linear
+from .parameters import Gaussians, rows
+
+GEOMETRY = ("position", "log_scale", "rotation")
+"""Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
+
+A field whose geometry and attenuation are the same for all transmitters says so by ``still``, and by
+``signal_parameters`` which of its parameters, by the start of their names, reach its signals alone.
+"""
+
+NEAREST_M = 1e-3
+"""Distances of a phase are not taken below that: where an image lies in a Gaussian's centre their slope has no end."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """Positional encoding of Gaussians and transmitters.
+
+    The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.gaussians.encoding`.
+
+    Attributes:
+        position_octaves: of Gaussian centres.
+        position_scale_m: metres that make their unit.
+        tx_octaves: of transmitter positions.
+        tx_scale_m: metres that make their unit.
+        features: number of features that take the encoded transmitter's place, as they are (the uplink channel in the
+            second case study of WRF-GS+); 0: the transmitter's position is encoded.
+    """
+
+    position_octaves: int = 10
+    position_scale_m: float = 1.0
+    tx_octaves: int = 10
+    tx_scale_m: float = 1.0
+    features: int = 0
+
+    def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
+        """Encoded Gaussian centres [6 * octaves, n], detached.
+
+        The network sees where a Gaussian is but does not move it: its gradient through the fast
+        octaves would drown the one through the footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
+        """
+        return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
+
+    def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
+        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch] themselves."""
+        return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of features of each part."""
+        return {
+            "position": encoded_size(self.position_octaves),
+            "transmitter": self.features or encoded_size(self.tx_octaves),
+        }
+
+
+@dataclass(frozen=True)
+class WrfGs:
+    """WRF-GS (paper, section IV-B): attenuation and signal from two networks, product blending (eq. 12, 13).
+
+    The first network, eight layers of 128, sees the Gaussian's centre and gives its complex attenuation and a
+    feature vector; the second, layers of 128 and 64, sees features and transmitter and gives the signal.
+    Where the paper is silent: the feature vector has ``width`` entries; centre, scale and rotation are
+    learned as in 3D Gaussian splatting; delta = z / sqrt(1 + |z|^2) keeps |delta| < 1 and starts at
+    0.9 (nearly transparent), so that Gaussians far away are seen from the first step.
+    With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
+    """
+
+    encoding: Encoding = Encoding()
+    layers: int = 8
+    width: int = 128
+    signal_widths: tuple[int, int] = (128, 64)
+    components: int = 1
+
+    blending = "product"
+    per_gaussian = GEOMETRY
+    still = True
+    signal_parameters = ("signal.",)
+
+    def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
+        """Parameters as NumPy arrays: geometry from ``initial``, networks drawn from ``rng``."""
+        sizes, weights = self.encoding.sizes, initial.geometry()
+        weights |= init_layer("attenuation.0", {"position": sizes["position"]}, self.width, rng)
+        for i in range(1, self.layers):
+            weights |= init_layer(f"attenuation.{i}", {"hidden": self.width}, self.width, rng)
+        weights |= init_layer("attenuation.delta", {"hidden": self.width}, 2, rng, gain=0.1)
+        weights["attenuation.delta.bias"][0] = 2.0
+        first, second = self.signal_widths
+        weights |= init_layer("signal.0", {"feature": self.width, "transmitter": sizes["transmitter"]}, first, rng)
+        weights |= init_layer("signal.1", {"hidden": first}, second, rng)
+        return weights | init_layer("signal.out", {"hidden": second}, 2 * self.components, rng, gain=initial.signal)
+
+    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        batch = tx_pos.shape[1]
+        hidden = dense(params, "attenuation.0", self.encoding.position(params["position"]), "position")
+        for i in range(1, self.layers):
+            hidden = dense(params, f"attenuation.{i}", hidden)
+        z = linear(params, "attenuation.delta", hidden)
+        re, im = rows(z)
+        norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
+        encoded = {"transmitter": self.encoding.transmitter(tx_pos)}
+        seen = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
+        signal = linear(params, "signal.out", dense(params, "signal.1", seen))
+        return Gaussians(
+            position=rows(params["position"]),
+            scale=[dr.exp(s) for s in rows(params["log_scale"])],
+            rotation=rows(params["rotation"]),
+            signal=rows(signal),
+            opacity=None,
+            attenuation=[re * norm, im * norm],
+            batch=batch,
+        )
+
+
+@dataclass(frozen=True)
+class WrfGsPlus:
+    """WRF-GS+ (paper, section V): static attributes and a deformation network, alpha blending (eq. 14).
+
+    The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
+    three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
+    With ``still`` the first head is the only one: Gaussians then stand as they are for every transmitter, and the
+    map from their signals to the receiver is the same for all.
+    With ``phase_hz`` each signal turns as a wave does on its way from the transmitter's image, x' = A x + b, to the
+    Gaussian: exp(-j 2 pi f abs(x' - position) / c), which a network need not learn; A and b stay as they started.
+    Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
+    rotation's to the quaternion before it is normalised; the heads start small, so that the static
+    field is what training sees first.
+    With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
+    """
+
+    encoding: Encoding = Encoding()
+    layers: int = 8
+    width: int = 256
+    skip: int = 4
+    still: bool = False
+    phase_hz: float = 0.0
+    components: int = 1
+
+    blending = "alpha"
+    signal_parameters = ("signal", "deform.", "image")
+
+    @property
+    def per_gaussian(self) -> tuple[str, ...]:
+        """Names of the parameters that each Gaussian has of its own."""
+        return (*GEOMETRY, "opacity", "signal", *(("image",) if self.phase_hz else ()))
+
+    @property
+    def heads(self) -> tuple[tuple[str, int, float], ...]:
+        """Name, size and starting gain of each head."""
+        moving = () if self.still else (("rotation", 4, 0.05), ("scale", 3, 0.05))
+        return (("signal", 2 * self.components, 0.5), *moving)
+
+    def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
+        """Parameters as NumPy arrays: static attributes from ``initial``, network drawn from ``rng``."""
+        sizes, weights = self.encoding.sizes, initial.geometry()
+        weights["opacity"] = initial.opacity_logit()
+        weights["signal"] = np.concatenate([initial.static_signal(rng) for _ in range(self.components)])
+        if self.phase_hz:
+            weights["image"] = initial.image()
+        for i in range(self.layers):
+            inputs = ({"hidden": self.width} if i else {}) | (sizes if i in (0, self.skip) else {})
+            weights |= init_layer(f"deform.{i}", inputs, self.width, rng)
+        for head, size, gain in self.heads:
+            weights |= init_layer(f"deform.{head}", {"hidden": self.width}, size, rng, gain=gain * initial.signal)
+        return weights
+
+    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        batch = tx_pos.shape[1]
+        position = {"position": self.encoding.position(params["position"])}
+        transmitter = {"transmitter": self.encoding.transmitter(tx_pos)}
+        hidden = dense_of_pairs(params, "deform.0", position, transmitter)
+        for i in range(1, self.layers):
+            if i == self.skip:
+                hidden = dense_of_pairs(params, f"deform.{i}", position, transmitter, hidden)
+            else:
+                hidden = dense(params, f"deform.{i}", hidden)
+        offset = {head: rows(linear(params, f"deform.{head}", hidden)) for head, _, _ in self.heads}
+
+        def deformed(name: str, head: str) -> list[dr.ArrayBase]:
+            if head not in offset:
+                return rows(params[name])
+            static = [dr.tile(a, batch) for a in rows(params[name])]
+            return [a + d for a, d in zip(static, offset[head], strict=True)]
+
+        opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
+        return Gaussians(
+            position=rows(params["position"]),
+            scale=[dr.exp(s) for s in deformed("log_scale", "scale")],
+            rotation=deformed("rotation", "rotation"),
+            signal=self._turned(deformed("signal", "signal"), params, tx_pos)
+            if self.phase_hz
+            else deformed("signal", "signal"),
+            opacity=opacity if self.still else dr.tile(opacity, batch),
+            attenuation=None,
+            batch=batch,
+        )
+
+    def _turned(self, signal: list[dr.ArrayBase], params: Params, tx_pos: dr.ArrayBase) -> list[dr.ArrayBase]:
+        """Signals [batch * n] with the phase of their ways from the transmitter's images."""
+        batch, position, image = tx_pos.shape[1], rows(params["position"]), rows(dr.detach(params["image"]))
+        x = [dr.repeat(c, dr.width(position[0])) for c in rows(tx_pos)]
+        away = []
+        for k in range(3):
+            a, b, c, d = (dr.tile(part, batch) for part in image[4 * k : 4 * k + 4])
+            away.append(a * x[0] + b * x[1] + c * x[2] + d - dr.tile(position[k], batch))
+        square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+        turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
+        # Whole turns off first: sines of large arguments have no digits left in float32.
+        sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
+        re, im = signal
+        return [re * cosine - im * sine, re * sine + im * cosine]

@@ -1,0 +1,150 @@
+"""From 3D Gaussians to footprints on the sphere of directions around a receiver.
+
+The paper projects to an equirectangular ("Mercator") plane and takes the covariance there. The azimuth
+derivative of that map grows as 1 / cos(elevation), so the plane's Gaussian is wrong near the zenith, where the
+strongest lobe of real data sits. Here the covariance stands in the tangent plane at the Gaussian's direction
+n, and the footprint is evaluated at each pixel's unit vector u:
+
+    v = (e1 . u, e2 . u) / (n . u),   G' = exp(-v^T C^-1 v / 2),   C = [e1 e2]^T Sigma [e1 e2] / d^2 + low-pass
+
+which equals the paper's form to first order at low elevation and knows neither seam nor pole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from .footprint_constants import CUTOFF, LOW_PASS_RAD, NEAR_M
+from .parameters import Gaussians
+
+
+@dataclass
+class Pose:
+    """A receiver's pose on the device: position (three arrays of width 1) and rotation to the world (3 x 3)."""
+
+    position: list[dr.ArrayBase]
+    to_world: list[list[dr.ArrayBase]]
+
+    def to_local(self, v: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
+        """A world vector in the receiver's frame (R^T v)."""
+        return [sum((self.to_world[k][i] * v[k] for k in (1, 2)), self.to_world[0][i] * v[0]) for i in range(3)]
+
+
+@dataclass
+class Footprints:
+    """Footprints in a receiver's frame, arrays [batch * n], batch-major.
+
+    Attributes:
+        direction: unit vector n.
+        whitened: two vectors a, b with v^T C^-1 v = ((a . u)^2 + (b . u)^2) / (n . u)^2.
+        radius: angular radius that holds the whole footprint, radians; detached.
+        visible: far enough from the receiver to have a footprint; detached.
+        depth: distance from the receiver, metres, [n] (the same for all transmitters); detached, float64: it decides
+            the order, and depths that differ by less than a float32's last digit must not change places by chance.
+    """
+
+    direction: list[dr.ArrayBase]
+    whitened: tuple[list[dr.ArrayBase], list[dr.ArrayBase]]
+    radius: dr.ArrayBase
+    visible: dr.ArrayBase
+    depth: dr.ArrayBase
+
+
+def dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Scalar product of two vectors, each three arrays."""
+    return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
+
+
+def tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
+    """Two unit vectors perpendicular to n and to each other (Duff et al. 2017, J. Comput. Graph. Techn. 6)."""
+    x, y, z = n
+    sign: Any = dr.copysign(type(z)(1), dr.detach(z))
+    a = -dr.rcp(sign + z)
+    b = x * y * a
+    return [dr.fma(sign * x * x, a, 1), sign * b, -sign * x], [b, dr.fma(y * y, a, sign), -y]
+
+
+def own_axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
+    """World directions of the three own axes (columns of the rotation) of unnormalised quaternions x, y, z, w."""
+    x, y, z, w = quaternion
+    f = 2 / (x * x + y * y + z * z + w * w)
+    return [
+        [1 - f * (y * y + z * z), f * (x * y + z * w), f * (x * z - y * w)],
+        [f * (x * y - z * w), 1 - f * (x * x + z * z), f * (y * z + x * w)],
+        [f * (x * z + y * w), f * (y * z - x * w), 1 - f * (x * x + y * y)],
+    ]
+
+
+def project(gaussians: Gaussians, pose: Pose) -> Footprints:
+    """Footprints of Gaussians as a receiver sees them. Differentiable in position, scale and rotation.
+
+    A Gaussian whose centre is nearer than ``NEAR_M`` contains the receiver and has no footprint; any other
+    keeps its footprint however large it is.
+    """
+    batch = gaussians.batch
+    offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
+    local = pose.to_local(offset)
+    exact = centre_distance(gaussians.position, pose.position)
+    visible = exact >= NEAR_M
+    depth = dr.sqrt(dot(local, local))
+    inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
+    n = [c * inverse for c in local]
+    n[2] = dr.select(visible, n[2], 1)
+    e1, e2 = tangent_basis(n)
+    n, e1, e2 = ([dr.tile(c, batch) for c in v] for v in (n, e1, e2))
+    inverse = dr.tile(inverse, batch)
+
+    # Columns of [e1 e2]^T R diag(s) / d: C = sum of their outer products + low-pass.
+    columns = []
+    for scale, axis in zip(gaussians.scale, own_axes(gaussians.rotation), strict=True):
+        m, f = pose.to_local(axis), scale * inverse
+        columns.append((dot(e1, m) * f, dot(e2, m) * f))
+    low = LOW_PASS_RAD**2
+    own11 = sum((p * p for p, _ in columns[1:]), columns[0][0] ** 2)
+    own22 = sum((q * q for _, q in columns[1:]), columns[0][1] ** 2)
+    c12 = sum((p * q for p, q in columns[1:]), columns[0][0] * columns[0][1])
+    c11, c22 = own11 + low, own22 + low
+    # det C by Lagrange's identity: a sum of squares, where c11 c22 - c12^2 would cancel for needles.
+    (p0, q0), (p1, q1), (p2, q2) = columns
+    minors = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
+    determinant = minors + low * (own11 + own22) + low * low
+    # C = L L^T; the rows of L^-1 [e1 e2]^T whiten the tangent plane.
+    l11 = dr.rsqrt(c11)
+    l22 = dr.sqrt(c11) * dr.rsqrt(determinant)
+    slope = c12 / c11
+    a = [p * l11 for p in e1]
+    b = [(q - slope * p) * l22 for p, q in zip(e1, e2, strict=True)]
+
+    d11, d22, d12 = dr.detach(c11), dr.detach(c22), dr.detach(c12)
+    largest = 0.5 * (d11 + d22 + dr.sqrt((d11 - d22) ** 2 + 4 * d12 * d12))
+    return Footprints(
+        direction=n,
+        whitened=(a, b),
+        radius=dr.atan(CUTOFF * dr.sqrt(largest)),
+        visible=dr.tile(visible, batch),
+        depth=exact,
+    )
+
+
+def centre_distance(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Distance of points in float64, detached."""
+    double: Any = dr.float64_array_t(type(a[0]))
+    x, y, z = (double(dr.detach(p)) - double(dr.detach(q)) for p, q in zip(a, b, strict=True))
+    return dr.sqrt(x * x + y * y + z * z)
+
+
+def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Indices of Gaussians from near to far; equal depths are ordered by x, then y, then z.
+
+    Args:
+        depth: array [n], metres.
+        position: three arrays [n]; they decide ties, so storage order does not.
+    """
+    order = dr.arange(dr.uint32_array_t(type(depth)), dr.width(depth))
+    # Stable sorts from the last key to the first.
+    for key in (position[2], position[1], position[0], depth):
+        order = dr.gather(type(order), order, dr.argsort(dr.gather(type(key), dr.detach(key), order)))
+    return order

@@ -1,0 +1,220 @@
+"""Projection, footprint and blending in float64 NumPy, written for reading.
+
+What the fast kernels are tested against: one loop over the Gaussians, no tiles, no culling. It fixes what
+the WRF-GS papers leave open:
+
+* the covariance is taken in the tangent plane at the Gaussian's direction and evaluated at each pixel's
+  unit vector through the central projection, so that neither the azimuth seam nor the zenith is special;
+* a Gaussian is skipped when its centre is nearer than ``NEAR_M``, and is otherwise treated like any other,
+  however large: it may contain the receiver;
+* equal depths are ordered by the centre's world coordinates, not by storage order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wrf_mi.core import Receiver, rotation_matrix
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.types import IntArray
+from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The Gaussians as a receiver sees them, in its own frame.
+
+    Attributes:
+        centre_m: shape [n, 3], metres.
+        depth_m: shape [n], distance of the centre.
+        direction: shape [n, 3], unit vector to the centre.
+        basis: shape [n, 2, 3], orthonormal vectors of the tangent plane: eastwards and towards the zenith.
+        covariance: shape [n, 2, 2], in that basis, radians squared, low-pass included.
+        order: the Gaussians that have a footprint, near to far.
+    """
+
+    centre_m: FloatArray
+    depth_m: FloatArray
+    direction: FloatArray
+    basis: FloatArray
+    covariance: FloatArray
+    order: IntArray
+
+
+def covariance_matrix(scale_m: ArrayLike, quaternion_xyzw: ArrayLike) -> FloatArray:
+    """Covariances [n, 3, 3] in m^2, R diag(s^2) R^T, of scales [n, 3] in metres and quaternions [n, 4].
+
+    Source: Kerbl et al., "3D Gaussian splatting" (2023), eq. 6.
+    """
+    turn = rotation_matrix(quaternion_xyzw)
+    return turn * np.asarray(scale_m, float)[:, None, :] ** 2 @ np.swapaxes(turn, -1, -2)
+
+
+def tangent_basis(direction: ArrayLike) -> FloatArray:
+    """Eastward and zenithward unit vectors [..., 2, 3] at unit vectors [..., 3]; east is +y at the poles."""
+    n = np.asarray(direction, float)
+    horizontal = np.hypot(n[..., 0], n[..., 1])
+    at_pole = horizontal == 0
+    safe = np.where(at_pole, 1.0, horizontal)
+    cosine, sine = np.where(at_pole, 1.0, n[..., 0] / safe), np.where(at_pole, 0.0, n[..., 1] / safe)
+    east = np.stack([-sine, cosine, np.zeros_like(sine)], axis=-1)
+    return np.stack([east, np.cross(n, east)], axis=-2)
+
+
+def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, receiver: Receiver) -> Projection:
+    """Project Gaussians onto a receiver's sphere of directions.
+
+    Args:
+        mean_m: shape [n, 3], world frame, metres.
+        scale_m: shape [n, 3], standard deviations along the Gaussian's axes, metres.
+        quaternion_xyzw: shape [n, 4], the Gaussian's axes to world.
+        receiver: pose of the receiver.
+
+    Returns:
+        The projection; its order leaves out Gaussians nearer than ``NEAR_M``.
+    """
+    mean = np.asarray(mean_m, float)
+    to_world = receiver.to_world
+    centre = (mean - receiver.position_m) @ to_world  # each row R^T (mu - x_rx)
+    # Of the offset as it is: turned into the receiver's frame, equal depths differ in the last digit.
+    depth = np.linalg.norm(mean - receiver.position_m, axis=-1)
+    near = depth < NEAR_M
+    direction = np.where(near[:, None], [1.0, 0.0, 0.0], centre / np.where(near, 1.0, depth)[:, None])
+    basis = tangent_basis(direction)
+    sigma = to_world.T @ covariance_matrix(scale_m, quaternion_xyzw) @ to_world
+    in_plane = basis @ sigma @ np.swapaxes(basis, -1, -2) / np.where(near, 1.0, depth)[:, None, None] ** 2
+    by_depth = np.lexsort((mean[:, 2], mean[:, 1], mean[:, 0], depth))
+    return Projection(
+        centre_m=centre,
+        depth_m=depth,
+        direction=direction,
+        basis=basis,
+        covariance=in_plane + LOW_PASS_RAD**2 * np.eye(2),
+        order=by_depth[~near[by_depth]],
+    )
+
+
+def footprint(projection: Projection, index: int, directions: FloatArray) -> FloatArray:
+    """Footprint G' in 0..1 of Gaussian ``index`` at unit vectors [..., 3] in the receiver's frame.
+
+    exp(-m^2 / 2) for a Mahalanobis distance m below ``CUTOFF``, else 0; m is taken in the tangent plane at
+    the point where the pixel's ray meets it (central projection).
+    """
+    if projection.depth_m[index] < NEAR_M:
+        return np.zeros(directions.shape[:-1])
+    cosine = directions @ projection.direction[index]
+    in_front = cosine > MIN_COSINE
+    point = directions @ projection.basis[index].T / np.where(in_front, cosine, 1.0)[..., None]
+    squared = np.einsum("...i,ij,...j->...", point, np.linalg.inv(projection.covariance[index]), point)
+    return np.where(in_front & (squared < CUTOFF**2), np.exp(-squared / 2), 0.0)
+
+
+def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLike) -> ComplexArray:
+    """WRF-GS: R = sum_i G'_i S_i prod_{j<i} (1 - G'_j (1 - delta_j)).
+
+    Args:
+        footprints: shape [n, ...], near to far.
+        signal: complex S, shape [n].
+        attenuation: complex delta, shape [n], magnitude at most 1.
+
+    Returns:
+        Complex, shape [...]: the received field at each direction.
+
+    Source: WRF-GS, eq. 12 and 13, where footprints are 0 or 1; G' interpolates between passing a Gaussian
+    by (factor 1) and crossing its centre (factor delta).
+    """
+    g = np.asarray(footprints, float)
+    received, passed = np.zeros(g.shape[1:], complex), np.ones(g.shape[1:], complex)
+    for g_i, s_i, delta_i in zip(g, np.asarray(signal), np.asarray(attenuation), strict=True):
+        received += g_i * s_i * passed
+        passed *= 1 - g_i * (1 - delta_i)
+    return received
+
+
+def blend_alpha(footprints: ArrayLike, signal: ArrayLike, opacity: ArrayLike) -> ComplexArray:
+    """WRF-GS+: R = sum_i S_i alpha_i prod_{j<i} (1 - alpha_j) with alpha_i = o_i G'_i.
+
+    Args:
+        footprints: shape [n, ...], near to far.
+        signal: complex S, static part and deviation together, shape [n].
+        opacity: real o, shape [n], in 0..1.
+
+    Returns:
+        Complex, shape [...]: the received field at each direction.
+
+    Source: WRF-GS+, complex-valued alpha blending.
+    """
+    g = np.asarray(footprints, float)
+    received, passed = np.zeros(g.shape[1:], complex), np.ones(g.shape[1:])
+    for g_i, s_i, o_i in zip(g, np.asarray(signal), np.asarray(opacity), strict=True):
+        alpha = o_i * g_i
+        received += s_i * alpha * passed
+        passed *= 1 - alpha
+    return received
+
+
+def render(
+    mean_m: ArrayLike,
+    scale_m: ArrayLike,
+    quaternion_xyzw: ArrayLike,
+    signal: ArrayLike,
+    receiver: Receiver,
+    directions: FloatArray,
+    *,
+    attenuation: ArrayLike | None = None,
+    opacity: ArrayLike | None = None,
+) -> ComplexArray:
+    """Complex field at a receiver; give ``attenuation`` for WRF-GS or ``opacity`` for WRF-GS+.
+
+    Args:
+        mean_m: shape [n, 3], world frame, metres.
+        scale_m: shape [n, 3], metres.
+        quaternion_xyzw: shape [n, 4].
+        signal: complex, shape [n].
+        receiver: pose of the receiver.
+        directions: unit vectors in the receiver's frame, [H, W, 3] as of ``core.pixel_directions``.
+        attenuation: complex delta, shape [n].
+        opacity: real, shape [n].
+
+    Returns:
+        Complex, shape [H, W].
+
+    Raises:
+        TypeError: neither or both of ``attenuation`` and ``opacity``.
+    """
+    if (attenuation is None) == (opacity is None):
+        raise TypeError("give either attenuation (WRF-GS) or opacity (WRF-GS+)")
+    seen = project(mean_m, scale_m, quaternion_xyzw, receiver)
+    footprints = np.array([footprint(seen, i, directions) for i in seen.order]).reshape(-1, *directions.shape[:-1])
+    sorted_signal = np.asarray(signal)[seen.order]
+    if opacity is not None:
+        return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[seen.order])
+    return blend_product(footprints, sorted_signal, np.asarray(attenuation)[seen.order])
+
+
+def paper_jacobian_covariance(centre_m: ArrayLike, covariance_m2: ArrayLike, height: int, width: int) -> FloatArray:
+    """The papers' form: J Sigma J^T of the equirectangular map at the centres, without any low-pass.
+
+    Args:
+        centre_m: shape [n, 3], receiver's frame, metres, not on the z axis.
+        covariance_m2: shape [n, 3, 3], receiver's frame.
+        height: rows over 90 degrees of elevation.
+        width: columns over 360 degrees of azimuth.
+
+    Returns:
+        Shape [n, 2, 2], axes (column, row), pixels squared. The column's variance grows as
+        1 / cos^2(elevation): the map stretches the azimuth, and J is its tangent at one point only.
+
+    Source: WRF-GS+, the projection model; Zwicker et al., "EWA splatting" (2002), for J Sigma J^T.
+    """
+    x, y, z = np.moveaxis(np.asarray(centre_m, float), -1, 0)
+    ground, distance = np.hypot(x, y), np.sqrt(x * x + y * y + z * z)
+    longitude = np.stack([-y, x, np.zeros_like(x)], axis=-1) / ground[:, None] ** 2
+    latitude = np.stack([-x * z, -y * z, ground**2], axis=-1) / (ground * distance**2)[:, None]
+    jacobian = np.stack([longitude * width / (2 * np.pi), latitude * height / (np.pi / 2)], axis=-2)
+    return jacobian @ np.asarray(covariance_m2, float) @ np.swapaxes(jacobian, -1, -2)

@@ -1,0 +1,279 @@
+"""Pixels in tiles, and for each tile the Gaussians that may reach it.
+
+A tile is `TILE_ROWS` x `TILE_COLUMNS` pixels and 16 lanes, the width of a vector register: each lane owns
+`LANE_ROWS` pixels of one column. All lanes of a register so walk the same list and hit the same Gaussian at the
+same time, what is read for it serves `LANE_ROWS` pixels, and its gradient is summed over them before it is
+stored. Measured at 300 Gaussians of 9 degrees, this is three times as fast as one pixel a lane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..backend.device import on_device
+from ..core import InputError
+from ..core.angles import azimuth_rad, elevation_rad
+from .footprint import Footprints
+
+LANE_ROWS = 5
+TILE_ROWS, TILE_COLUMNS = 2 * LANE_ROWS, 8
+LANES = TILE_ROWS * TILE_COLUMNS // LANE_ROWS
+
+RESERVED = 1 << 21
+"""Entries of lists for which there is room without counting, 8 MB: to count fewer takes longer than to list them."""
+
+
+@dataclass
+class Plane:
+    """The perception plane, in tile order, for one image size.
+
+    Attributes:
+        height: rows, over elevations 0 to 90 degrees.
+        width: columns, over the whole azimuth.
+        tile: tile of each lane, [lanes].
+        azimuth: cosine and sine of each lane's azimuth, [lanes] each.
+        elevation: for each of a lane's pixels, cosine and sine of the elevation, [lanes] each.
+        pixel: for each of a lane's pixels its row-major number, [lanes].
+        active: for each of a lane's pixels: False where it pads the plane to whole tiles, [lanes].
+        tile_row: first row of each tile, [tiles].
+        tile_column: first column of each tile, [tiles].
+    """
+
+    height: int
+    width: int
+    tile: dr.ArrayBase
+    azimuth: list[dr.ArrayBase]
+    elevation: list[list[dr.ArrayBase]]
+    pixel: list[dr.ArrayBase]
+    active: list[dr.ArrayBase]
+    tile_row: dr.ArrayBase
+    tile_column: dr.ArrayBase
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return dr.width(self.tile_row)
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes."""
+        return dr.width(self.tile)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.height * self.width
+
+
+@lru_cache(maxsize=16)
+def perception_plane(height: int, width: int, float_type: type) -> Plane:
+    """The perception plane of ``height`` x ``width`` pixels over the hemisphere, arrays of ``float_type``."""
+    index_type: Any = dr.uint32_array_t(float_type)
+    mask_type: Any = dr.mask_t(float_type)
+    down, across = -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
+    tile, lane = np.divmod(np.arange(down * across * LANES), LANES)
+    group, lane_column = np.divmod(lane, TILE_COLUMNS)
+    column = (tile % across) * TILE_COLUMNS + lane_column
+    rows = [(tile // across) * TILE_ROWS + group * LANE_ROWS + k for k in range(LANE_ROWS)]
+    inside = [(row < height) & (column < width) for row in rows]
+    column, rows = np.minimum(column, width - 1), [np.minimum(row, height - 1) for row in rows]
+    azimuth, elevation = azimuth_rad(width)[column], elevation_rad(height)
+    number = np.arange(down * across)
+    result = Plane(
+        height,
+        width,
+        tile=on_device(tile, index_type),
+        azimuth=[on_device(np.cos(azimuth), float_type), on_device(np.sin(azimuth), float_type)],
+        elevation=[[on_device(f(elevation)[r], float_type) for f in (np.cos, np.sin)] for r in rows],
+        pixel=[on_device(row * width + column, index_type) for row in rows],
+        active=[on_device(i, mask_type) for i in inside],
+        tile_row=on_device(number // across * TILE_ROWS, float_type),
+        tile_column=on_device(number % across * TILE_COLUMNS, float_type),
+    )
+    dr.eval(result)
+    return result
+
+
+@dataclass
+class TileLists:
+    """For each (transmitter, tile) the Gaussians that may reach it, from near to far.
+
+    Attributes:
+        index: columns ``b * n + i`` of the Gaussians, all lists behind each other.
+        length: number of entries of each list, [batch * tiles].
+        start: where each list begins, [batch * tiles]; None: list k begins at ``k * n``.
+    """
+
+    index: dr.ArrayBase
+    length: dr.ArrayBase
+    start: dr.ArrayBase | None = None
+
+    def begin(self, number: dr.ArrayBase, n: int) -> dr.ArrayBase:
+        """Where lists of these numbers begin, with ``n`` Gaussians of each transmitter."""
+        return number * n if self.start is None else dr.gather(type(number), self.start, number)
+
+
+def _boxes(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBase, ...]:
+    """First and last row, first column and column span of each footprint, in (fractional) pixels.
+
+    The box holds the spherical cap of the footprint's radius: half its azimuth span is
+    asin(sin radius / cos elevation), and all azimuths once the cap holds the zenith. It may start below
+    the horizon; the span wraps around the seam. A footprint that cannot be seen has an empty box.
+    """
+    x, y, z = (dr.detach(c) for c in footprints.direction)
+    radius = footprints.radius
+    elevation = dr.atan2(z, dr.sqrt(x * x + y * y))
+    low, high = elevation - radius, elevation + radius
+    ratio = dr.minimum(dr.sin(radius) * dr.rsqrt(dr.maximum(x * x + y * y, 1e-12)), 1)
+    half = dr.select(high >= 0.5 * dr.pi, dr.pi, dr.asin(ratio))
+    # A pixel of slack on each side covers rounding in these few lines.
+    to_row, to_column = 2 * height / dr.pi, width / (2 * dr.pi)
+    first_row = dr.select(footprints.visible, low * to_row - 1, height + TILE_ROWS)
+    return first_row, high * to_row + 1, (dr.atan2(y, x) - half) * to_column - 1, 2 * half * to_column + 2
+
+
+def _whole_plane(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBase, ...]:
+    """Boxes that reach every pixel, for what can be seen."""
+    whole: Any = dr.zeros(type(footprints.radius), dr.width(footprints.radius))
+    return dr.select(footprints.visible, whole, height + TILE_ROWS), whole + height, whole, whole + width
+
+
+def build_lists(
+    footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch: int, by_box: bool = True
+) -> TileLists:
+    """List the Gaussians of each tile in depth order.
+
+    Where room for every Gaussian in every tile takes more than `RESERVED` entries, entries are counted first, and there
+    is room for what is found alone. A function that Dr.Jit records cannot count: there, it is room for all.
+
+    Args:
+        footprints: of ``batch * n`` columns.
+        order: Gaussians from near to far, [n].
+        plane: the perception plane.
+        batch: number of transmitters.
+        by_box: list what may reach the tile alone. False lists all that can be seen: slower, the same image.
+
+    Raises:
+        InputError: more entries than 32 bits count.
+    """
+    index_type: Any = type(order)
+    float_type: Any = type(footprints.radius)
+    n = dr.width(order)
+    boxes = (_boxes if by_box else _whole_plane)(footprints, plane.height, plane.width)
+    # Every tile reads all boxes from near to far: in that order in memory, a million of them come from the cache.
+    entry = dr.arange(index_type, batch * n)
+    at = dr.gather(index_type, order, entry % n) + (entry // n) * n
+    boxes = tuple(dr.gather(float_type, box, at) for box in boxes)
+    dr.eval(boxes, order)
+    entries = batch * plane.tiles * n
+    if entries > RESERVED and not dr.flag(dr.JitFlag.FreezingScope):
+        return _counted(boxes, at, plane, batch)
+    index = dr.empty(index_type, _checked(entries))
+    length = _all_of(boxes, order, plane, batch, index)
+    dr.eval(index, length)
+    return TileLists(index, length)
+
+
+def _checked(entries: int) -> int:
+    if entries >= 2**32:
+        what = f"{entries} entries in the lists of tiles, where 32 bits count"
+        raise InputError(f"splatting: {what}; use fewer Gaussians, or fewer transmitters at once")
+    return entries
+
+
+def _beside(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase, width: dr.ArrayBase) -> Any:
+    """Whether a tile that begins at a column meets columns from ``first`` on, going right around the circle."""
+    ahead = column - first
+    ahead -= width * dr.floor(ahead / width)
+    return (ahead <= span) | (ahead + (TILE_COLUMNS - 1) >= width)
+
+
+@dr.syntax
+def _all_of(
+    boxes: tuple[dr.ArrayBase, ...], order: dr.ArrayBase, plane: Plane, batch: int, index: dr.ArrayBase
+) -> dr.ArrayBase:
+    """Length of each tile's list, [batch * tiles], after a look at all boxes; list k begins at ``k * n``."""
+    first_row, last_row, first_column, span = boxes
+    index_type, float_type = type(order), type(span)
+    n, tiles = dr.width(order), plane.tiles
+    slot = dr.arange(index_type, batch * tiles)
+    tile, column0 = slot % tiles, (slot // tiles) * n
+    row = dr.gather(float_type, plane.tile_row, tile)
+    column = dr.gather(float_type, plane.tile_column, tile)
+    width, start = float_type(plane.width), slot * n
+    length, k = dr.zeros(index_type, batch * tiles), index_type(0)
+    while k < n:
+        i = column0 + k
+        hit = (dr.gather(float_type, first_row, i) <= row + (TILE_ROWS - 1)) & (
+            dr.gather(float_type, last_row, i) >= row
+        )
+        hit &= _beside(column, dr.gather(float_type, first_column, i), dr.gather(float_type, span, i), width)
+        dr.scatter(index, column0 + dr.gather(index_type, order, k, hit), start + length, hit)
+        length = dr.select(hit, length + 1, length)
+        k += 1
+    return length
+
+
+def _counted(boxes: tuple[Any, ...], at: Any, plane: Plane, batch: int) -> TileLists:
+    """Lists with as much room as they need: of each row of tiles first, then of its tiles, counted and filled.
+
+    Args:
+        boxes: of all columns, each transmitter's from near to far.
+        at: column ``b * n + i`` of each, [batch * n].
+        plane: the perception plane.
+        batch: number of transmitters.
+    """
+    index_type: Any = type(at)
+    n = dr.width(at) // batch
+    rows, row_of = np.unique(plane.tile_row.numpy(), return_inverse=True)
+    parts, starts, total = [], [], 0
+    for row in rows:
+        hit = (boxes[0] <= float(row) + (TILE_ROWS - 1)) & (boxes[1] >= float(row))
+        parts.append(dr.compress(hit))
+        each = dr.block_sum(dr.select(hit, index_type(1), 0), n).numpy().astype(np.int64)
+        starts.append(total + np.cumsum([0, *each]))
+        total = int(starts[-1][-1])
+    members = dr.concat([index_type(p) for p in parts]) if _checked(total) else dr.zeros(index_type, 1)
+    begin = np.array([s[:-1] for s in starts]).T[:, row_of].ravel()
+    end = np.array([s[1:] for s in starts]).T[:, row_of].ravel()
+    walk = members, on_device(begin, index_type), on_device(end, index_type)
+    dr.eval(walk)
+    length = _of_rows(boxes, at, plane, walk, None, None)
+    dr.eval(length)
+    counts = length.numpy().astype(np.int64)
+    start = on_device(np.cumsum(counts) - counts, index_type)
+    index = dr.empty(index_type, max(_checked(int(counts.sum())), 1))
+    length = _of_rows(boxes, at, plane, walk, index, start)
+    dr.eval(index, length)
+    return TileLists(index, length, start)
+
+
+@dr.syntax
+def _of_rows(
+    boxes: tuple[dr.ArrayBase, ...],
+    at: dr.ArrayBase,
+    plane: Plane,
+    walk: tuple[dr.ArrayBase, ...],
+    index: dr.ArrayBase | None,
+    start: dr.ArrayBase | None,
+) -> dr.ArrayBase:
+    """Length of each tile's list, [batch * tiles], after a look at those of its row; with ``index`` the lists too."""
+    members, begin, end = walk
+    index_type, float_type = type(at), type(boxes[0])
+    slot = dr.arange(index_type, dr.width(begin))
+    column = dr.gather(float_type, plane.tile_column, slot % plane.tiles)
+    width = float_type(plane.width)
+    length, k, last = dr.zeros(index_type, dr.width(begin)), index_type(begin), index_type(end)
+    while k < last:
+        i = dr.gather(index_type, members, k)
+        hit = _beside(column, dr.gather(float_type, boxes[2], i), dr.gather(float_type, boxes[3], i), width)
+        if dr.hint(index is not None, mode="scalar"):
+            dr.scatter(index, dr.gather(index_type, at, i, hit), start + length, hit)
+        length = dr.select(hit, length + 1, length)
+        k += 1
+    return length

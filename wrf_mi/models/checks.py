@@ -1,0 +1,143 @@
+"""Data that a model does not serve, and inputs that it cannot predict from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+import numpy as np
+
+from ..core import InputError, Record
+from ..core.carriers import carriers_text
+from ..datasets.observations import count_not_finite, place_of
+from ..tasks import task_of
+from .method import Inputs
+
+
+class Served(Protocol):
+    """What these checks know of a model or `Method`."""
+
+    @property
+    def name(self) -> str:
+        """As in ``wrf-mi train --model``."""
+        ...
+
+    @property
+    def tasks(self) -> tuple[str, ...] | None:
+        """Tasks that it serves; None: all."""
+        ...
+
+    @property
+    def several_carriers(self) -> bool:
+        """Whether it serves rows of several carriers."""
+        ...
+
+    @property
+    def needs_uplink(self) -> bool:
+        """Whether it predicts from the uplink alone."""
+        ...
+
+    def serves(self, task: str) -> bool:
+        """Whether it serves a task."""
+        ...
+
+
+def check_record(method: Served, record: Record, others: Iterable[Served] = ()) -> None:
+    """Refuse a record that a method does not serve, or whose parts do not fit together.
+
+    Args:
+        method: that is to be fitted.
+        record: to this.
+        others: methods to be named where it does not serve.
+
+    Raises:
+        InputError: another task; no uplink for a method that needs one; rows of several carriers for a method that
+            serves one; numbers of rows, antennas, subcarriers and frequencies that differ; carriers, numbers of
+            readings or standard deviations that do not fit the observations.
+    """
+    if not method.serves(record.task):
+        *most, last = method.tasks or ("nothing",)
+        served = f"{', '.join(most)} and {last}" if most else last
+        able = [other.name for other in others if other.serves(record.task)]
+        named = f": {', '.join(able)}" if able else ""
+        text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
+        raise InputError(f"{place_of(record)}: {text}")
+    if method.needs_uplink and record.uplink is None:
+        raise InputError(
+            f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
+        )
+    check_parts(record)
+    if record.carriers_hz is not None and not method.several_carriers:
+        able = [one.name for one in others if one.several_carriers and one.serves(record.task)]
+        named = f" ({', '.join(able)})" if able else ""
+        text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
+        raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
+
+
+def check_parts(record: Record) -> None:
+    """Refuse a record whose parts do not fit together.
+
+    Raises:
+        InputError: as `check_record`, whatever the method.
+    """
+    task_of(record).check(record)
+    _check_carriers(record)
+    _check_noise(record)
+
+
+def _check_carriers(record: Record) -> None:
+    """Refuse carriers of rows that do not fit the rest of a record."""
+    carriers, place = record.carriers_hz, place_of(record)
+    if carriers is None:
+        return
+    if record.frequencies_hz is not None or task_of(record).is_complex:
+        text = "carriers_hz belongs to spectra and signal strengths without frequencies_hz"
+        raise InputError(f"{place}: {text}; set one of the two to None, or make a record for each carrier")
+    if carriers.shape != (len(record),) or not (np.isfinite(carriers) & (carriers > 0)).all():
+        raise InputError(f"{place}: carriers_hz {list(carriers.shape)}; give {len(record)} positive frequencies in Hz")
+
+
+def _check_noise(record: Record) -> None:
+    """Refuse numbers of readings and standard deviations that do not fit the observations."""
+    stated = {"n_readings": record.n_readings, "std": record.std}
+    for name, values in stated.items():
+        if values is None:
+            continue
+        if not task_of(record).in_decibel:
+            text = f"{name} belongs to signal strengths, not to {record.task}"
+            raise InputError(f"{place_of(record)}: {text}; set Record.{name} to None")
+        if values.shape != record.observation.shape:
+            text = f"{name} {list(values.shape)} beside observations {list(record.observation.shape)}"
+            raise InputError(f"{place_of(record)}: {text}; give one for each receiver and row")
+        wrong = np.argwhere(np.isfinite(record.observation) & ~((values > 0) & np.isfinite(values)))
+        if len(wrong):
+            receiver, row = wrong[0]
+            where = f"{place_of(record)}, receiver {record.receivers[receiver].name}, row {row}"
+            raise InputError(f"{where}: {name} is {values[receiver, row]:g}; give a number above 0 where it received")
+
+
+def check_inputs(inputs: Inputs, record: Record, method: Served) -> None:
+    """Refuse inputs that a model fitted to a record cannot predict from.
+
+    Raises:
+        InputError: no uplink for a method that needs one, another number of antennas or subcarriers, or values that
+            are not finite.
+    """
+    if record.uplink is None and inputs.uplink is not None:
+        raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; leave uplink away")
+    if inputs.uplink is None:
+        if method.needs_uplink:
+            form = "uplink [m, antennas, subcarriers], in the file of `predict --input`"
+            raise InputError(f"{method.name}: predicts from the uplink; give {form}")
+        return
+    assert record.uplink is not None
+    antennas, subcarriers = record.uplink.shape[1:]
+    if inputs.uplink.shape != (len(inputs), antennas, subcarriers):
+        raise InputError(
+            f"{method.name}: uplink {list(inputs.uplink.shape)}; fitted to {antennas} antennas and {subcarriers} "
+            f"subcarriers, so give [{len(inputs)}, {antennas}, {subcarriers}]"
+        )
+    bad = np.flatnonzero(~np.isfinite(inputs.uplink.reshape(len(inputs), -1)).all(axis=1))
+    if len(bad):
+        row = inputs.uplink[bad[0]].ravel()
+        raise InputError(f"{method.name}: uplink, row {bad[0]}: {count_not_finite(row)}; correct or remove the row")

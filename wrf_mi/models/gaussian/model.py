@@ -1,0 +1,199 @@
+"""The models of 3D Gaussians: ``wrf-gs``, ``wrf-gs+`` and ``factorised``, trained step by step for every task.
+
+With a scene its paths are trained in the same graph (`wrf_mi.graph.graph`); without Gaussians they are so alone, which
+is how `wrf_mi.models.ray_tracing` is calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, replace
+from functools import cache, cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
+from ...graph.graph import Graph
+from ...graph.receivers import Form
+from ...tasks import TASKS
+from ...tasks.conditions import placed_receivers
+from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
+from ...training.config import PATHS_ALONE, PRESETS, TrainConfig, task_settings
+from ...training.fields import make_field
+from ...training.initial import initial_gaussians
+from ...training.loop import Progress
+from ...training.packed import pack_params, unpack_params
+from ...training.predictor import Predictor
+from ...training.reach import Reach
+from ...training.state import FitState
+from ...training.targets import form_of, plan_rows, targets_of
+from ...training.trainer import Trainer
+from ..method import Inputs
+from ..model import Arrays, Fitted, Model, Problem, Session
+
+SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
+PARAM = "param/"
+"""Prefix of a parameter's array in ``model.npz``."""
+
+Params = dict[str, NDArray[np.float32]]
+
+
+class FittedField(Fitted):
+    """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
+
+    Args:
+        arrays: from `arrays`.
+        config: settings of the training.
+        problem: data and scene.
+        store: folder in which operators are kept (`wrf_mi.training.static_operator`).
+
+    Attributes:
+        config: settings of the training.
+        params: parameters by name.
+        form: what observations are made of.
+        field: the model, see `wrf_mi.gaussians`; None: paths alone.
+    """
+
+    def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
+        self._arrays, self._problem, self._store = arrays, problem, store
+        self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
+        alone = config.model == PATHS_ALONE
+        self.field = None if alone else make_field(config, self.form.components, self.form.features)
+        own = {key.removeprefix(PARAM): values for key, values in arrays.items() if key.startswith(PARAM)}
+        self.params: Params = own or unpack_params(arrays)
+        self.uses_heading = self.form.headings
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """``predictor(tx_pos_m, receiver)`` gives spectra [m, H, W], powers [m] or channels [m, ...]."""
+        form, config, antenna = self.form, self.config, Antenna(*map(str, self._arrays["tx_antenna"]))
+        assert self.receivers is not None
+        scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
+        graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
+        ends = self.field, self.params, self.receivers, *form.size, config.skip
+        reach = _reach(self._arrays)
+        return Predictor(*ends, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """See `Fitted`."""
+        heading = inputs.tx_heading_rad if self.uses_heading else None
+        return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading))
+
+    def arrays(self) -> Arrays:
+        """See `Fitted`."""
+        return self._arrays
+
+    def facts(self) -> dict[str, Any]:
+        """Steps of the training and number of Gaussians."""
+        gaussians = {} if self.field is None else {"gaussians": int(self.params["position"].shape[1])}
+        return {"steps": self.config.steps} | gaussians
+
+    def packed(self, params: Params, precision: str) -> Arrays:
+        """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
+        ends = {key: v for key, v in self._arrays.items() if not key.startswith((PARAM, "packed_"))}
+        return ends | pack_params(params, precision)
+
+
+def _reach_arrays(reach: Reach | None) -> Arrays:
+    if reach is None:
+        return {}
+    counts = np.array([len(known) for known in reach.known_m])
+    return {"reach_m": np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
+
+
+def _reach(arrays: Arrays) -> Reach | None:
+    if "reach_m" not in arrays:
+        return None
+    ends = np.cumsum(arrays["known_counts"])[:-1]
+    return Reach(tuple(np.split(arrays["known_m"], ends)), float(arrays["reach_m"]))
+
+
+def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
+    """What `FittedField.arrays` described; operators are stored in the folder (`wrf_mi.training.static_operator`)."""
+    return FittedField(arrays, problem.settings, problem, folder)
+
+
+def fit(problem: Problem, split: Split, session: Session) -> FittedField:
+    """Train from the last checkpoint, or from the start, to the last step.
+
+    Raises:
+        Interrupted: stopped between two steps; the checkpoint is written.
+        NumericsError: a value that is not finite.
+    """
+    folder, record, config = session.folder, problem.record, problem.settings
+    stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
+    state = None if stored is None else FitState.from_arrays(stored)
+    trainer = Trainer(record, split, config, state=state, scene=problem.opened_scene)
+    trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
+    cut_log(folder, trainer.state.step)
+
+    def heard(progress: Progress) -> None:
+        append_log(folder, progress)
+        session.listen(session.fold or "training", progress.step / config.steps, progress)
+
+    if not trainer.run(heard, lambda: write_checkpoint(folder, trainer), session.stop):
+        raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
+    arrays: Arrays = {
+        **{f"{PARAM}{name}": values for name, values in trainer.state.mean_params().items()},
+        **trainer.graph.form.arrays(),
+        "tx_antenna": np.asarray(astuple(record.tx_antenna)),
+        **receiver_arrays(trainer.graph.receivers),
+        **_reach_arrays(trainer.reach()),
+    }
+    fitted = load(arrays, problem, folder)
+    fitted.train_seconds = trainer.seconds
+    return fitted
+
+
+def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
+    """Settings with number of steps and scale of transmitters resolved."""
+    config: TrainConfig = problem.settings
+    return config.resolved(problem.record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
+
+
+def check(problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse settings, files and scenes that a training would refuse."""
+    record = problem.record
+    scene = None if problem.scene is None else problem.opened_scene
+    for rows in splits:
+        known = rows.all_train
+        config = problem.settings.resolved(record.tx_pos_m[known])
+        targets = targets_of(record, known, scene is not None)
+        form = form_of(record, config, targets, known, scene is not None)
+        receivers = placed_receivers(record, by_uplink=bool(form.features))
+        field = None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)
+        Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
+        plan_rows(config, targets, rows, field is not None and scene is not None)
+        drawn = np.random.default_rng([config.seed, 0])
+        initial_gaussians(config.initial, replace(record, receivers=receivers), rows.train, drawn)
+
+
+@cache
+def _by_data(name: str, task: str, with_scene: bool) -> Model:
+    """The entry for a task: its settings begin with others, and spectra are complete."""
+    image = TASKS[task].image
+    return replace(_entry(name), defaults=task_settings(task, image, with_scene), complete=image, by_data=None)
+
+
+def _entry(name: str) -> Model:
+    return Model(
+        name,
+        ("spectrum", "rssi", "csi"),
+        TrainConfig,
+        fit,
+        load,
+        SOURCE,
+        scene="optional",
+        uplink="optional",
+        given=("model", "seed", "deterministic", "receiver", "evaluation"),
+        presets=PRESETS,
+        check=check,
+        prepare=prepare,
+        by_data=partial(_by_data, name),
+    )
+
+
+WRF_GS, WRF_GS_PLUS, FACTORISED = _entry("wrf-gs"), _entry("wrf-gs+"), _entry("factorised")

@@ -1,0 +1,1 @@
+"""Interpolation of the training rows: IDW, kriging, trees and the path-loss law."""

@@ -1,0 +1,307 @@
+"""Kriging: the best linear interpolation of the measurements under a stated covariance.
+
+An observation is a trend, a smooth field of zero mean and noise: y(x) = b(x) . beta + z(x) + e with
+Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared by all components of an observation
+(pixels, subcarriers), so that one Cholesky factor serves all of them; the variance s^2 and the trend are each
+component's own. Written over `wrf_mi.models.interpolation.kriging_equations` and not over scikit-learn's
+`GaussianProcessRegressor`, which has no trend, and whose likelihood stores a matrix of rows x rows for each component
+(6 GiB for 160 spectra).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.linalg import LinAlgError
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+
+from wrf_mi.core import InputError, Prediction
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.models.interpolation.kriging_equations import KERNELS, KrigingSystem, component_root, correlation
+
+Trend = Callable[[FloatArray], FloatArray]
+"""From positions [n, 3] to the columns [n, p] that the trend is a sum of."""
+
+LENGTH_M = (0.01, 100.0)
+HEADING_LENGTH = (0.1, 100.0)
+NOISE = (1e-4, 10.0)
+"""Where the likelihood looks: metres, chords of the unit circle (2 is the opposite heading), shares of the variance."""
+LIKELIHOOD_EVALUATIONS = 200
+"""Nelder-Mead on three logarithms settles to 0.01 in 60 to 150."""
+
+
+def constant(positions_m: FloatArray) -> FloatArray:
+    """Trend of one unknown mean."""
+    return np.ones((len(positions_m), 1))
+
+
+def log_distance(receiver_m: ArrayLike) -> Trend:
+    """Trend of the log-distance law a + b 10 log10(d), d the distance in metres from a receiver at [3].
+
+    Source: Rappaport, "Wireless Communications" (2002), section 4.9.
+    """
+    origin = np.asarray(receiver_m, float)
+
+    def columns(positions_m: FloatArray) -> FloatArray:
+        # Below 1 cm no antenna is a point; the logarithm must not diverge on a transmitter at the receiver.
+        distance = np.maximum(np.linalg.norm(positions_m - origin, axis=1), 0.01)
+        return np.stack([np.ones(len(distance)), 10 * np.log10(distance)], axis=1)
+
+    return columns
+
+
+@dataclass(frozen=True)
+class KrigedMean:
+    """What a fitted kriging predicts: a trend and weights of the training rows' correlations.
+
+    Attributes:
+        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+        lengths: correlation length in metres, and over headings where there are any.
+        positions_m: of the rows [n, 3].
+        circle: cosine and sine of their headings [n, 2], or None.
+        coefficients: of the trend's columns for each component [p, q].
+        weights: of the rows for each component [n, q].
+        like: empty array of the shape and type of observations, [0, ...].
+        trend: columns of the trend.
+    """
+
+    kernel: str
+    lengths: FloatArray
+    positions_m: FloatArray
+    circle: FloatArray | None
+    coefficients: NDArray[np.inexact]
+    weights: NDArray[np.inexact]
+    like: NDArray[np.inexact]
+    trend: Trend
+
+    def correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
+        """Correlations [m, n] of positions [m, 3] with the rows.
+
+        Raises:
+            InputError: headings that the fit did not have, or the other way round.
+        """
+        if (tx_heading_rad is None) != (self.circle is None):
+            had = "no headings" if self.circle is None else "headings"
+            raise InputError(f"kriging: fitted with {had}; predict with the same")
+        turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
+        asked = _coordinates(positions_m, turned, self.lengths)
+        return correlation(asked, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
+
+    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
+        """As `Kriging.predict`."""
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        cross = self.correlations(positions, tx_heading_rad)
+        mean = self.trend(positions) @ self.coefficients + cross @ self.weights
+        return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All but the trend."""
+        circle = np.zeros((0, 2)) if self.circle is None else self.circle
+        names = ("lengths", "positions_m", "coefficients", "weights", "like")
+        return {"kernel": np.asarray(self.kernel), "circle": circle} | {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], trend: Trend) -> KrigedMean:
+        """What `arrays` returned, with the trend."""
+        names = ("lengths", "positions_m", "coefficients", "weights", "like")
+        circle = arrays["circle"] if len(arrays["circle"]) else None
+        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **{name: arrays[name] for name in names})
+
+
+class Kriging:
+    """Kriging of real or complex observations over positions and, if given, headings.
+
+    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). What is None is
+    chosen by the likelihood of the training rows, in which the variance takes its best value; it is the restricted one,
+    of what the joint trend leaves free: else a trend for each component would shorten the lengths.
+
+    Args:
+        length_m: correlation length in metres, or None.
+        noise: variance of the noise as a share of the field's, or None.
+        heading_length: correlation length over headings, in chords of the unit circle, or None; unused without.
+        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+        trend: columns of the trend; one unknown mean by default.
+        trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
+            kriging), which a crowd of rows in one place pulls to itself.
+        likelihood_rows: at most so many rows, drawn with ``seed``, enter the likelihood; all of them the prediction.
+        seed: of that draw.
+    """
+
+    def __init__(
+        self,
+        length_m: float | None = None,
+        noise: float | None = None,
+        heading_length: float | None = None,
+        kernel: str = "exponential",
+        trend: Trend = constant,
+        trend_fit: Literal["gls", "ols"] = "gls",
+        likelihood_rows: int = 1000,
+        seed: int = 0,
+    ) -> None:
+        for what, value in (("length", length_m), ("heading length", heading_length), ("noise", noise)):
+            zero = what == "noise"
+            if value is not None and not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
+                raise InputError(f"kriging: {what} {value}; choose a finite number above 0, or None to have it chosen")
+        if kernel not in KERNELS or trend_fit not in ("gls", "ols"):
+            known = f"choose a kernel of {', '.join(KERNELS)} and gls or ols"
+            raise InputError(f"kriging: kernel {kernel!r}, trend by {trend_fit!r}; {known}")
+        if likelihood_rows < 2:
+            raise InputError(f"kriging: likelihood of {likelihood_rows} rows; choose 2 or more")
+        self.length_m, self.noise, self.heading_length = length_m, noise, heading_length
+        self.kernel, self.trend, self.trend_fit = kernel, trend, trend_fit
+        self.likelihood_rows, self.seed = likelihood_rows, seed
+
+    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
+        """Choose what is to be chosen and factor the covariance of the rows that were observed.
+
+        Args:
+            tx_pos: shape [n, 3], metres.
+            observation: shape [n, ...], real or complex; rows with NaN, where nothing was received, are left out.
+            tx_heading_rad: shape [n], or None to leave headings out.
+
+        Raises:
+            InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
+                or rows that coincide while the noise is zero.
+        """
+        positions, values = np.asarray(tx_pos, float), np.asarray(observation)
+        heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
+        if not (0 < len(positions) == len(values)) or (heading is not None and len(heading) != len(values)):
+            counts = f"{len(positions)} positions and {len(values)} observations"
+            raise InputError(f"{counts}: give one (and one heading, if any) per row, at least one")
+        observed = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
+        if not observed.any():
+            raise InputError(f"{len(values)} training rows: none of them was received; use another split")
+        like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
+        wide = complex if np.iscomplexobj(values) else float
+        y = values[observed].reshape(int(observed.sum()), -1).astype(wide)
+        self._positions = positions[observed]
+        self._circle = None if heading is None else _circle(heading[observed])
+        columns = self.trend(self._positions)
+        if len(y) < columns.shape[1]:
+            raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
+        start = 0
+        if self.trend_fit == "ols":
+            # The field is what the least-squares trend leaves; taken as known from here on.
+            coefficients = np.linalg.lstsq(columns, y, rcond=None)[0]
+            start = columns @ coefficients
+            columns = columns[:, :0]
+        self._lengths, self.chosen_noise = self._choose(y - start, columns)
+        try:
+            self._system = self._factored(slice(None), columns, self._lengths, self.chosen_noise)
+        except LinAlgError:
+            raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
+        field = y - start
+        beta = self._system.coefficients(field)
+        weights = self._system.weights(field, beta)
+        self.mean = KrigedMean(
+            self.kernel,
+            self._lengths,
+            self._positions,
+            self._circle,
+            beta if self.trend_fit == "gls" else coefficients,
+            weights,
+            like,
+            self.trend,
+        )
+        quadratic = (field.conj() * weights).real.sum(axis=0)
+        # The trend's own degrees of freedom leave the residual too small by their share.
+        self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
+        return self
+
+    @property
+    def chosen(self) -> dict[str, float]:
+        """Length in metres, noise as a share of the variance, and the heading's length where there is one."""
+        names = ("length_m", "heading_length")
+        return dict(zip(names, map(float, self._lengths), strict=False)) | {"noise": float(self.chosen_noise)}
+
+    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
+        """Interpolate.
+
+        Args:
+            tx_pos: shape [m, 3], metres.
+            tx_heading_rad: shape [m], if and only if the fit had headings.
+
+        Returns:
+            Shape [m, ...], in the observations' unit and type.
+
+        Raises:
+            InputError: headings that the fit did not have, or the other way round.
+        """
+        return self.mean.predict(tx_pos, tx_heading_rad)
+
+    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
+        """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
+
+        The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
+        """
+        mean = self.predict(tx_pos, tx_heading_rad)
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        cross = self.mean.correlations(positions, tx_heading_rad)
+        columns = self.trend(positions)[:, : self._system.trend.shape[1]]
+        share = self._system.variance(1.0, cross, columns) + self.chosen_noise
+        std = np.sqrt(share)[:, None] * np.sqrt(self._variance)
+        return Prediction(mean, std.reshape(mean.shape))
+
+    def _factored(
+        self, rows: slice | NDArray[np.intp], columns: FloatArray, lengths: FloatArray, noise: float
+    ) -> KrigingSystem:
+        circle = None if self._circle is None else self._circle[rows]
+        x = _coordinates(self._positions[rows], circle, lengths)
+        return KrigingSystem(correlation(x, x, self.kernel), noise, columns[rows])
+
+    def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
+        """Lengths and noise: as given, or of the greatest likelihood."""
+        given = [self.length_m, *([] if self._circle is None else [self.heading_length]), self.noise]
+        limits = np.log([LENGTH_M, *([] if self._circle is None else [HEADING_LENGTH]), NOISE])
+        free = np.array([value is None for value in given])
+        value = np.array([0.0 if v is None else v for v in given])
+        if not free.any():
+            return value[:-1], float(value[-1])
+        rows = np.arange(len(field))
+        if len(rows) > self.likelihood_rows:
+            rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
+        root = component_root(field[rows])
+        if not root.any():
+            raise InputError("kriging: all observations are zero; give length and noise instead of None")
+
+        def objective(logarithm: FloatArray) -> float:
+            """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
+            value[free] = np.exp(logarithm)
+            try:
+                system = self._factored(rows, columns, value[:-1], float(value[-1]))
+            except LinAlgError:
+                return np.inf
+            return system.restricted_cost(root, np.finfo(float).tiny) / 2
+
+        start = self._start(rows)[free]
+        simplex = np.concatenate([start[None], start + np.eye(len(start))])
+        best = minimize(
+            objective,
+            start,
+            method="Nelder-Mead",
+            bounds=limits[free],
+            options={"initial_simplex": simplex, "maxfev": LIKELIHOOD_EVALUATIONS, "xatol": 0.01, "fatol": 0.01},
+        )
+        value[free] = np.exp(best.x)
+        return value[:-1], float(value[-1])
+
+    def _start(self, rows: NDArray[np.intp]) -> FloatArray:
+        """Logarithms to begin from: a tenth of the extent, a chord of one, a tenth of the variance."""
+        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
+        length = np.clip(extent / 10, *LENGTH_M)
+        return np.log([length, *([] if self._circle is None else [1.0]), 0.1])
+
+
+def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: FloatArray) -> FloatArray:
+    """Positions and headings in correlation lengths."""
+    scaled = positions_m / lengths[0]
+    return scaled if circle is None else np.concatenate([scaled, circle / lengths[1]], axis=1)
+
+
+def _circle(heading_rad: ArrayLike) -> FloatArray:
+    heading = np.asarray(heading_rad, float)
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)

@@ -1,0 +1,1 @@
+"""Neural networks from the transmitter position to an observation: VAE, DCGAN and NeRF2."""

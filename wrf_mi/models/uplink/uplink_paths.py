@@ -1,0 +1,178 @@
+"""Propagation paths of an uplink by greedy search and nonlinear least squares, many rows at once.
+
+Paths are found one after the other where the matched filter of what is left is greatest, and after each one all paths
+found so far are refined together (Levenberg and Marquardt). A row takes no further path once the Bayesian information
+criterion of complex white noise of unknown power, 2 N log(residual energy) + freedom log(2 N) for N coefficients,
+would rise: the noise ends the search, no threshold does.
+
+Source: Vasisht et al. (2016), sections 5.2 to 5.4 (search on a grid, then refinement, paths added one by one until the
+residual tells no more); Mamandipoor et al., "Newtonized orthogonal matching pursuit" (2016) (refinement after each
+path); Schwarz, "Estimating the dimension of a model" (1978) (criterion).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ...core.angles import FloatArray
+from .uplink_waves import Complex, Mask, Solved, Waves, strongest
+
+T = TypeVar("T")
+
+ROWS = 16
+"""Rows refined together: more leave the processor's cache."""
+ALONE = 4
+"""Steps of refinement of a new path before all are refined."""
+ACCURACY = 1e-26
+"""Share of the energy, the square of what float64 resolves times what sums lose, at which a fit is perfect."""
+SETTLED = 1e-9
+"""Relative fall of the residual's energy below which a refinement is done."""
+
+
+@dataclass
+class Paths:
+    """Paths of n rows.
+
+    Attributes:
+        theta: parameters [n, k, p], see `Waves`.
+        present: which of the k a row has, [n, k].
+        gains: [n, k] or [n, k, antennas].
+    """
+
+    theta: FloatArray
+    present: Mask
+    gains: Complex
+
+
+def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
+    """Paths of uplinks [n, antennas, f].
+
+    Args:
+        waves: wave model.
+        h: coefficients, finite.
+        max_paths: most paths of a row.
+        between: steps of refinement after each path.
+        final: steps after the last.
+    """
+    return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final), len(h)))
+
+
+def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
+    """Paths of uplinks [n, antennas, f] from a start: parameters [n, k, p], which of them to use [n, k]."""
+    return join_paths(in_parts(lambda rows: _finish(waves, h[rows], theta[rows], present[rows], steps), len(h)))
+
+
+def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
+    """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use.
+
+    Products run on one thread each: those of the BLAS wait for each other by spinning, and where another process has
+    a processor the fit of a row then takes seconds.
+    """
+    parts = [slice(start, start + ROWS) for start in range(0, count, ROWS)]
+    affinity = getattr(os, "sched_getaffinity", None)
+    workers = len(affinity(0)) if affinity else os.cpu_count() or 1
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(workers, len(parts)))) as pool:
+        return list(pool.map(work, parts))
+
+
+def join_paths(parts: list[Paths]) -> Paths:
+    """Paths of all rows, as many a row as the longest part has."""
+    most = max(part.present.shape[1] for part in parts)
+
+    def padded(part: Paths, name: str) -> np.ndarray:
+        values = getattr(part, name)
+        missing = most - values.shape[1]
+        # Parameters of an absent path repeat another's, so that they are defined.
+        filler = values[:, :1] if name == "theta" else np.zeros_like(values[:, :1])
+        return np.concatenate([values, np.repeat(filler, missing, axis=1)], axis=1)
+
+    return Paths(*(np.concatenate([padded(part, name) for part in parts]) for name in ("theta", "present", "gains")))
+
+
+def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
+    n, count = len(h), h.shape[1] * h.shape[2]
+    energy = np.square(np.abs(h)).sum(axis=(1, 2))
+    # A dead antenna array has no paths; its row is predicted as zero.
+    active = np.flatnonzero(energy > 0)
+    theta: FloatArray = np.zeros((n, 0, 1 + waves.cosines.shape[1]))
+    present: Mask = np.zeros((n, 0), bool)
+    best = energy.copy()
+    residual = h
+    for number in range(max_paths):
+        # A row that has stopped keeps its first path's parameters, masked, as a place holder that is defined.
+        fresh = strongest(waves, residual) if number == 0 else theta[:, 0].copy()
+        if number:
+            fresh[active] = strongest(waves, residual[active])
+        # One path alone costs little, and starts the refinement of all much nearer to its end.
+        lonely = np.ones((len(active), 1), bool)
+        fresh[active] = refine(waves, residual[active], fresh[active][:, None], lonely, ALONE)[0][:, 0]
+        theta = np.concatenate([theta, fresh[:, None]], axis=1)
+        present = np.concatenate([present, np.zeros((n, 1), bool)], axis=1)
+        trial = present[active]
+        trial[:, -1] = True
+        refined, solved = refine(waves, h[active], theta[active], trial, between)
+        left = solved.energy
+        floor = ACCURACY * energy[active]
+        gain = 2 * count * np.log(np.maximum(best[active], floor) / np.maximum(left, floor))
+        better = gain > waves.freedom * np.log(2 * count)
+        kept = active[better]
+        theta[kept], present[kept], best[kept] = refined[better], True, left[better]
+        if number == 0:
+            residual = h.copy()
+        residual[kept] = solved.residual[better]
+        active = kept[best[kept] > ACCURACY * energy[kept]]
+        if not len(active):
+            break
+    return _finish(waves, h, theta, present, final)
+
+
+def _finish(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
+    """Refine, then settle the gains: a path is not stronger than the whole channel, which holds back close pairs."""
+    count = h.shape[1] * h.shape[2]
+    theta, solved = refine(waves, h, theta, present, steps)
+    power = np.square(np.abs(h)).mean(axis=(1, 2))
+    free = np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
+    ridge = solved.energy / free / np.maximum(power, np.finfo(float).tiny)
+    gains = waves.solve(theta, present, h, ridge).gains
+    return Paths(theta, present, gains)
+
+
+def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> tuple[FloatArray, Solved]:
+    """Levenberg and Marquardt's steps on all paths of each row; a step that raises the residual is taken back."""
+    theta, solved = theta.copy(), waves.solve(theta, present, h)
+    damping = np.full(len(h), 1e-3)
+    energy, whole = solved.energy, np.square(np.abs(h)).sum(axis=(1, 2))
+    active = np.flatnonzero(energy > ACCURACY * whole)
+    for _ in range(steps):
+        if not len(active):
+            break
+        now = Solved(*(getattr(solved, name)[active] for name in ("gains", "residual", "atoms", "gram")))
+        normal, right = waves.normal(theta[active], now)
+        diagonal = np.arange(normal.shape[1])
+        scale = np.maximum(normal[:, diagonal, diagonal], 0)
+        scale = np.maximum(scale, 1e-12 * scale.max(axis=1, keepdims=True, initial=0) + np.finfo(float).tiny)
+        normal[:, diagonal, diagonal] += damping[active, None] * scale
+        # In units of the diagonal: distances and cosines differ by orders of magnitude.
+        root = np.sqrt(scale)
+        step = np.linalg.solve(normal / (root[:, :, None] * root[:, None]), (right / root)[..., None])[..., 0] / root
+        trial = waves.limit(theta[active] + step.reshape(theta[active].shape) * present[active][..., None])
+        tried = waves.solve(trial, present[active], h[active])
+        left = tried.energy
+        better = left < energy[active]
+        settled = better & (left > (1 - SETTLED) * energy[active])
+        kept = active[better]
+        theta[kept] = trial[better]
+        for name in ("gains", "residual", "atoms", "gram"):
+            getattr(solved, name)[kept] = getattr(tried, name)[better]
+        energy[kept] = left[better]
+        damping[active] = np.where(better, damping[active] / 5, damping[active] * 8).clip(1e-12, 1e6)
+        done = settled | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)
+        active = active[~done]
+    return theta, solved

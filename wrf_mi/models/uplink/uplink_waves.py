@@ -1,0 +1,322 @@
+"""Wave models of an uplink: what one propagation path gives at every antenna and subcarrier.
+
+With f0 the middle of the uplink, p_a the elements and g_k complex gains,
+
+- array: h_af = sum_k g_k (d_k / s_ka) exp(-j 2 pi / c ((f - f0) d_k + f (s_ka - d_k))), where s_ka is the distance of
+  element a from the path's image source at distance d_k in the direction with cosines psi_k along the array's axes:
+  s = d - p . psi for a plane wave (no amplitude factor), s^2 = d^2 - 2 d p . psi + |p|^2 for a spherical one;
+- free: h_af = sum_k g_ka exp(-j 2 pi / c (f - f0) d_k), where each antenna has its own gain.
+
+Both are linear in the gains, which are eliminated (variable projection: Golub and Pereyra, "The differentiation of
+pseudo-inverses and nonlinear least squares problems whose variables separate", 1973, with Kaufman's simplification).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from ...core.angles import FloatArray
+from .csi_bands import Bands
+
+Complex = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+AXIS_POINTS = 64
+"""Most points of the first search along one axis of the array: larger arrays start from a coarser grid."""
+FINE = 4
+"""Grid points of the first search in one resolution cell of distance."""
+UNIFORM = 1e-9
+"""Spacings by which subcarriers may lie off a grid: a phase below what float64 keeps of a path of 100 m."""
+SINGULAR = 1e-12
+"""Added to normal matrices, of the power of one path: two equal paths then share their gain."""
+
+
+@dataclass
+class Solved:
+    """Best gains for some paths.
+
+    Attributes:
+        gains: [n, paths] or [n, paths, antennas].
+        residual: what they leave of the uplink [n, antennas, f].
+        atoms: what the paths give at unit gain.
+        gram: their products [n, paths, paths].
+    """
+
+    gains: Complex
+    residual: Complex
+    atoms: Complex
+    gram: Complex
+
+    @property
+    def energy(self) -> FloatArray:
+        """Squared residual [n]."""
+        return np.asarray(np.square(np.abs(self.residual)).sum(axis=(1, 2)))
+
+
+class Waves(Protocol):
+    """A wave model; parameters of paths are [n, paths, p], present ones marked in [n, paths]."""
+
+    freedom: int
+    """Real numbers that describe one path, gains included."""
+    grid: FloatArray
+    """Distances of the grid, ascending, metres."""
+    cosines: FloatArray
+    """Directions of the grid [cells, p - 1]."""
+    lattice: NDArray[np.int64]
+    """Where these are on the lattice of directions, [cells, p - 1]."""
+
+    def power(self, residual: Complex) -> FloatArray:
+        """Power of a residual in each cell of the grid, [n, distances, cells]: a matched filter."""
+        ...
+
+    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
+        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
+        ...
+
+    def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix [n, m, m] and right side [n, m] of a Gauss-Newton step of all m = paths * p parameters."""
+        ...
+
+    def limit(self, theta: FloatArray) -> FloatArray:
+        """Parameters brought back to where the model is defined."""
+        ...
+
+    def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
+        """Coefficients [n, antennas, frequencies]."""
+        ...
+
+
+def waves_of(kind: str, bands: Bands, max_distance_m: float) -> Waves:
+    """A wave model by name: ``plane``, ``spherical`` or ``free``."""
+    if kind == "free":
+        return FreeWaves(bands, max_distance_m)
+    return ArrayWaves(bands, max_distance_m, spherical=kind == "spherical")
+
+
+def distances(bands: Bands, max_distance_m: float) -> FloatArray:
+    """Distances of the first search, metres: negative ones too, as a clock may run ahead.
+
+    No further than what subcarriers of this spacing can tell apart.
+    """
+    width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
+    reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
+    step = speed_of_light / width / FINE
+    count = max(int(np.ceil(reach / step)), 1)
+    return np.linspace(-reach, reach, 2 * count + 1)
+
+
+def strongest(waves: Waves, residual: Complex) -> FloatArray:
+    """The path [n, p] on a wave model's grid that explains most of a residual."""
+    power = waves.power(residual)
+    best = power.reshape(len(power), -1).argmax(axis=1)
+    at, direction = np.unravel_index(best, power.shape[1:])
+    return np.concatenate([waves.grid[at][:, None], waves.cosines[direction]], axis=1)
+
+
+def _solve(gram: Complex, right: Complex, ridge: Any, size: float) -> Complex:
+    loaded = gram.copy()
+    diagonal = np.arange(gram.shape[-1])
+    loaded[:, diagonal, diagonal] += np.reshape(ridge, (-1, 1)) + SINGULAR * size
+    return np.asarray(np.linalg.solve(loaded, right))
+
+
+def _turn(angle: FloatArray) -> Complex:
+    """exp(-j angle): twice as fast as the exponential of complex numbers."""
+    turned = np.empty(angle.shape, complex)
+    np.cos(angle, out=turned.real)
+    np.sin(-angle, out=turned.imag)
+    return turned
+
+
+def _mark_absent(gram: Complex, present: Mask) -> Complex:
+    """A path that is absent has zero atoms: a one on the diagonal keeps the matrix regular, the gain zero."""
+    diagonal = np.arange(gram.shape[-1])
+    gram[:, diagonal, diagonal] += ~present
+    return gram
+
+
+class FreeWaves:
+    """Paths whose delay all antennas share and whose gain is each antenna's own."""
+
+    def __init__(self, bands: Bands, max_distance_m: float) -> None:
+        self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
+        self.reference_hz = bands.reference_hz
+        self.grid = distances(bands, max_distance_m)
+        self.cosines, self.lattice = np.zeros((1, 0)), np.zeros((1, 0), np.int64)
+        self.steering = np.exp(self.grid[:, None] * self.slope)
+        self.freedom = 1 + 2 * bands.antennas
+
+    def power(self, residual: Complex) -> FloatArray:
+        """See `Waves`."""
+        return np.asarray(np.square(np.abs(residual @ self.steering.conj().T)).sum(axis=1)[:, :, None])
+
+    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
+        """See `Waves`."""
+        atoms = np.exp(theta * self.slope) * present[..., None]
+        gram = _mark_absent(atoms.conj() @ atoms.transpose(0, 2, 1), present)
+        gains = _solve(gram, atoms.conj() @ h.transpose(0, 2, 1), ridge, len(self.slope))
+        return Solved(gains, h - gains.transpose(0, 2, 1) @ atoms, atoms, gram)
+
+    def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
+        """See `Waves`."""
+        tilt = solved.atoms * self.slope
+        cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
+        own = tilt.conj() @ tilt.transpose(0, 2, 1)
+        projected = own - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, len(self.slope))
+        shared = solved.gains.conj() @ solved.gains.transpose(0, 2, 1)
+        right = (solved.gains.conj() * (tilt.conj() @ solved.residual.transpose(0, 2, 1))).sum(axis=-1)
+        return (projected * shared).real, right.real
+
+    def limit(self, theta: FloatArray) -> FloatArray:
+        """See `Waves`."""
+        return np.asarray(theta.clip(self.grid[0], self.grid[-1]))
+
+    def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
+        """See `Waves`."""
+        slope = -2j * np.pi / speed_of_light * (frequencies_hz - self.reference_hz)
+        return np.asarray(gains.transpose(0, 2, 1) @ np.exp(theta * slope))
+
+
+class ArrayWaves:
+    """Paths with one gain, a distance and a direction, at an array whose elements are known."""
+
+    def __init__(self, bands: Bands, max_distance_m: float, spherical: bool) -> None:
+        assert bands.elements_m is not None
+        self.elements, self.spherical = bands.elements_m, spherical
+        self.square = np.square(self.elements).sum(axis=1)
+        self.frequencies, self.reference_hz = bands.uplink_hz, bands.reference_hz
+        axes = self.elements.shape[1]
+        self.freedom = 3 + axes
+        self.far = max_distance_m
+        # An image source inside the array would make the distance's slope infinite.
+        self.near = 0.6 * 2 * float(np.sqrt(self.square.max(initial=0.0)))
+        wavelength = speed_of_light / self.reference_hz
+        points = []
+        for axis in range(axes):
+            half_cells = 2 * float(np.ptp(self.elements[:, axis])) / wavelength
+            points.append(np.linspace(-1, 1, int(min(2 * np.ceil(half_cells) + 1, AXIS_POINTS))))
+        where = np.array(list(np.ndindex(*(len(p) for p in points))), np.int64).reshape(-1, axes)
+        cosines = np.stack([p[where[:, axis]] for axis, p in enumerate(points)], axis=-1) if axes else np.zeros((1, 0))
+        visible = np.square(cosines).sum(axis=1) <= 1.01
+        self.cosines, self.lattice = cosines[visible], where[visible]
+        grid = distances(bands, max_distance_m)
+        if spherical:
+            # Curvature changes with 1 / d near the array, delay with d far from it.
+            bends = 1 / np.linspace(1 / max_distance_m, 1 / max(self.near, 1e-3), 9)[1:]
+            grid = np.sort(np.concatenate([grid[grid > max(self.near, 1e-3)], bends]))
+        self.grid = grid
+        self._steering = [self._towards(d) for d in (grid if spherical else grid[:1])]
+
+    def _towards(self, distance_m: float) -> Complex:
+        """Matched filters at one distance in all directions, [antennas, directions], of unit length."""
+        theta = np.concatenate([np.full((1, len(self.cosines), 1), distance_m), self.cosines[None]], axis=-1)
+        steering = self.atoms(theta, np.array([self.reference_hz]))[0, :, :, 0].conj().T
+        return np.asarray(steering / np.linalg.norm(steering, axis=0))
+
+    def _phase(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Distance, projections p . psi [n, k, a] and, of spherical waves, distances s from the elements."""
+        d = theta[..., :1]
+        along = theta[..., 1:] @ self.elements.T
+        root = np.sqrt(np.maximum(d * d - 2 * d * along + self.square, (0.1 * d) ** 2)) if self.spherical else None
+        return d, along, root
+
+    def atoms(self, theta: FloatArray, frequencies_hz: FloatArray) -> Complex:
+        """What paths of unit gain give, [n, k, antennas, frequencies]."""
+        d, along, s = self._phase(theta)
+        excess = -along if s is None else (self.square - 2 * d * along) / (s + d)
+        k = 2 * np.pi / speed_of_light
+        carrier = _turn(k * self.reference_hz * excess)
+        if s is not None:
+            carrier *= d / s
+        offset = frequencies_hz - self.reference_hz
+        spacing = float(np.diff(np.sort(offset)).min()) if len(offset) > 1 else 1.0
+        steps = (offset - offset.min()) / spacing
+        whole = steps.round()
+        length = k * (d + excess)
+        if np.abs(steps - whole).max() > UNIFORM or whole.max() > AXIS_POINTS:
+            return np.asarray(carrier[..., None] * _turn(length[..., None] * offset))
+        # Subcarriers on a grid, split into eights and ones: a third of the sines.
+        order = whole.astype(int)
+        carrier *= _turn(length * offset.min())
+        ones = _turn(length[..., None] * (spacing * np.arange(8)))
+        eights = _turn(length[..., None] * (spacing * 8 * np.arange(order.max() // 8 + 1))) * carrier[..., None]
+        beat = (eights[..., None] * ones[..., None, :]).reshape(*length.shape, -1)
+        return np.asarray(beat[..., : len(order)] if (np.diff(order) == 1).all() else beat[..., order])
+
+    def _slopes(self, theta: FloatArray) -> tuple[Complex, FloatArray]:
+        """Logarithmic derivatives of atoms as c + m f for each parameter: constants and f's factors [n, k, p, a]."""
+        d, along, s = self._phase(theta)
+        n, k, _ = theta.shape
+        axes, antennas = self.elements.shape[1], len(self.elements)
+        excess, amplitude = np.zeros((2, n, k, 1 + axes, antennas))
+        if s is None:
+            excess[:, :, 1:] = -self.elements.T
+        else:
+            by_d = (d - along) / s
+            excess[:, :, 0] = by_d - 1
+            amplitude[:, :, 0] = 1 / d - by_d / s
+            excess[:, :, 1:] = -(d / s)[:, :, None] * self.elements.T
+            amplitude[:, :, 1:] = (d / (s * s))[:, :, None] * self.elements.T
+        factor = excess * (-2 * np.pi / speed_of_light)
+        factor[:, :, 0] -= 2 * np.pi / speed_of_light
+        constant = amplitude.astype(complex)
+        constant[:, :, 0] += 2j * np.pi / speed_of_light * self.reference_hz
+        return constant, factor
+
+    def power(self, residual: Complex) -> FloatArray:
+        """See `Waves`.
+
+        Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
+        """
+        k = 2 * np.pi / speed_of_light
+        beat = np.exp(-1j * k * self.grid[:, None] * (self.frequencies - self.reference_hz))
+        combined = residual @ beat.conj().T
+        power = np.empty((len(residual), len(self.grid), len(self.cosines)))
+        for index in range(len(self.grid)):
+            steering = self._steering[index if self.spherical else 0]
+            power[:, index] = np.square(np.abs(combined[:, :, index] @ steering))
+        return power
+
+    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
+        """See `Waves`."""
+        n, paths = present.shape
+        atoms = self.atoms(theta, self.frequencies).reshape(n, paths, -1) * present[..., None]
+        flat = h.reshape(n, -1, 1)
+        left = atoms.conj()
+        gram = _mark_absent(left @ atoms.transpose(0, 2, 1), present)
+        gains = _solve(gram, left @ flat, ridge, flat.shape[1])[..., 0]
+        residual = h - (gains[:, None] @ atoms).reshape(h.shape)
+        return Solved(gains, residual, atoms, gram)
+
+    def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
+        """See `Waves`."""
+        n, k, p = theta.shape
+        antennas, subcarriers = solved.residual.shape[1:]
+        constant, factor = self._slopes(theta)
+        slopes = constant[..., None] + 1j * factor[..., None] * self.frequencies
+        moved = (solved.atoms * solved.gains[..., None]).reshape(n, k, 1, antennas, subcarriers)
+        tilt = (moved * slopes).reshape(n, k * p, -1)
+        cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
+        # Only the real part of the products is needed: half the work.
+        pairs, residual = tilt.view(float), solved.residual.reshape(n, -1, 1).view(float).reshape(n, -1, 1)
+        own = pairs @ pairs.transpose(0, 2, 1)
+        size = antennas * subcarriers
+        shadow = cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, size)
+        return own - shadow.real, (pairs @ residual)[..., 0]
+
+    def limit(self, theta: FloatArray) -> FloatArray:
+        """See `Waves`."""
+        limited = theta.copy()
+        limited[..., 0] = theta[..., 0].clip(max(self.near, 1e-3) if self.spherical else -self.far, self.far)
+        length = np.linalg.norm(theta[..., 1:], axis=-1, keepdims=True)
+        limited[..., 1:] /= np.maximum(length, 1)
+        return limited
+
+    def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
+        """See `Waves`."""
+        return np.asarray(np.einsum("nk,nkaf->naf", gains, self.atoms(theta, frequencies_hz)))

@@ -1,0 +1,192 @@
+"""From a stored spectrum back to the complex signals of the array's elements.
+
+A spectrum that was scaled to its own minimum and maximum and cut to grey levels still tells the element signals, up to
+a common factor:
+
+1. The lowest magnitude. Scaling took off a constant c of the magnitude; (grey + c)^2 lies in the span of the array's
+   lags, grey^2 alone does not. So c is linear least squares.
+2. The signals. Lags are sums of products h_m conj(h_n); for a planar array of two or more rows and columns they have
+   more numbers than the signals. Their inverse, phase retrieval from an autocorrelation, is unique up to a common
+   phase and, where the array is its own mirror image through its centre, the exchange of h_m with the conjugate of the
+   opposite element's signal, which leaves the magnitude as it is. It has local minima: it is started several times.
+
+Source: Hayes, "The reconstruction of a multidimensional sequence from the phase or magnitude of its Fourier transform"
+(1982) for uniqueness; More, "The Levenberg-Marquardt algorithm" (1978).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from .beams import mirror_order
+from .lags import Lags
+
+ComplexArray = NDArray[np.complex128]
+
+STARTS = 200
+"""Of the retrieval of one spectrum; of 160 measured ones half needed 5 or fewer, the slowest 76."""
+GOOD_ENOUGH = 4.0
+"""A start has found the signals when what is left is this many times what the grey levels explain."""
+STEPS = 120
+"""Evaluations of one start; those that arrive take 20 to 60."""
+
+
+@dataclass(frozen=True)
+class Unscaled:
+    """Spectra with what scaling took off put back, in units of each spectrum's range.
+
+    Attributes:
+        squared: squared magnitudes [n, height, width].
+        lowest: c, the magnitude that became 0, over the range that became 1, [n].
+        residual: root mean square over pixels of what no squared spectrum of the array can have, [n].
+        rounding: what the grey levels alone would leave, [n].
+    """
+
+    squared: FloatArray
+    lowest: FloatArray
+    residual: FloatArray
+    rounding: FloatArray
+
+
+def unscale(grey: ArrayLike, lags: Lags, bits: int = 8, cut: bool = True) -> Unscaled:
+    """Undo the scaling of stored spectra, see `wrf_mi.receivers.physical_array.instrument_report`.
+
+    Args:
+        grey: stored spectra [n, height, width], 0 to 1.
+        lags: of the array on their grid.
+        bits: of a level.
+        cut: digits were cut off at whole levels; False: rounded.
+
+    Raises:
+        InputError: another grid.
+    """
+    levels = 2**bits - 1
+    stored = np.asarray(grey, float)
+    # Cutting off takes half a level on average, but not from the highest.
+    middle = stored + 0.5 / levels * (stored < 1) if cut else stored
+    curved, straight = (lags.residual(image).reshape(len(stored), -1) for image in (middle**2, middle))
+    # Levels' rounding is in both: what its variance adds to either sum is taken off. Where nothing but rounding lies
+    # outside the span, c cannot be told; it is then estimated too low, not at random.
+    rounding = (1 - lags.count / middle[0].size) * middle[0].size / (12 * levels**2)
+    across = (curved * straight).sum(axis=1) - 2 * middle.mean(axis=(1, 2)) * rounding
+    square = np.square(straight).sum(axis=1)
+    lowest = np.maximum(-across / (2 * np.maximum(square - rounding, rounding)), 0)
+    left = curved + 2 * lowest[:, None] * straight
+    magnitude = middle + lowest[:, None, None]
+    return Unscaled(
+        magnitude**2,
+        lowest,
+        np.sqrt(np.square(left).mean(axis=1)),
+        np.sqrt(np.square(2 * magnitude / levels).mean(axis=(1, 2)) / 12),
+    )
+
+
+@dataclass(frozen=True)
+class Retrieved:
+    """Element signals of spectra.
+
+    Attributes:
+        signals: [n, m], each spectrum's up to a common phase (and the exchange with its mirror image).
+        residual: root mean square over pixels of the squared spectrum in the span of the lags that they leave, [n].
+        found: whether that is what grey levels explain, [n]; the others are a local minimum or no single snapshot.
+    """
+
+    signals: ComplexArray
+    residual: FloatArray
+    found: NDArray[np.bool_]
+
+
+def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:
+    """Signals whose squared spectra are nearest.
+
+    Args:
+        unscaled: from `unscale`.
+        lags: the same.
+        seed: of the starts.
+        starts: at most so many for each spectrum.
+
+    Raises:
+        InputError: an array whose lags do not tell its signals: a line, or one of fewer than four elements.
+    """
+    m = lags.elements
+    extent = np.linalg.svd(lags.lag_m, compute_uv=False)
+    if lags.count < 2 * m - 1 or extent[1] < 1e-6 * extent[0]:
+        raise InputError(f"retrieval: {m} elements on a line or too few lags; it takes an array of two dimensions")
+    # P = x^T F x with x = (Re h, Im h), a symmetric F for each coordinate.
+    real, imaginary = (lags.to_coordinates(part).reshape(m, m, -1) for part in lags.pairs)
+    form = np.concatenate(
+        [np.concatenate([real, -imaginary], axis=1), np.concatenate([imaginary, real], axis=1)], axis=0
+    )
+    form = (form + form.transpose(1, 0, 2)) / 2
+    pixels = lags.shape[0] * lags.shape[1]
+    wanted = lags.coordinates(unscaled.squared)
+    enough = GOOD_ENOUGH * unscaled.rounding * np.sqrt(lags.count / pixels)
+    rng = np.random.default_rng(seed)
+    signals, residual = np.zeros((len(wanted), m), complex), np.full(len(wanted), np.inf)
+    for row, target in enumerate(wanted):
+        size = np.sqrt(unscaled.squared[row].mean() / (2 * m))
+        for _ in range(starts):
+            x, left = _descend(form, target, size * rng.normal(size=2 * m))
+            if left / np.sqrt(pixels) < residual[row]:
+                residual[row], signals[row] = left / np.sqrt(pixels), x[:m] + 1j * x[m:]
+            if residual[row] < enough[row]:
+                break
+    return Retrieved(signals, residual, residual < enough)
+
+
+def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
+    """Levenberg-Marquardt from one start: the signals, real and imaginary parts, and the norm of what is left."""
+    size = len(start)
+    flat = form.reshape(size, -1)
+
+    def slope(x: FloatArray) -> FloatArray:
+        return (x @ flat).reshape(size, -1).T
+
+    best = least_squares(
+        lambda x: slope(x) @ x - target,
+        start,
+        lambda x: 2 * slope(x),
+        method="lm",
+        max_nfev=STEPS,
+        xtol=1e-9,
+        ftol=1e-9,
+    )
+    return best.x, float(np.sqrt(2 * best.cost))
+
+
+def align_signals(signals: ArrayLike, tx_pos_m: ArrayLike, elements_m: ArrayLike) -> ComplexArray:
+    """Choose each spectrum's common phase, and of the two mirror images one, so that neighbours in space agree.
+
+    Rows are joined nearest first (Prim's tree). One exchange of all with their mirror images is left open.
+
+    Args:
+        signals: [n, m].
+        tx_pos_m: of the transmitters, [n, 3], metres.
+        elements_m: [m, 3].
+
+    Returns:
+        Shape [n, m].
+    """
+    aligned, positions = np.array(signals, complex), np.asarray(tx_pos_m, float)
+    opposite = mirror_order(elements_m)
+    count = len(aligned)
+    near, partner = np.linalg.norm(positions - positions[0], axis=1), np.zeros(count, np.int64)
+    waiting = np.ones(count, bool)
+    waiting[0] = False
+    while waiting.any():
+        row = int(np.where(waiting, near, np.inf).argmin())
+        choices = [aligned[row]] + ([] if opposite is None else [aligned[row][opposite].conj()])
+        overlap = [np.vdot(choice, aligned[partner[row]]) for choice in choices]
+        best = int(np.argmax(np.abs(overlap)))
+        aligned[row] = choices[best] * np.exp(1j * np.angle(overlap[best]))
+        waiting[row] = False
+        distance = np.linalg.norm(positions - positions[row], axis=1)
+        closer = distance < near
+        near[closer], partner[closer] = distance[closer], row
+    return aligned

@@ -1,0 +1,287 @@
+"""Several runs side by side: a table, score distributions, samples with their truth, training curves."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import io
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..core import InputError
+from ..core.files import write_atomically
+from ..models.ray_tracing import PATHS
+from ..tasks import TASKS
+from . import figures
+from .folder import FITTED
+from .results import Results, read_runs
+from .scene_view import scene_view
+
+QUANTILES = (0.1, 0.5, 0.9)
+"""Test rows that are shown of spectra: those at these quantiles of the first run's score."""
+
+COLUMNS = {
+    "run": "run",
+    "model": "model",
+    "dataset": "data set",
+    "split": "split",
+    "seed": "seed",
+    "n_train": "training rows",
+    "n_test": "test rows",
+    "metric": "score",
+    "median": "median",
+    "mean": "mean",
+    "p10": "p10",
+    "p90": "p90",
+    "inside_90": "inside 90 %",
+    "ms_per_sample": "ms per sample",
+    "train_seconds": "training (s)",
+    "peak_memory_mb": "peak memory (MB)",
+}
+"""Columns of ``compare.csv`` and their headings in ``index.html``."""
+
+Picture = tuple[str, str, Figure]
+"""File name, heading, figure."""
+
+
+def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
+    """Write the comparison of several runs.
+
+    Runs on the same data set stand beside each other on the same test rows, and beside the reference method that needs
+    no model (`wrf_mi.tasks.TASKS`). Writes into ``out`` (made if need be): ``compare.csv``, one row per run
+    and reference; for each data set ``<data set>-cdf.png``, ``<data set>-samples.png`` with the truth beside each
+    method, ``<data set>-scene.png`` if one was traced and ``<data set>-training.png`` if one was trained; and
+    ``index.html``, one file with all of it.
+
+    Args:
+        run_dirs: run folders.
+        out: folder to write to.
+
+    Returns:
+        Path of ``index.html``.
+
+    Raises:
+        InputError: no run, or a folder that is not one.
+    """
+    groups = _groups(read_runs(run_dirs))
+    table = [row for runs in groups.values() for row in _rows(runs)]
+    sections = [(_heading(runs), _pictures(slug, runs)) for slug, runs in groups.items()]
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(COLUMNS), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_atomically(folder / "compare.csv", text.getvalue())
+    for _, pictures in sections:
+        for name, _, figure in pictures:
+            figures.save(figures.without_formulas(figure), folder / name)
+    shown = [(heading, [(folder / name, title) for name, title, _ in pictures]) for heading, pictures in sections]
+    return write_atomically(folder / "index.html", _page(table, shown))
+
+
+def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
+    """Runs by task and data set, under names that can begin a file's name."""
+    by_data: dict[tuple[str, str], list[Results]] = {}
+    for run in runs:
+        by_data.setdefault((run.task, run.dataset), []).append(run)
+    groups: dict[str, list[Results]] = {}
+    for (_, dataset), members in by_data.items():
+        slug = re.sub(r"[^\w.-]+", "_", Path(dataset).name) or "data"
+        while slug in groups:
+            slug += "_"
+        groups[slug] = members
+    return groups
+
+
+def _heading(runs: Sequence[Results]) -> str:
+    return f"{Path(runs[0].dataset).name}: {TASKS[runs[0].task].heading}"
+
+
+def _rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
+    """The table's rows of one data set: each run, and each reference once."""
+    task = TASKS[runs[0].task]
+    rows = []
+    for run in runs:
+        known = {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
+        own = {"run": run.name, "dataset": run.dataset, "seed": run.seed, "metric": task.label}
+        rows.append(known | own | _summary(run.metrics[task.block]))
+    for name, (run, key) in _references(runs).items():
+        block = run.metrics["reference"][key]
+        kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
+        own = {"run": name, "model": key, "dataset": run.dataset, "metric": task.label}
+        rows.append(kept | own | _summary(block))
+    return [{key: row.get(key) for key in COLUMNS} for row in rows]
+
+
+def _summary(block: dict[str, Any]) -> dict[str, Any]:
+    return {key: block.get(key) for key in ("median", "mean", "p10", "p90")}
+
+
+def _references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
+    """Each reference by its name: a run that has it and its key, once for runs with the same training and test rows."""
+    found: dict[str, tuple[Results, str]] = {}
+    for run in runs:
+        for key, scores in run.reference_scores.items():
+            known = (r.reference_scores[key] for r, k in found.values() if k == key)
+            if any(np.array_equal(scores, other, equal_nan=True) for other in known):
+                continue
+            name = f"{TASKS[run.task].references[key]}, {run.metrics['split']}"
+            found[f"{name} of {run.name}" if name in found else name] = run, key
+    return found
+
+
+def _pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
+    task = TASKS[runs[0].task]
+    cdf = figures.score_cdf(
+        {run.name: run.score for run in runs},
+        {name: run.reference_scores[key] for name, (run, key) in _references(runs).items()},
+        task.label,
+    )
+    samples = _spectra(runs) if TASKS[runs[0].task].image else _maps(runs)
+    pictures: list[Picture] = [
+        (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
+        (f"{slug}-samples.png", *samples),
+    ]
+    if (view := _scene(runs)) is not None:
+        pictures.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
+    curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
+    if curves:
+        pictures.append((f"{slug}-training.png", "Training", figures.training_curves(curves, task.label)))
+    return pictures
+
+
+def _scene(runs: Sequence[Results]) -> Figure | None:
+    """The first traced run's scene, with the Gaussians of the first field; None where nothing was traced."""
+    traced = next((run for run in runs if (run.path / PATHS).exists()), None)
+    if traced is None:
+        return None
+    learned = (run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists())
+    field = next(learned, None)
+    row = traced.row[np.argsort(np.nanmean(traced.score, axis=0))[len(traced.row) // 2]]
+    try:
+        return scene_view(traced.path, int(row), field)
+    except InputError as error:
+        # A run folder outlives the scene that it was traced in.
+        print(f"no picture of the scene of {traced.name}: {error}", file=sys.stderr)
+        return None
+
+
+def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
+    """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
+    first = runs[0]
+    shared = np.array([all(_position(run, first, m) is not None for run in runs) for m in range(len(first.row))])
+    candidates = np.flatnonzero(shared if shared.any() else np.ones_like(shared))
+    score = first.score[:, candidates]
+    order = np.argsort(score, axis=None, kind="stable")
+    rows = []
+    for quantile in QUANTILES:
+        receiver, chosen = np.unravel_index(order[round(quantile * (len(order) - 1))], score.shape)
+        m = int(candidates[chosen])
+        places = [_position(run, first, m) for run in runs]
+        name = f"row {first.row[m]}" + (f", {first.receivers[receiver]}" if len(first.truth) > 1 else "")
+        predictions = [None if p is None else run.prediction[receiver, p] for run, p in zip(runs, places, strict=True)]
+        rows.append((name, [first.truth[receiver, m], *predictions, first.reference[receiver, m]]))
+    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
+    percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
+    heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"
+    return heading, figures.spectrum_table(rows, columns)
+
+
+def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
+    """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
+    first = runs[0]
+    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
+    rows = []
+    for r, receiver in enumerate(first.receivers):
+        aligned = [_aligned(run, first, r) for run in runs]
+        maps = [first.truth[r], *aligned, first.reference[r]]
+        rows.append((receiver, [None if values is None else _power_db(values) for values in maps]))
+    if not np.isfinite(first.tx_pos_m).all():
+        heading = f"Power at each receiver over the test rows of {first.name}"
+        return heading, figures.row_table(rows, columns, first.row, TASKS[first.task].quantity)
+    heading = f"Power at each receiver over the test positions of {first.name}"
+    return heading, figures.position_table(rows, columns, first.tx_pos_m, TASKS[first.task].quantity)
+
+
+def _power_db(values: np.ndarray) -> np.ndarray:
+    """RSSI as it is; the power of a channel's coefficients, summed over antennas and subcarriers, in dB."""
+    if not np.iscomplexobj(values):
+        return values
+    power = np.square(np.abs(values)).reshape(len(values), -1).sum(axis=-1)
+    return 10 * np.log10(np.where(power > 0, power, np.nan))
+
+
+def _aligned(run: Results, first: Results, receiver: int) -> np.ndarray | None:
+    """Predictions of ``run`` in the order of the test rows of ``first``, NaN where it has none; None without any."""
+    places = [_position(run, first, m) for m in range(len(first.row))]
+    if all(p is None for p in places):
+        return None
+    values = run.prediction[receiver]
+    missing = np.full(values.shape[1:], np.nan, values.dtype)
+    return np.stack([missing if p is None else values[p] for p in places])
+
+
+def _position(run: Results, first: Results, m: int) -> int | None:
+    """Where ``run`` keeps test row ``m`` of ``first``; None if it has not, or if it is another measurement."""
+    found = np.flatnonzero(run.row == first.row[m])
+    if len(found) != 1 or len(run.truth) != len(first.truth):
+        return None
+    same = np.array_equal(run.truth[:, found[0]], first.truth[:, m], equal_nan=True)
+    return int(found[0]) if same else None
+
+
+def _page(table: Sequence[dict[str, Any]], sections: Sequence[tuple[str, Sequence[tuple[Path, str]]]]) -> str:
+    """A page that needs no other file: the table, and each data set's pictures within it."""
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in COLUMNS.values())
+    body = "\n".join("<tr>" + "".join(f"<td>{_cell(row[key])}</td>" for key in COLUMNS) + "</tr>" for row in table)
+    images = "\n".join(
+        f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(_image(path, title) for path, title in pictures)
+        for heading, pictures in sections
+    )
+    notes = "\n".join(f"<li>{html.escape(task.note)}</li>" for task in TASKS.values() if _shows(table, task.label))
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<meta charset="utf-8">
+<title>Comparison of runs</title>
+<style>
+body {{ font-family: sans-serif; margin: 2em; }}
+table {{ border-collapse: collapse; }}
+th, td {{ border-bottom: 1px solid #ccc; padding: 0.3em 0.6em; text-align: right; }}
+th:nth-child(-n+4), td:nth-child(-n+4) {{ text-align: left; }}
+img {{ max-width: 100%; }}
+</style>
+<h1>Comparison of runs</h1>
+<table>
+<tr>{head}</tr>
+{body}
+</table>
+<ul>
+{notes}
+</ul>
+{images}
+</html>
+"""
+
+
+def _shows(table: Sequence[dict[str, Any]], label: str) -> bool:
+    return any(row["metric"] == label for row in table)
+
+
+def _image(path: Path, title: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<h3>{html.escape(title)}</h3>\n<img src="data:image/png;base64,{data}" alt="{html.escape(title)}">'
+
+
+def _cell(value: Any) -> str:
+    """A value of the table as text: four significant digits, nothing for what is unknown."""
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))

@@ -1,0 +1,140 @@
+"""A run made smaller: its folder, its size, and what that costs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import InputError, Record
+from ..core.files import write_atomically
+from ..datasets import save_split
+from ..graph.settings import TRACED
+from ..training.checkpoint import append_log
+from ..training.compress import Compression, compress
+from ..training.loop import Progress
+from ..training.predictor import Predictor
+from .api import evaluate_run, open_run
+from .evaluate import stored_metrics
+from .folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
+from .timing import interleaved, ratio
+
+COMPRESSION = "compression.json"
+"""What was done to the run, from which one, and what it cost."""
+REPEATS = 60
+"""Interleaved pairs of spectra that are timed."""
+
+Listen = Callable[[str, int, Progress], None]
+
+
+def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
+    """Times of single spectra, warm, of several fields that take turns.
+
+    Args:
+        predictors: by name; the first is what the others are compared with.
+        tx_pos_m: transmitter positions [m, 3], metres.
+        repeats: rounds.
+
+    Returns:
+        By name: ``ms`` (median), ``ms_least``, and ``times_faster`` than the first: median of the rounds' ratios and
+        its 95 % interval.
+    """
+    positions = np.asarray(tx_pos_m, float)
+
+    def call(one: Predictor) -> Callable[[], Any]:
+        turn = itertools.cycle(positions[:, None])
+        return lambda: one(next(turn))
+
+    taken = interleaved({name: call(one) for name, one in predictors.items()}, repeats)
+    first = next(iter(taken.values()))
+    result: dict[str, Any] = {}
+    for name, own in taken.items():
+        faster = ratio(first, own)
+        times = {"ms": float(np.median(own)), "ms_least": float(own.min())}
+        result[name] = times | {"times_faster": [faster.value, faster.low, faster.high]}
+    return result
+
+
+def compress_run(
+    run: str | Path,
+    out: str | Path,
+    how: Compression,
+    record: Record | None = None,
+    listen: Listen = lambda stage, steps, progress: None,
+) -> dict[str, Any]:
+    """Make a smaller run of a run and score it on the same held-out rows.
+
+    Args:
+        run: folder of a learned field (WRF-GS or WRF-GS+).
+        out: run folder to make; must not exist or be empty.
+        how: what is made smaller.
+        record: the data set of the run; None: loaded by its name.
+        listen: hears of progress.
+
+    Returns:
+        What ``compression.json`` says: ``before`` and ``after`` with ``gaussians``, ``bytes``, ``ssim`` (median) and
+        the times of `spectrum_times`; ``times_smaller``, ``ssim_change``, ``seconds`` and the settings.
+
+    Raises:
+        InputError: not a run of one learned field of spectra alone, or a folder that is not empty.
+    """
+    source, folder = Path(run), Path(out)
+    check_new(folder)
+    opened = open_run(source, record)
+    asked, field = opened.config, opened.field
+    if asked.scene is not None:
+        raise InputError(f"{source}: trained together with the paths of {asked.scene}; compress a run without a scene")
+    if field.config.evaluation == TRACED:
+        raise InputError(f"{source}: evaluated by tracing; compress a run with evaluation=splatted")
+    data = opened.problem.record
+    split = load_rows(source, data)
+    start = time.perf_counter()
+
+    def heard(stage: str, steps: int, progress: Progress) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        append_log(folder, progress)
+        listen(stage, steps, progress)
+
+    settings, params = compress(field.config, field.params, data, split, how, heard)
+    seconds = time.perf_counter() - start
+    folder.mkdir(parents=True, exist_ok=True)
+    save_split(folder / SPLIT, split)
+    write_config(folder, replace(asked, model=settings.model, settings=settings))
+    size = write_fitted(folder, field.packed(params, how.precision), read_fitted(source)[1]).stat().st_size
+    known = stored_metrics(source)
+    ssim_before = (known or evaluate_run(source))["ssim"]["median"]
+    ssim_after = evaluate_run(folder)["ssim"]["median"]
+    both = {"before": opened.predictor(), "after": open_run(folder, record).predictor()}
+    times = spectrum_times(both, data.tx_pos_m[split.all_train])
+    size_before, count = (source / FITTED).stat().st_size, field.params["position"].shape[1]
+    result = {
+        "run": str(source),
+        "how": asdict(how),
+        "seconds": seconds,
+        "before": {"gaussians": count, "bytes": size_before, "ssim": ssim_before} | times["before"],
+        "after": {"gaussians": params["position"].shape[1], "bytes": size, "ssim": ssim_after} | times["after"],
+        "times_smaller": size_before / size,
+        "ssim_change": ssim_after - ssim_before,
+    }
+    write_atomically(folder / COMPRESSION, json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def render(found: Mapping[str, Any]) -> str:
+    """The result of `compress_run` as a table."""
+    lines = [f"{'':<8}{'Gaussians':>10}{'kB':>9}{'ms':>8}{'SSIM':>8}"]
+    for name in ("before", "after"):
+        one = found[name]
+        lines.append(f"{name:<8}{one['gaussians']:>10}{one['bytes'] / 1e3:>9.1f}{one['ms']:>8.2f}{one['ssim']:>8.3f}")
+    value, low, high = found["after"]["times_faster"]
+    lines.append(
+        f"{found['times_smaller']:.1f} times smaller, {value:.1f} times as fast ({low:.1f} to {high:.1f}), "
+        f"median SSIM {found['ssim_change']:+.3f}, made in {found['seconds']:.0f} s"
+    )
+    return "\n".join(lines)

@@ -1,0 +1,254 @@
+"""Pictures: spectra on the polar sky, score distributions, training curves.
+
+Figures are made without pyplot: no global state, no window system.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from numpy.typing import ArrayLike
+
+from wrf_mi.core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
+from wrf_mi.core.files import write_atomically
+from wrf_mi.gaussians.oracle import Projection
+
+PANEL_IN = 2.3
+"""Side of one polar picture in inches."""
+
+OUTLINE_POINTS = 64
+"""Corners of the polygon that stands for a footprint's outline."""
+
+
+def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
+    """Draw a spectrum on polar axes: azimuth as angle, 90 degrees - elevation as radius.
+
+    Args:
+        axes: made with ``projection="polar"``.
+        spectrum: grey values [H, W]; colours span 0..1.
+        title: above the picture.
+    """
+    values = np.asarray(spectrum)
+    height, width = values.shape
+    # The zenith is no sample; the mean of the ring around it closes the picture there.
+    values = np.vstack([values, np.full(width, values[-1].mean())])
+    radius_deg = np.append(90 - np.degrees(elevation_rad(height)), 0.0)
+    axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap="viridis", vmin=0, vmax=1)
+    _sky(axes, title, ring_labels="white")
+
+
+def _sky(axes: Axes, title: str, ring_labels: str) -> None:
+    """Rings of elevation and spokes of azimuth."""
+    axes.set_rlim(0, 90)  # type: ignore[attr-defined]
+    axes.set_yticks([30, 60, 90], ["60°", "30°", ""], fontsize=6, color=ring_labels)
+    axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"], fontsize=6)
+    axes.tick_params(pad=-2)
+    axes.grid(alpha=0.3, linewidth=0.5)
+    axes.set_title(title, fontsize=8)
+
+
+def spectrum_table(rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str]) -> Figure:
+    """Polar pictures side by side, for example truth beside prediction.
+
+    Args:
+        rows: a name and one spectrum [H, W] per column; None leaves the place empty.
+        columns: a title for each column.
+
+    Returns:
+        The figure.
+    """
+    figure = Figure(figsize=(PANEL_IN * len(columns), PANEL_IN * len(rows) + 0.2), layout="constrained")
+    grid = figure.subplots(len(rows), len(columns), squeeze=False, subplot_kw={"projection": "polar"})
+    for r, (name, spectra) in enumerate(rows):
+        for c, (title, spectrum) in enumerate(zip(columns, spectra, strict=True)):
+            axes = grid[r, c]
+            if spectrum is None:
+                axes.set_axis_off()
+            else:
+                polar_spectrum(axes, spectrum, title if r == 0 else "")
+            if c == 0:
+                axes.text(-0.25, 0.5, name, transform=axes.transAxes, rotation=90, va="center", fontsize=7)
+    return figure
+
+
+def position_table(
+    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], tx_pos_m: ArrayLike, label: str
+) -> Figure:
+    """Maps of one value for each transmitter position side by side, for example truth beside prediction.
+
+    Args:
+        rows: a name and one array [m] per column; None leaves the place empty, NaN leaves a position out. The maps of
+            a row share their colours.
+        columns: a title for each column.
+        tx_pos_m: positions [m, 3], metres; drawn from above.
+        label: of the value, with its unit.
+
+    Returns:
+        The figure.
+    """
+    x, y, _ = np.asarray(tx_pos_m, float).T
+    aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
+    figure = Figure(figsize=(PANEL_IN * len(columns) + 0.8, PANEL_IN * aspect * len(rows) + 0.6), layout="constrained")
+    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
+    for r, (name, maps) in enumerate(rows):
+        given = np.concatenate([np.ravel(values) for values in maps if values is not None])
+        low, high = np.nanpercentile(given, [1, 99]) if np.isfinite(given).any() else (0.0, 1.0)
+        for c, (title, values) in enumerate(zip(columns, maps, strict=True)):
+            axes = grid[r, c]
+            axes.set_aspect("equal")
+            axes.tick_params(labelsize=6)
+            if r == 0:
+                axes.set_title(title, fontsize=8)
+            if c == 0:
+                axes.set_ylabel(f"{name}\ny (m)", fontsize=7)
+            if r == len(rows) - 1:
+                axes.set_xlabel("x (m)", fontsize=7)
+            if values is None:
+                axes.set_axis_off()
+                continue
+            axes.scatter(x, y, c=np.asarray(values), s=6, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+        colours = ScalarMappable(Normalize(low, high), cmap="viridis")
+        bar = figure.colorbar(colours, ax=list(grid[r]), shrink=0.9)
+        bar.set_label(label, fontsize=7)
+        bar.ax.tick_params(labelsize=6)
+    return figure
+
+
+def row_table(
+    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], row: ArrayLike, label: str
+) -> Figure:
+    """One value over row numbers, for data without positions: a panel for each name, a line for each column.
+
+    Args:
+        rows: a name and one array [m] per column; None leaves the line out, NaN a point.
+        columns: what each line is.
+        row: numbers of the rows [m].
+        label: of the value, with its unit.
+
+    Returns:
+        The figure.
+    """
+    order = np.argsort(np.asarray(row))
+    figure = Figure(figsize=(8, 2.2 * len(rows) + 0.6), layout="constrained")
+    grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, (name, lines) in zip(grid, rows, strict=True):
+        for title, values in zip(columns, lines, strict=True):
+            if values is not None:
+                axes.plot(np.asarray(row)[order], np.asarray(values)[order], linewidth=0.8, label=title)
+        axes.set_ylabel(f"{name}\n{label}", fontsize=7)
+        axes.tick_params(labelsize=6)
+    grid[0].legend(fontsize=7)
+    grid[-1].set_xlabel("row", fontsize=7)
+    return figure
+
+
+def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
+    """A spectrum beside the Gaussians that make it, each as the receiver sees it.
+
+    An outline is where a footprint has fallen to exp(-1/2), one standard deviation from its centre.
+
+    Args:
+        spectrum: grey values [H, W].
+        gaussians: n of them, projected by `wrf_mi.gaussians.oracle.project`; those without a footprint are left out.
+        weight: colours the outlines, the largest on top, shape [n]; for example the magnitude of opacity times signal.
+        label: of the weight.
+
+    Returns:
+        The figure.
+    """
+    drawn = gaussians.order[np.argsort(np.asarray(weight, float)[gaussians.order], kind="stable")]
+    figure = Figure(figsize=(2 * 1.6 * PANEL_IN, 1.5 * PANEL_IN), layout="constrained")
+    left, right = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
+    polar_spectrum(left, spectrum, "spectrum")
+    lines = LineCollection(list(_outlines(gaussians)[drawn]), cmap="magma_r", linewidths=0.8)
+    lines.set_array(np.asarray(weight, float)[drawn])
+    lines.set_clim(0, None)
+    right.add_collection(lines)
+    _sky(right, f"footprints of {len(drawn)} Gaussians", ring_labels="black")
+    bar = figure.colorbar(lines, ax=right, shrink=0.8)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    return figure
+
+
+def _outlines(gaussians: Projection) -> FloatArray:
+    """Azimuth in radians and 90 degrees - elevation in degrees along each footprint's outline, [n, points, 2]."""
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    # A point v of the tangent plane lies in the direction n + v_1 e_1 + v_2 e_2.
+    in_plane = np.swapaxes(np.linalg.cholesky(gaussians.covariance) @ circle, -1, -2)
+    azimuth, elevation = azimuth_elevation(gaussians.direction[:, None] + in_plane @ gaussians.basis)
+    return np.stack([azimuth, 90 - np.degrees(elevation)], axis=-1)
+
+
+COLOURS = 10
+"""In Matplotlib's cycle."""
+TAIL = 0.01
+"""Share of each curve that may lie beyond either end of the axis: a few rows would squeeze all others together."""
+
+
+def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLike], label: str = "SSIM") -> Figure:
+    """Cumulative distributions of a score over test rows, one step curve each; references dashed.
+
+    Args:
+        scores: values of each run by its name; NaN are left out.
+        references: the same for what runs are held against.
+        label: of the score's axis.
+    """
+    figure = Figure(figsize=(7.5, 4), layout="constrained")
+    axes = figure.subplots()
+    shown = [
+        np.ravel(values)[~np.isnan(np.ravel(values))] for group in (scores, references) for values in group.values()
+    ]
+    for number, (name, scored) in enumerate(zip([*scores, *references], shown, strict=True)):
+        # Beyond the colours there are, the same again in another style.
+        style = "--" if number >= len(scores) else ("-", "-.", ":")[number // COLOURS % 3]
+        axes.ecdf(scored, label=name, linestyle=style, color=f"C{number % COLOURS}")
+    axes.set_xlim(min(np.quantile(one, TAIL) for one in shown), max(np.quantile(one, 1 - TAIL) for one in shown))
+    axes.set_xlabel(label)
+    axes.set_ylabel("share of test rows below")
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, loc="outside right upper")
+    return figure
+
+
+def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "SSIM") -> Figure:
+    """Score on validation rows, while they are held out, over training time.
+
+    Args:
+        curves: pairs (seconds, score) of each run by its name.
+        label: of the score.
+    """
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, points in curves.items():
+        seconds, score = zip(*points, strict=True)
+        axes.plot(seconds, score, marker=".", label=name)
+    axes.set_xlabel("training time (s)")
+    axes.set_ylabel(f"{label} on held-out validation rows")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def without_formulas(figure: Figure) -> Figure:
+    """The figure with every text as it stands: names may hold dollar signs, between which Matplotlib sees a formula."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    return figure
+
+
+def save(figure: Figure, path: Path, dpi: int = 110) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return write_atomically(path, buffer.getvalue())

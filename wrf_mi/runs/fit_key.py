@@ -1,0 +1,154 @@
+"""Keys of fits that are kept and used again: digests of everything that determines a fit.
+
+A folder whose name holds the key of a fit can be used again without another look: another setting, row or seed, other
+content of the data or another version of a package makes another key, and so another folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..core import InputError
+from ..core.files import one_line
+from ..datasets.registry import locate
+from .folder import METRICS, versions
+
+logger = logging.getLogger(__name__)
+
+PACKAGES, COMPILED = ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"), "__pycache__"
+DIGITS = 16
+"""Of a key, hexadecimal: two of a million fits have the same one with a probability of 3e-8."""
+
+
+def fit_key(*determining: Any) -> str:
+    """Key of a fit: a digest of the versions of what computes (`versions`) and of what is given.
+
+    Args:
+        determining: arrays, data classes (fields that count in comparisons), mappings, tuples and lists of these, and
+            plain values. A path stands for the names and contents of the files there.
+
+    Raises:
+        InputError: a path where nothing is.
+    """
+    return content_digest(versions(), *determining)[:DIGITS]
+
+
+def content_digest(*values: Any) -> str:
+    """SHA-256 (hex) of values as `fit_key` takes them, without versions.
+
+    Raises:
+        InputError: a path where nothing is.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _add(digest, value)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    """Kind and size come before content, so that no two values have the same bytes."""
+    if isinstance(value, Path):
+        if not value.exists():
+            raise InputError(f"{value}: no such file or folder; restore it")
+        files = [value] if value.is_file() else _files_below(value)
+        digest.update(f"files {len(files)}\n".encode())
+        for file in files:
+            with file.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest.update(f"{file.relative_to(value).as_posix()!r} {content}\n".encode())
+    elif isinstance(value, np.ndarray):
+        digest.update(f"array {value.dtype.str} {value.shape}\n".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__}\n".encode())
+        _add(digest, {field.name: getattr(value, field.name) for field in fields(value) if field.compare})
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping {len(value)}\n".encode())
+        for key in sorted(value):
+            _add(digest, key)
+            _add(digest, value[key])
+    elif isinstance(value, (tuple, list)):
+        digest.update(f"sequence {len(value)}\n".encode())
+        for one in value:
+            _add(digest, one)
+    elif value is None or isinstance(value, (str, int, float, np.generic)):
+        digest.update(f"{value!r}\n".encode())
+    else:
+        raise TypeError(f"fit_key: {type(value).__name__} has no digest; give arrays, data classes or plain values")
+
+
+def _files_below(folder: Path) -> list[Path]:
+    """All files of a folder, those of folders that are links too."""
+    below = (Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+    return sorted(path for path in below if path.is_file())
+
+
+def source_files() -> dict[str, Path]:
+    """Every file of this package, its plugins and its scenes by name, compiled ones left out."""
+    found: dict[str, Path] = {}
+    for name in PACKAGES:
+        spec = find_spec(name)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            files = [path for path in _files_below(Path(folder)) if COMPILED not in path.parts]
+            found |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in files}
+    return found
+
+
+def dataset_files(name_or_folder: str) -> list[Path]:
+    """Folder or file of a data set, whose content is part of a key; none where it is not on this machine yet.
+
+    Raises:
+        InputError: no such data set.
+    """
+    path = Path(name_or_folder)
+    place = path if path.exists() else locate(name_or_folder)
+    return [] if place is None else [place]
+
+
+def scene_files(scene: str | Path) -> list[Path]:
+    """Folder or file of a scene, with the files that a Mitsuba XML names; none for a scene of this package by its name.
+
+    Raises:
+        InputError: an XML that cannot be read.
+    """
+    path = Path(scene)
+    if not path.exists():
+        return []
+    if path.suffix.lower() != ".xml":
+        return [path]
+    try:
+        stated = [node.get("value", "") for node in ElementTree.parse(path).iter("string")]
+    except (ElementTree.ParseError, OSError) as error:
+        raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
+    return [path, *(place for value in stated if value and (place := path.parent / value).is_file())]
+
+
+def fit_once(folder: Path, fit: Callable[[], object]) -> Path:
+    """Fit into a folder whose name holds the fit's key, unless a finished fit lies there; the log says which.
+
+    Args:
+        folder: of the run; a run in it that was stopped is removed.
+        fit: writes the run.
+
+    Returns:
+        The folder.
+    """
+    if (folder / METRICS).exists():
+        logger.info("%s: the same fit was finished before; used again", folder)
+        return folder
+    if folder.exists():
+        logger.info("%s: was stopped; fitted from the start", folder)
+        shutil.rmtree(folder)
+    fit()
+    return folder

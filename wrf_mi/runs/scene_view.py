@@ -1,0 +1,75 @@
+"""One picture of a place: its mesh, the paths that were traced in it and the Gaussians that were learned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..core.angles import FloatArray
+from ..gaussians.parameters import Gaussians
+from ..models.ray_tracing import PATHS
+from ..scene.preview import GaussianCloud, draw_scene
+from ..scene.surfaces import KINDS, Kind, Surface
+from ..tracing import load_trace
+from ..tracing.surfaces import scene_surfaces
+from .api import open_run
+
+SHOWN_GAUSSIANS = 40
+"""The strongest ones; all of them would hide the rest."""
+WEAKEST = 1e-6
+"""Signals below it are drawn as this: -120 dB."""
+
+
+def scene_view(traced: str | Path, row: int, field: str | Path | None = None) -> Figure:
+    """Mesh, traced paths and, of a field that was trained on the same data, Gaussians for one transmitter position.
+
+    Args:
+        traced: run folder of the ray tracer.
+        row: of the data set; its transmitter's paths are drawn, and the Gaussians for it.
+        field: run folder of a learned field, or None.
+
+    Raises:
+        InputError: not such run folders, or a scene that is no longer there.
+    """
+    run, found = open_run(traced), load_trace(Path(traced) / PATHS)
+    scene = run.problem.open_scene(found.frequency_hz)
+    transmitter = found.tx_pos_m[row]
+    own = found.paths.select(found.paths.tx == row)
+    cloud = None
+    if field is not None:
+        cloud = cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
+    return draw_scene(
+        surfaces_of(scene),
+        paths=replace(own, tx=np.zeros_like(own.tx), n_tx=1),
+        transmitters_m=transmitter,
+        receivers_m=[receiver.position_m for receiver in found.receivers],
+        gaussians=cloud,
+        title=f"{run.config.scene}, transmitter of row {row}",
+    )
+
+
+def surfaces_of(scene: Any) -> list[Surface]:
+    """The objects of a ``sionna.rt.Scene`` as surfaces; a name that begins with a kind's tells it, else ``other``."""
+    faces = scene_surfaces(scene)
+    surfaces = []
+    for index, name in enumerate(faces.names):
+        triangles: FloatArray = faces.triangles[faces.first_face[index] : faces.first_face[index + 1]]
+        kind: Kind = next((kind for kind in KINDS if name.startswith(kind)), "other")
+        corners = triangles.reshape(-1, 3)
+        surfaces.append(Surface(name, kind, corners, np.arange(len(corners)).reshape(-1, 3)))
+    return surfaces
+
+
+def cloud_of(gaussians: Gaussians) -> GaussianCloud:
+    """Gaussians for one transmitter, coloured by the strength with which they are seen, opacity times signal."""
+    position, scale, rotation = (
+        np.array(a, float).T for a in (gaussians.position, gaussians.scale, gaussians.rotation)
+    )
+    strength = np.hypot(*np.array(gaussians.signal, float))
+    if gaussians.opacity is not None:
+        strength = strength * np.array(gaussians.opacity, float)
+    return GaussianCloud(position, scale, rotation, 20 * np.log10(np.maximum(strength, WEAKEST)))

@@ -1,0 +1,39 @@
+"""Data sets that are traced on this machine: the laboratory, a furnished room, channels of two floors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..core import Record
+from ..datasets import load
+from .floor_channels import PLACES, PREFIX, walked_channels
+from .furnished_room import NAME as ROOM
+from .furnished_room import traced_room
+from .laboratory import NAME as LABORATORY
+from .laboratory import laboratory_record
+
+__all__ = ["laboratory_record", "load_record", "traced_room", "walked_channels"]
+
+
+def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
+    """Read any data set as `wrf_mi.datasets.load` does, and trace what is made on this machine where it is asked for.
+
+    These are the embedded ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
+    ``traced-csi-office`` (a minute or two each).
+
+    Args:
+        name_or_folder: a folder, or a known data set's name.
+        progress: show a progress bar on standard error where tracing takes time.
+
+    Raises:
+        InputError: as `wrf_mi.datasets.load`.
+    """
+    if not Path(name_or_folder).is_dir():
+        if name_or_folder == LABORATORY:
+            return laboratory_record(progress=progress)
+        if name_or_folder == ROOM:
+            return traced_room(progress=progress)[0]
+        place = str(name_or_folder).removeprefix(PREFIX)
+        if place in PLACES and place != str(name_or_folder):
+            return walked_channels(place, progress=progress)
+    return load(name_or_folder)

@@ -1,0 +1,169 @@
+"""Gains of known paths by Sionna RT's field calculator, with the materials that the scene has at this moment."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.antenna import MountedAntenna
+from .buffer import Legs, to_buffer
+from .options import TraceOptions
+from .surfaces import Surfaces
+
+PATHS_AT_ONCE = 1 << 19
+"""Paths of one call of the field calculator, which takes some 300 bytes per path and interaction."""
+
+
+@dataclass(frozen=True)
+class Devices:
+    """Devices of one side of a trace, as Sionna RT's field calculator takes them.
+
+    Attributes:
+        position_m: shape [n, 3], metres.
+        antennas: one for each, or one for all.
+    """
+
+    position_m: FloatArray
+    antennas: tuple[MountedAntenna, ...]
+
+    @property
+    def angles(self) -> FloatArray:
+        """Sionna RT's orientation of each device [n, 3] (alpha, beta, gamma; rad)."""
+        angles = np.array([sionna_orientation(one.to_world) for one in self.antennas])
+        return np.broadcast_to(angles, (len(self.position_m), 3))
+
+
+Ends = tuple[Devices, Devices]
+"""Sources and targets of a search, or transmitters and receivers."""
+
+
+def sionna_orientation(to_world: ArrayLike) -> tuple[float, float, float]:
+    """Sionna RT's orientation (alpha, beta, gamma; rad) of a device.
+
+    Args:
+        to_world: rotation [3, 3] from the device's frame, whose boresight is +x, to the world's; see
+            `wrf_mi.core.Antenna.to_world`.
+    """
+    with warnings.catch_warnings():
+        # Of a device that looks straight up or down many angles are right, and any of them will do.
+        warnings.filterwarnings("ignore", "Gimbal lock")
+        alpha, beta, gamma = Rotation.from_matrix(to_world).as_euler("ZYX")
+    return float(alpha), float(beta), float(gamma)
+
+
+def point_array(points: FloatArray) -> Any:
+    """Mitsuba's points of rows [n, 3]."""
+    import mitsuba as mi
+
+    from ..backend.device import to_vectors
+
+    return to_vectors(points, mi.Point3f)
+
+
+def field_of(
+    scene: Any,
+    buffer: Any,
+    ends: Ends,
+    rays: int,
+    loop_mode: Literal["symbolic", "evaluated"] = "symbolic",
+) -> tuple[Any, Any]:
+    """Complex gains of paths as Dr.Jit arrays, differentiable in the materials with ``loop_mode="evaluated"``.
+
+    Args:
+        scene: ``sionna.rt.Scene``.
+        buffer: p paths from source to target, as `wrf_mi.tracing.buffer.to_buffer` makes it; may be used again.
+        ends: sources and targets.
+        rays: that were shot per source, for diffuse reflections.
+        loop_mode: Dr.Jit's; the symbolic one is faster and has no derivatives.
+
+    Returns:
+        Real and imaginary part, ``mi.Float`` of p each, without the phase of travelling.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.field_calculator import FieldCalculator
+
+    if buffer.buffer_size == 0:
+        return mi.Float(), mi.Float()
+    calculator = FieldCalculator()
+    calculator.loop_mode = loop_mode
+    buffer.valid = dr.full(mi.Bool, True, buffer.buffer_size)
+    done = calculator(
+        wavelength=scene.wavelength,
+        paths=buffer,
+        samples_per_src=rays,
+        diffraction=buffer.diffracting_wedges is not None,
+        src_positions=point_array(ends[0].position_m),
+        tgt_positions=point_array(ends[1].position_m),
+        src_orientations=point_array(ends[0].angles),
+        tgt_orientations=point_array(ends[1].angles),
+        src_antenna_patterns=[_pattern(ends[0], buffer.source_indices)],
+        tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices)],
+    )
+    gain = done.a[0][0]
+    return gain.real, gain.imag
+
+
+def _pattern(devices: Devices, index: Any) -> Any:
+    """Sionna RT's antenna pattern of the devices ``index`` of p paths, as a function of zenith and azimuth angle."""
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.antenna_pattern import antenna_pattern_registry
+
+    from ..backend.device import to_uint
+
+    own = [one.antenna for one in devices.antennas]
+    distinct = list(dict.fromkeys(own))
+    functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
+    if len(distinct) == 1:
+        return functions[0]
+    kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in own])), index)
+
+    def mixed(theta: Any, phi: Any) -> tuple[Any, Any]:
+        first, second = functions[0](theta, phi)
+        for number, function in enumerate(functions[1:], start=1):
+            other = function(theta, phi)
+            first, second = dr.select(kind == number, other[0], first), dr.select(kind == number, other[1], second)
+        return first, second
+
+    return mixed
+
+
+def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
+    """Complex gains [p] of paths, without the phase of travelling, in parts of bounded memory.
+
+    Raises:
+        InputError: a gain that is not a number.
+    """
+    gain = np.zeros(len(legs), np.complex128)
+    for start in range(0, len(legs), PATHS_AT_ONCE):
+        part = slice(start, start + PATHS_AT_ONCE)
+        buffer = to_buffer(legs.select(part), surfaces, valid=True)
+        real, imaginary = field_of(scene, buffer, ends, rays)
+        gain[part] = real.numpy() + 1j * imaginary.numpy()
+    if not np.isfinite(gain).all():
+        raise InputError("gains that are not numbers: give materials constants that single precision can hold")
+    return gain
+
+
+@contextmanager
+def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
+    """Let every material scatter as asked for while the block lasts."""
+    able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
+    before = [material.scattering_coefficient for material in able]
+    for material in able:
+        material.scattering_coefficient = options.scattering_coefficient
+    try:
+        yield
+    finally:
+        for material, coefficient in zip(able, before, strict=True):
+            material.scattering_coefficient = coefficient

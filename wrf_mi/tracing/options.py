@@ -1,0 +1,115 @@
+"""What is traced: kinds of interaction, depth, rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from ..core import InputError
+
+MAX_DEPTH = 12
+MAX_RAYS = 1 << 24
+MAX_DEGREE = 8
+"""Of trainable antenna patterns: a single antenna's asks for no more, and Dr.Jit's `sh_eval` has few more."""
+
+
+@dataclass(frozen=True)
+class TraceOptions:
+    """Settings of `wrf_mi.tracing.trace_paths`; nothing that is off costs time.
+
+    Attributes:
+        line_of_sight: the direct path.
+        reflection: specular reflections.
+        transmission: straight through surfaces (slabs of the material's thickness).
+        diffraction: one diffraction at an edge.
+        scattering: diffuse reflection with ``scattering_coefficient`` at every surface.
+        max_depth: interactions per path at most, transmissions included.
+        max_reflections: of these, at most so many reflections; None: all may be. Does not bind paths with scattering or
+            diffraction.
+        rays: that search from each source (a power of two is best), or ``"auto"``: doubled until the paths of a sample
+            of positions grow no more, see `wrf_mi.tracing.solve.converged_rays`.
+        seed: of the directions of the rays.
+        scattering_coefficient: share of the reflected amplitude that is scattered, 0..1; for ``scattering`` alone.
+    """
+
+    line_of_sight: bool = True
+    reflection: bool = True
+    transmission: bool = False
+    diffraction: bool = False
+    scattering: bool = False
+    max_depth: int = 3
+    max_reflections: int | None = None
+    rays: int | Literal["auto"] = 1 << 17
+    seed: int = 1
+    scattering_coefficient: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be traced.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        if not 0 <= self.max_depth <= MAX_DEPTH:
+            raise InputError(f"max_depth {self.max_depth}: give 0 to {MAX_DEPTH}")
+        if self.max_reflections is not None and self.max_reflections < 0:
+            raise InputError(f"max_reflections {self.max_reflections}: give 0 or more")
+        if self.rays != "auto" and not (isinstance(self.rays, int) and 1 <= self.rays <= MAX_RAYS):
+            raise InputError(f'rays {self.rays}: give 1 to {MAX_RAYS}, or "auto"')
+        if self.seed < 0:
+            raise InputError(f"seed {self.seed}: give 0 or more")
+        if not 0 < self.scattering_coefficient <= 1:
+            raise InputError(f"scattering_coefficient {self.scattering_coefficient}: give a number in (0, 1]")
+
+    @property
+    def reflections(self) -> int:
+        """Reflections of a specular path at most."""
+        most = self.max_depth if self.max_reflections is None else min(self.max_reflections, self.max_depth)
+        return most if self.reflection else 0
+
+    @property
+    def sampled(self) -> bool:
+        """Whether paths are drawn at random (scattering) or along edges, so that Sionna RT's own search finds them."""
+        return (self.diffraction or self.scattering) and self.max_depth > 0
+
+
+DEFAULTS = TraceOptions()
+
+KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
+"""Kinds of path by the names that the command takes."""
+
+
+def with_kinds(
+    options: TraceOptions,
+    kinds: str | None = None,
+    *,
+    max_depth: int | None = None,
+    max_reflections: int | None = None,
+    rays: int | str | None = None,
+    seed: int | None = None,
+) -> TraceOptions:
+    """Options as the command states them; None keeps what ``options`` has.
+
+    Args:
+        options: to begin with.
+        kinds: the kinds of path to trace, separated by commas, from `KINDS`; all others are off.
+        max_depth: interactions per path at most.
+        max_reflections: of these at most.
+        rays: a number, as text or not, or ``"auto"``.
+        seed: of the rays.
+
+    Raises:
+        InputError: an unknown kind, or a number out of range.
+    """
+    changes: dict[str, Any] = {}
+    if kinds is not None:
+        asked = [kind.strip() for kind in kinds.split(",")]
+        unknown = [kind for kind in asked if kind not in KINDS]
+        if unknown:
+            raise InputError(f"kind of path {unknown[0]!r}: unknown; choose from {', '.join(KINDS)}")
+        changes |= {kind.replace("-", "_"): kind in asked for kind in KINDS}
+    if rays is not None and rays != "auto":
+        if not str(rays).isdecimal():
+            raise InputError(f'rays {rays!r}: give a whole number, or "auto"')
+        rays = int(rays)
+    given: dict[str, Any] = {"max_depth": max_depth, "max_reflections": max_reflections, "rays": rays, "seed": seed}
+    return replace(options, **changes, **{key: value for key, value in given.items() if value is not None})

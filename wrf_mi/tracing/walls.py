@@ -1,0 +1,183 @@
+"""The planes of a scene as mirrors and screens with outlines, in float64; offsets and tilts may be corrected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .surfaces import Surfaces
+
+ON_LINE_M = 1e-4
+"""Edges whose ends are so close to one line lie on it: a triangulation's inner edges cancel along it."""
+PAIRS_AT_ONCE = 1 << 22
+"""Pairs of point and edge that are worked on at once."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Planes n . x = d with outlines; q planes, e edges.
+
+    Attributes:
+        normal: unit normals [q, 3].
+        offset_m: d [q].
+        centre_m: point of each plane about which it is turned, the centroid of its faces [q, 3].
+        axes: two unit vectors in each plane [q, 2, 3].
+        area_m2: of its faces [q].
+        low_m, high_m: bounds of its faces along ``axes`` from ``centre_m`` [q, 2].
+        edge_m: both ends of each edge of the outlines, the same coordinates [e, 2, 2]; sorted by plane.
+        first_edge: where each plane's edges begin [q + 1].
+    """
+
+    normal: FloatArray
+    offset_m: FloatArray
+    centre_m: FloatArray
+    axes: FloatArray
+    area_m2: FloatArray
+    low_m: FloatArray
+    high_m: FloatArray
+    edge_m: FloatArray
+    first_edge: IntArray
+
+    def __len__(self) -> int:
+        """Number of planes."""
+        return len(self.normal)
+
+    def flat(self, plane: IntArray, points_m: FloatArray) -> FloatArray:
+        """Coordinates [n, 2] in planes [n] of points [n, 3], metres from the planes' centres."""
+        return np.einsum("nad,nd->na", self.axes[plane], points_m - self.centre_m[plane])
+
+    def moved(self, change: FloatArray) -> Walls:
+        """The planes shifted along their normals and turned about their centres.
+
+        Args:
+            change: shift in metres, and tilts in rad towards either axis [q, 3].
+        """
+        normal, offset = moved_planes(self.normal, self.axes, self.centre_m, change)
+        return replace(self, normal=normal, offset_m=offset)
+
+    def inside_m(self, plane: IntArray, flat_m: FloatArray) -> tuple[FloatArray, IntArray]:
+        """How far points [n, 2] of planes [n] lie inside the outlines, and the nearest edge of each.
+
+        Metres, negative outside; -inf and edge -1 for a plane without outline.
+        """
+        result, nearest = np.full(len(plane), -np.inf), np.full(len(plane), -1)
+        order = np.argsort(plane, kind="stable")
+        bounds = np.searchsorted(plane[order], np.arange(len(self) + 1))
+        for q in np.unique(plane):
+            edges = self.edge_m[self.first_edge[q] : self.first_edge[q + 1]]
+            members = order[bounds[q] : bounds[q + 1]]
+            step = max(1, PAIRS_AT_ONCE // max(len(edges), 1))
+            for start in range(0, len(members) if len(edges) else 0, step):
+                part = members[start : start + step]
+                result[part], edge = _inside(edges, flat_m[part])
+                nearest[part] = self.first_edge[q] + edge
+        return result, nearest
+
+
+def no_walls() -> Walls:
+    """Empty space."""
+    none, flat = np.zeros((0, 3)), np.zeros((0, 2))
+    axes, edges = np.zeros((0, 2, 3)), np.zeros((0, 2, 2))
+    return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
+
+
+def moved_planes(
+    normal: FloatArray, axes: FloatArray, centre_m: FloatArray, change: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Normals [q, 3] and offsets [q] of planes after a change, see `Walls.moved`."""
+    result = normal + np.einsum("qa,qad->qd", change[:, 1:], axes)
+    result /= np.linalg.norm(result, axis=1, keepdims=True)
+    return result, (result * centre_m).sum(axis=1) + change[:, 0]
+
+
+def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
+    """Centroids of the planes' faces, [q, 3] in metres, and the faces' areas [q] in square metres."""
+    triangles, plane = surfaces.triangles, surfaces.plane
+    count = len(surfaces.normal)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 2
+    total = np.asarray(np.bincount(plane, area, minlength=count), float)
+    centre = (
+        np.stack([np.bincount(plane, area * c, minlength=count) for c in triangles.mean(axis=1).T], axis=1)
+        / np.maximum(total, 1e-30)[:, None]
+    )
+    # On the plane itself: the centroid of faces that lie in it within rounding.
+    centre -= surfaces.normal * ((centre * surfaces.normal).sum(axis=1) - surfaces.offset)[:, None]
+    return centre, total
+
+
+def walls_of(surfaces: Surfaces) -> Walls:
+    """The planes of a scene's surfaces."""
+    triangles, plane = surfaces.triangles, surfaces.plane
+    count = len(surfaces.normal)
+    centre, total = plane_centres(surfaces)
+    flat = np.einsum("fad,fcd->fca", surfaces.axes[plane], triangles - centre[plane, None])
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, plane, flat.min(axis=1))
+    np.maximum.at(high, plane, flat.max(axis=1))
+    edges = [outline_edges(flat[plane == q]) for q in range(count)]
+    first = np.cumsum([0, *(len(part) for part in edges)])
+    return Walls(
+        surfaces.normal,
+        surfaces.offset,
+        centre,
+        surfaces.axes,
+        total,
+        low,
+        high,
+        np.concatenate([np.zeros((0, 2, 2)), *edges]),
+        np.asarray(first, np.int64),
+    )
+
+
+def outline_edges(triangles_m: FloatArray) -> FloatArray:
+    """Edges [e, 2, 2] of the area that triangles [f, 3, 2] cover, whose inner edges need not meet corner to corner.
+
+    Along each line, edges of triangles on its two sides cancel; what is left over is outline.
+    """
+    first, second = triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0]
+    twice = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    turned = np.where((twice < 0)[:, None, None], triangles_m[:, ::-1], triangles_m)[twice != 0]
+    start, end = turned.reshape(-1, 2), np.roll(turned, -1, axis=1).reshape(-1, 2)
+    along = end - start
+    length = np.linalg.norm(along, axis=1)
+    keep = length > ON_LINE_M
+    start, end, along = start[keep], end[keep], along[keep] / length[keep, None]
+    edges = []
+    left = np.ones(len(start), bool)
+    for index in np.argsort(-length[keep]):
+        if not left[index]:
+            continue
+        t, origin = along[index], start[index]
+        n = np.array([-t[1], t[0]])
+        near = (np.abs((start - origin) @ n) < ON_LINE_M) & (np.abs((end - origin) @ n) < ON_LINE_M) & left
+        left &= ~near
+        s0, s1 = (start[near] - origin) @ t, (end[near] - origin) @ t
+        stops = np.unique(np.round(np.concatenate([s0, s1]) / ON_LINE_M)) * ON_LINE_M
+        middle = (stops[1:] + stops[:-1]) / 2
+        covered = ((s0[:, None] < middle) & (middle < s1[:, None])).sum(axis=0)
+        covered -= ((s1[:, None] < middle) & (middle < s0[:, None])).sum(axis=0)
+        for a, b, net in zip(stops[:-1], stops[1:], covered, strict=True):
+            if net:
+                edges.append([origin + a * t, origin + b * t])
+    return np.asarray(edges, float).reshape(-1, 2, 2)
+
+
+def _inside(edges_m: FloatArray, points_m: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distance [n] to the nearest of edges [e, 2, 2], negative outside (even-odd rule), and its index."""
+    a, b = edges_m[:, 0], edges_m[:, 1]
+    along = b - a
+    away = points_m[:, None] - a
+    share = np.clip((away * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-30), 0, 1)
+    square = np.square(away - share[..., None] * along).sum(axis=-1)
+    nearest = square.argmin(axis=1)
+    near = np.sqrt(square[np.arange(len(points_m)), nearest])
+    y = points_m[:, 1:]
+    above = (a[:, 1] > y) != (b[:, 1] > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = a[:, 0] + (y - a[:, 1]) / along[:, 1] * along[:, 0]
+    odd = (above & (points_m[:, :1] < at)).sum(axis=1) % 2 == 1
+    return np.where(odd, near, -near), nearest

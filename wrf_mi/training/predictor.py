@@ -1,0 +1,290 @@
+"""What receivers report of a trained graph, for new transmitters."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..backend.device import to_float, to_tensor
+from ..backend.recorded import Recorded
+from ..core import InputError, Receiver, Record
+from ..core.angles import FloatArray
+from ..core.receivers import receiver_index
+from ..core.types import IntArray
+from ..gaussians.parameters import Gaussians
+from ..gaussians.skip import NOTHING, Skip
+from ..gaussians.tiles import perception_plane
+from ..graph.graph import Batch, Field, Graph
+from ..graph.receivers import PIXEL, Form
+from ..tasks.conditions import known_uplink, normalised_uplink
+from .reach import Reach
+from .static_operator import StillField, stands_still
+from .step import CompiledPredictor, Params, device_pose, evaluated
+
+if TYPE_CHECKING:
+    from ..tracing.traced_field import TracedField
+
+TOGETHER = 16
+"""Transmitters whose Gaussians, or paths and Gaussians, are evaluated together."""
+TRACED_NUMBERS = 512
+"""With paths, of small observations as many as have so many numbers: each search for paths has its price."""
+
+
+class Predictor:
+    """Evaluates one field for any receiver and image size.
+
+    Args:
+        field: the model.
+        params: its parameters as NumPy arrays, and those of the traced side.
+        receivers: poses, by which spectra are asked for.
+        height: rows of a spectrum.
+        width: columns.
+        skip: what is not evaluated.
+        operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear
+            map from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction. It leaves nothing
+            out, whatever ``skip`` says.
+        store: folder in which operators are kept from process to process; None: in memory alone.
+        graph: of the field, these receivers and a scene; None: the field alone, seen by pixel receivers.
+        reach: where the Gaussians are trusted; None: everywhere.
+    """
+
+    def __init__(
+        self,
+        field: Field | None,
+        params: Mapping[str, NDArray[np.float32]],
+        receivers: Sequence[Receiver],
+        height: int,
+        width: int,
+        skip: Skip = NOTHING,
+        operator: bool = False,
+        store: Path | None = None,
+        graph: Graph | None = None,
+        reach: Reach | None = None,
+    ) -> None:
+        self.receivers, self.reach = tuple(receivers), reach
+        self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
+        # The operator and the recorded prediction are the splatted magnitude at each direction.
+        self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
+        self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
+        self._poses = [device_pose(r) for r in self.receivers]
+        self._plane = perception_plane(height, width, mi.Float)
+        self._field, self._skip, self._count = field, skip, -1
+        self._by_operator, self._store = operator and self._pixels and stands_still(field), store
+        self._reports: dict[int, Recorded] = {}
+        self._still: StillField | None = None
+        self.update({name: to_tensor(values) for name, values in params.items()})
+
+    def update(self, params: Params) -> None:
+        """Use other parameters (Dr.Jit tensors) from now on."""
+        count = params["position"].shape[1] if "position" in params else 0
+        if count != self._count:
+            # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
+            self._predict = None if self._field is None else CompiledPredictor(self._field, self._skip)
+            self._count, self._reports = count, {}
+        self._params, self._still = params, None
+        dr.eval(self._params)
+
+    def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
+        """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
+        columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
+        return self._gaussians.gaussians(self._params, to_tensor(columns)).spread()
+
+    @property
+    def _gaussians(self) -> Field:
+        if self._field is None:
+            raise ValueError("paths alone: there are no Gaussians")
+        return self._field
+
+    def still(self) -> StillField:
+        """The field as operators; forgotten when parameters change."""
+        if self._still is None:
+            params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
+            size = self._plane.height, self._plane.width
+            self._still = StillField(self._gaussians, params, self.receivers, *size, self._store)
+        return self._still
+
+    @property
+    def uses_heading(self) -> bool:
+        """Whether predictions depend on the transmitters' headings: a trained pattern turns with them."""
+        return self.graph.form.headings
+
+    def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
+        """What a receiver observes in rows of a record, see `__call__`."""
+        uplink = None if record.uplink is None else record.uplink[rows]
+        heading = record.tx_heading_rad[rows] if self.uses_heading and record.tx_heading_rad is not None else None
+        return self(record.tx_pos_m[rows], receiver, uplink, heading)
+
+    def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
+        """Headings as an array, where they are used."""
+        if (tx_heading_rad is not None) != self.uses_heading:
+            text = "needs headings; give heading_rad" if self.uses_heading else "does not know how it is turned"
+            raise InputError(f"transmitter: the model {text}{'' if self.uses_heading else '; leave heading_rad away'}")
+        if tx_heading_rad is None:
+            return None
+        heading = np.asarray(tx_heading_rad, float)
+        if heading.shape != (count,) or not np.isfinite(heading).all():
+            raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
+        return heading
+
+    def _traced(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
+    ) -> Any:
+        """What a receiver reports of both sides, flat, unrecorded; positions without paths are learned ones alone."""
+        side = self.graph.trace(tx_pos_m, receiver, heading_rad)
+        if side is not None:
+            side.refresh(self._params)
+        return self._evaluated(tx_pos_m, receiver, side, None, weight)
+
+    def _evaluated(
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        side: TracedField | None,
+        slots: IntArray | None,
+        weight: NDArray[Any] | None,
+    ) -> Any:
+        learned = side is None or weight is None or bool(np.any(weight))
+        report, pose = self.graph.report(receiver, side, learned, self._skip), self._poses[receiver]
+        return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
+
+    def of_side(
+        self, tx_pos_m: FloatArray, receiver: int, side: TracedField | None, slots: IntArray, weight: NDArray[Any]
+    ) -> NDArray[Any]:
+        """What a receiver reports of transmitters whose paths are known.
+
+        Args:
+            tx_pos_m: positions [m, 3], metres.
+            receiver: its number.
+            side: its traced side, or None.
+            slots: rows of that [m].
+            weight: of the Gaussians' signal [m], 0 to 1.
+
+        Returns:
+            As `__call__`.
+        """
+
+        def found(part: slice) -> Any:
+            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weight[part])
+
+        return self._in_parts(len(tx_pos_m), receiver, found)
+
+    def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
+        """What a receiver reports of conditions [3 or features, at most `TOGETHER`], recorded, flat."""
+        if receiver not in self._reports:
+            report = self.graph.report(receiver, None, skip=self._skip)
+
+            def predicted(params: Params, batch: Batch) -> Any:
+                with dr.suspend_grad():
+                    return report(params, batch)
+
+            # What is made from NumPy's memory at first use must be there before a recording.
+            evaluated(report, self._params, condition[:, :1], receiver, self._poses[receiver], self._plane)
+            self._reports[receiver] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
+        # Their number is a constant of the recorded kernels: the last ones are filled up with copies.
+        count = condition.shape[1]
+        filled = np.minimum(np.arange(TOGETHER), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
+        dr.make_opaque(slots)
+        own = None if weight is None else to_float(weight[filled])
+        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, own)
+        found = self._reports[receiver](self._params, batch)
+        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
+
+    def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
+        """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
+        weight = None if self.reach is None else self.reach.weight(given, receiver)
+        if weight is not None and weight.any() and not weight.all():
+            # Where Gaussians are not trusted they are not evaluated.
+            parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
+            turned = [None if heading_rad is None else heading_rad[part] for part in parts]
+            found = [self._reported(given[part], receiver, own) for part, own in zip(parts, turned, strict=True)]
+            return np.concatenate(found)[np.argsort(np.concatenate(parts))]
+
+        if self.graph.scene is None and weight is not None and not weight.any():
+            return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
+
+        def evaluate(part: slice) -> Any:
+            own = None if weight is None else weight[part]
+            if self._recordable:
+                return self._learned(given[part].T, receiver, own)
+            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
+
+        return self._in_parts(len(given), receiver, evaluate)
+
+    def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
+        """Reports of so many transmitters from the flat ones of parts of them."""
+        shape = self.graph.models[receiver].shape
+        if self.graph.form.features:  # of one antenna of the array
+            shape = shape[-2:]
+        out = np.empty((count, *shape), np.float32)
+        together = TOGETHER if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
+        for start in range(0, count, together):
+            part = slice(start, min(start + together, count))
+            out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
+        return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
+
+    def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
+        """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
+        features, divisor = normalised_uplink(known_uplink(uplink))
+        found = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1) * divisor[..., None]
+        return (found if len(self.graph.form.outputs) > 1 else found[:, 0]).astype(np.complex64)
+
+    def __call__(
+        self,
+        tx_pos_m: ArrayLike,
+        receiver: int | str = 0,
+        uplink: NDArray[Any] | None = None,
+        tx_heading_rad: ArrayLike | None = None,
+    ) -> NDArray[Any]:
+        """What one receiver observes of transmitters.
+
+        Args:
+            tx_pos_m: positions [m, 3], world frame, metres.
+            receiver: name, or number from 0, of one of ``receivers``.
+            uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them; positions are not
+                looked at then.
+            tx_heading_rad: yaw of each transmitter [m], radians, if and only if ``uses_heading``.
+
+        Returns:
+            Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
+
+        Raises:
+            InputError: positions of another shape or not finite, no uplink or headings where they are needed, headings
+                where they are not used, or no such receiver.
+        """
+        index = receiver_index(self.receivers, receiver)
+        if self.graph.form.features:
+            return self._by_uplink(uplink, index)
+        positions = np.asarray(tx_pos_m, np.float32)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
+        bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+        if len(bad):
+            raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
+        if self._by_operator:
+            try:
+                return self.still()(positions, index)
+            except MemoryError as error:
+                warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
+                self._by_operator = False
+        if not self._pixels:
+            given = np.asarray(tx_pos_m, float)
+            turned = self._headings(tx_heading_rad, len(given))
+            self.graph.check(given)
+            return self._reported(given, index, turned)
+        height, width = self._plane.height, self._plane.width
+        out = np.empty((len(positions), height, width), np.float32)
+        assert self._predict is not None, "a field of pixels"
+        for image, position in zip(out, positions, strict=True):
+            tx = to_tensor(position[:, None])
+            image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)
+        return out

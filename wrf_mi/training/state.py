@@ -1,0 +1,154 @@
+"""The state of a fit between two steps: parameters, Adam's moments, running mean; to and from NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+from numpy.typing import NDArray
+
+from ..backend.device import to_float, to_tensor
+from ..gaussians.density import DensityChange
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class FitState:
+    """Parameters under optimisation.
+
+    Args:
+        params: starting values.
+        momentum: Adam's decay of the first moment.
+
+    Attributes:
+        adam: Dr.Jit's optimiser, which owns the current parameters.
+        mean: running mean of the parameters, which is what is evaluated.
+        step: steps taken.
+        urge: sum since the last round of density control of each Gaussian's directional gradient, [n].
+        urge_steps: steps in that sum.
+        reach_m: how far from training transmitters the Gaussians are trusted, metres (`wrf_mi.training.reach`);
+            infinite: everywhere.
+        searched_m: where each receiver was when paths were searched last, [n_rx, 3], metres; empty without a scene.
+        chosen: step from which the fit went on, see `wrf_mi.training.config.TrainConfig.patience`; 0: from the last
+            one.
+        best: the state that scored best on validation rows (see `arrays`); None: none is kept.
+        best_score: its score, the higher the better; also once the fit went on from it.
+        waited: scores since then.
+    """
+
+    def __init__(self, params: Mapping[str, NDArray[np.float32]], momentum: float = 0.9) -> None:
+        self.adam = Adam(lr=0.0, beta_1=momentum)
+        self.adam.update({name: to_tensor(values) for name, values in params.items()})
+        self.mean = {name: to_tensor(values) for name, values in params.items()}
+        self.step = self.chosen = 0
+        self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
+        self.best: Arrays | None = None
+        self.best_score, self.waited = -np.inf, 0
+        self._clear_urge()
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians; 0 where paths are trained alone."""
+        return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
+
+    def _clear_urge(self) -> None:
+        self.urge, self.urge_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
+        dr.make_opaque(self.urge)
+
+    def params(self) -> Arrays:
+        """Current parameters."""
+        return {name: dr.detach(self.adam[name]).numpy().copy() for name in self.adam}
+
+    def mean_params(self) -> Arrays:
+        """Running mean of the parameters."""
+        return {name: self.mean[name].numpy().copy() for name in self.mean}
+
+    def moments(self) -> tuple[Arrays, Arrays, int]:
+        """Adam's first and second moments in the parameters' shapes, and its step count."""
+        first, second, count = {}, {}, 0
+        for name, (value, _, _, (t, m, v, _)) in self.adam.state.items():
+            first[name], second[name] = (a.numpy().copy().reshape(value.shape) for a in (m, v))
+            count = int(t[0])
+        return first, second, count
+
+    def _set_moments(self, first: Arrays, second: Arrays, count: int) -> None:
+        for name, (value, promoted, rate, _) in list(self.adam.state.items()):
+            moments = (to_float(first[name]), to_float(second[name]))
+            self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
+
+    def change_density(self, change: DensityChange) -> None:
+        """Replace the set of Gaussians; what is fresh starts without momentum, what is new without a past mean."""
+        first, second, count = self.moments()
+        before, mean = self.params(), self.mean_params()
+        for name, values in change.parameters.items():
+            fresh = np.broadcast_to(change.fresh, values.shape)
+            first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
+            second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
+            # A clone's original has a new opacity: the old one's mean beside the clone would count it twice.
+            new = fresh | (values != before[name][:, change.source])
+            mean[name] = np.where(new, values, mean[name][:, change.source]).astype(np.float32)
+            self.adam[name] = to_tensor(values)
+        self.mean = {name: to_tensor(values) for name, values in mean.items()}
+        self._set_moments(first, second, count)
+        self._clear_urge()
+
+    def forget_moments(self) -> None:
+        """Let Adam start anew from the parameters as they are."""
+        nothing = {name: np.zeros_like(values) for name, values in self.params().items()}
+        self._set_moments(nothing, nothing, 0)
+
+    def set_param(self, name: str, values: NDArray[np.float32]) -> None:
+        """Set one parameter and forget its momentum (opacity reset)."""
+        _, _, count = self.moments()
+        self.adam[name] = to_tensor(values)
+        self.adam.reset(name)
+        value, promoted, rate, (_, m, v, _) = self.adam.state[name]
+        self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
+
+    def keep_best(self, score: float) -> None:
+        """Remember this moment if its score is the best so far."""
+        self.waited += 1
+        if score > self.best_score:
+            self.best, self.best_score, self.waited = self._now(), score, 0
+
+    def go_back(self) -> FitState:
+        """The moment that was kept, with nothing kept in it but its score."""
+        if self.best is None:
+            return self
+        return FitState.from_arrays(self.best | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
+
+    def arrays(self) -> Arrays:
+        """All of it, for a checkpoint."""
+        kept = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
+        return self._now() | kept | {f"best/{name}": values for name, values in (self.best or {}).items()}
+
+    def _now(self) -> Arrays:
+        """All of it but what is kept."""
+        first, second, count = self.moments()
+        groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
+        flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
+        scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
+        flat |= {"urge": self.urge.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
+        flat |= {"searched_m": self.searched_m.copy()}
+        return flat | {name: np.asarray(value) for name, value in scalars.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
+        """The state that `arrays` described, with Adam's decay of the first moment."""
+
+        def group(prefix: str) -> Arrays:
+            return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
+
+        state = cls(group("param/"), momentum)
+        state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
+        state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
+        state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
+        state.urge_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
+        state.urge, state.searched_m = to_float(arrays["urge"]), np.array(arrays["searched_m"])
+        state.best = group("best/") or None
+        state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
+        return state

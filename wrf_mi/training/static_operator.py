@@ -1,0 +1,168 @@
+"""Prediction by operator: a trained field whose Gaussians stand still, as the receivers of a run see it.
+
+    operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
+
+The file is a store, not a source: its key is a digest of all that the weights depend on. Another receiver, image size
+or geometry, a field that was trained on, another version of this package: the key differs and they are built anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from .. import __version__
+from ..backend.device import to_tensor
+from ..backend.recorded import Recorded
+from ..core import Receiver
+from ..core.files import write_arrays
+from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from ..gaussians.operator import Images, PixelOperator, pixel_weights
+from ..gaussians.static_signals import ComplexArray, Signals, host_signals
+from ..gaussians.tiles import perception_plane
+from .step import DARK, Field, device_pose
+
+FORMAT = 1
+"""Version of the file."""
+MOST_BYTES = 1 << 30
+"""Of one receiver's weights; larger fields are evaluated directly."""
+
+
+def stands_still(field: Any) -> bool:
+    """Whether geometry and attenuation of a field are the same for all transmitters."""
+    return bool(getattr(field, "still", False))
+
+
+class RecordedSignals:
+    """Signals of any field that stands still, by its own Dr.Jit function; see
+    `wrf_mi.gaussians.static_signals.Signals`.
+
+    Args:
+        field: the model.
+        params: its parameters.
+    """
+
+    factors: ComplexArray | None = None
+
+    def __init__(self, field: Field, params: Mapping[str, NDArray[np.float32]]) -> None:
+        self._params = {name: to_tensor(values) for name, values in params.items()}
+
+        @Recorded
+        def signals(params: Mapping[str, Any], tx_pos: Any) -> Any:
+            with dr.suspend_grad():
+                return field.gaussians(params, tx_pos).signal
+
+        self._signals = signals
+
+    def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
+        """Signals [m, n] of transmitters [m, 3] in metres."""
+        rows = []
+        for position in np.asarray(tx_pos_m, np.float32):
+            re, im = self._signals(self._params, to_tensor(position[:, None]))
+            rows.append(re.numpy() + np.complex64(1j) * im.numpy())
+        return np.stack(rows)
+
+
+class StillField:
+    """A field that stands still, ready to predict by operator.
+
+    Args:
+        field: the model.
+        params: its parameters as NumPy arrays.
+        receivers: poses.
+        height: rows of a spectrum.
+        width: columns.
+        folder: where operators are stored; None: kept in memory alone.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        params: Mapping[str, NDArray[np.float32]],
+        receivers: Sequence[Receiver],
+        height: int,
+        width: int,
+        folder: Path | None = None,
+    ) -> None:
+        self._field, self._params, self._receivers = field, params, tuple(receivers)
+        self._size, self._folder = (height, width), folder
+        self._signals: Signals = host_signals(field, params) or RecordedSignals(field, params)
+        self._ready: dict[int, Images | PixelOperator] = {}
+
+    def __call__(self, tx_pos_m: NDArray[np.float32], receiver: int) -> NDArray[np.float32]:
+        """Greys [m, height, width] of transmitters [m, 3]."""
+        if receiver not in self._ready:
+            weights = self.weights(receiver)
+            operator: Images | PixelOperator = PixelOperator(weights, *self._size)
+            if self._signals.factors is not None:
+                operator = PixelOperator(weights, *self._size).composed(self._signals.factors)
+            self._ready[receiver] = operator
+        return self._ready[receiver].magnitude(self._signals.coefficients(tx_pos_m), DARK)
+
+    def key(self, receiver: int) -> str:
+        """Digest of all that the weights at a receiver depend on."""
+        pose = self._receivers[receiver]
+        constants = (FORMAT, __version__, *self._size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M)
+        digest = hashlib.sha256(repr((constants, self._field)).encode())
+        arrays: dict[str, NDArray[Any]] = {"position of the receiver": pose.position_m, "its turn": pose.to_world}
+        signal_alone = self._field.signal_parameters
+        arrays |= {name: a for name, a in self._params.items() if not name.startswith(signal_alone)}
+        for name in sorted(arrays):
+            values = np.ascontiguousarray(arrays[name])
+            digest.update(f"{name} {values.dtype} {values.shape}".encode())
+            digest.update(values.tobytes())
+        return digest.hexdigest()
+
+    def weights(self, receiver: int) -> csr_array:
+        """Weights [pixels, n] at a receiver: stored ones if they still hold, else built and stored.
+
+        Raises:
+            MemoryError: they would take more than `MOST_BYTES`.
+        """
+        key = self.key(receiver)
+        shape = self._size[0] * self._size[1], self._params["position"].shape[1]
+        path = None if self._folder is None else self._folder / f"operator{receiver}.npz"
+        stored = None if path is None else read_weights(path, key, shape)
+        if stored is not None:
+            return stored
+        tensors = {name: to_tensor(values) for name, values in self._params.items()}
+        with dr.suspend_grad():
+            gaussians = self._field.gaussians(tensors, to_tensor(np.zeros((3, 1))))
+            pose, plane = device_pose(self._receivers[receiver]), perception_plane(*self._size, mi.Float)
+            weights = pixel_weights(gaussians, pose, plane, MOST_BYTES)
+        if path is not None:
+            write_weights(path, key, weights)
+        return weights
+
+
+def write_weights(path: Path, key: str, weights: csr_array) -> None:
+    """Store weights; a folder that cannot be written is no harm."""
+    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+    try:
+        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts)
+    except OSError:
+        return
+
+
+def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:
+    """Stored weights of ``shape``; None if there are none, or damaged ones, or those of another key."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
+                return None
+            data, indices, indptr = (stored[name] for name in ("data", "indices", "indptr"))
+    except Exception:  # numpy and zipfile raise a dozen kinds on damaged files
+        return None
+    fits = len(indptr) == shape[0] + 1 and len(data) == len(indices) == indptr[-1] and indptr[0] == 0
+    # SciPy's product checks nothing: what points outside would end the process.
+    if not fits or (np.diff(indptr) < 0).any() or (len(indices) and not 0 <= indices.min() <= indices.max() < shape[1]):
+        return None
+    return csr_array((data, indices, indptr), shape=shape)

@@ -1,0 +1,170 @@
+"""What a fit compares reports with: observations as flat numbers, and what the field is told of each.
+
+A *condition* is what a field sees in the transmitter's place: a row's position, or with an uplink the uplink channel of
+one antenna of a row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Record, Split
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..graph.receivers import AUTO, Form, receiver_kind
+from ..tasks import task_of
+from ..tasks.conditions import normalised_uplink, outputs_of
+from .config import TrainConfig
+from .schedule import Schedule, density_rounds, plan
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Conditions and observations of a record.
+
+    Attributes:
+        condition: positions [3, c] in metres or features [features, c].
+        truth: float32 [n_rx, c, *shape of a report], NaN where nothing was received.
+        unit: of each receiver, by which differences are divided in the loss, [n_rx].
+        per_row: conditions of a row; they stand one after the other.
+        weight: factor of each observation's difference in the loss [n_rx, c]; None: 1 throughout.
+    """
+
+    condition: FloatArray
+    truth: NDArray[np.float32]
+    unit: FloatArray
+    per_row: int = 1
+    weight: FloatArray | None = None
+
+    def conditions(self, rows: IntArray) -> IntArray:
+        """Numbers of the conditions of rows."""
+        return np.asarray((rows[:, None] * self.per_row + np.arange(self.per_row)).ravel())
+
+    def received(self, receiver: int, rows: IntArray) -> IntArray:
+        """Conditions of those rows that a receiver observed."""
+        chosen = self.conditions(rows)
+        seen = np.isfinite(self.truth[receiver, chosen]).all(axis=tuple(range(1, self.truth.ndim - 1)))
+        return chosen[seen]
+
+
+def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
+    """Conditions and observations of a record; units are measured on training rows.
+
+    An uplink is the condition where there is one, but beside paths of a scene, which are traced from positions.
+
+    Raises:
+        InputError: a position that is not known, or an uplink without a signal or of other antennas.
+    """
+    task, seen = task_of(record), np.asarray(record.observation)
+    if record.uplink is None or with_scene:
+        if not np.isfinite(record.tx_pos_m[rows]).all():
+            row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
+            raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
+        units = np.array([task.unit(own[rows]) for own in seen])
+        weight = _weights(record, rows)
+        return Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
+    outputs = outputs_of(record)
+    features, divisor = normalised_uplink(record.uplink)
+    channels = seen[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
+    truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
+    known = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
+    return Targets(np.asarray(features.T, float), truth, np.array([_rms(truth[0, known])]), outputs.antennas)
+
+
+def _weights(record: Record, rows: IntArray) -> FloatArray | None:
+    """One over the noise's standard deviation, with a mean of 1 over what training rows received; 1 in other rows.
+
+    Divided by it differences are standardised residuals: an absolute error is then weighted by 1 / std, the weight of
+    least variance for medians, and a squared one by 1 / variance, that for means.
+    """
+    precision = record.precision(rows)
+    if precision is None:
+        return None
+    weight = np.ones(record.observation.shape[:2])
+    inverse = np.sqrt(precision)
+    weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
+    return weight
+
+
+def _rms(values: NDArray[np.float32]) -> float:
+    return float(np.sqrt(2 * np.mean(np.square(values, dtype=float)))) or 1.0
+
+
+def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Complex values with a last axis of real and imaginary part."""
+    if not np.iscomplexobj(values):
+        return np.ascontiguousarray(values, np.float32)
+    whole = np.ascontiguousarray(values, np.complex64)
+    return whole.view(np.float32).reshape(*whole.shape, 2)
+
+
+def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
+    """What a record's observations are made of, as settings have it.
+
+    Args:
+        record: of any task.
+        config: settings.
+        targets: of the record.
+        rows: training rows, whose channels tell the basis.
+        with_scene: whether paths of a scene are trained.
+
+    Raises:
+        InputError: a receiver model of another task.
+    """
+    task = task_of(record)
+    default = task.receiver_with_scene if with_scene else task.receiver
+    if not default:
+        raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
+    name = default if config.receiver == AUTO else config.receiver
+    receiver_kind(name, task.name)
+    view = config.view.height, config.view.columns
+    size = tuple(map(int, record.observation.shape[-2:])) if task.image else view
+    basis = _basis(targets, rows, config.view.components) if task.is_complex else None
+    outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
+    features = 0 if record.uplink is None or with_scene else len(targets.condition)
+    headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
+    if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
+        raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
+    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features, headings)
+
+
+def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
+    """Principal components [components, outputs] of the training rows' channels, their mean not taken off.
+
+    Receivers count alike, however far away or seldom heard, since scores are relative.
+    """
+    power: NDArray[np.complex128] | float = 0.0
+    for receiver in range(len(targets.truth)):
+        pairs = targets.truth[receiver, targets.received(receiver, rows)].astype(float)
+        own = (pairs[..., 0] + 1j * pairs[..., 1]).reshape(len(pairs), -1)
+        power = power + own.conj().T @ own / (np.square(np.abs(own)).sum() or 1.0)
+    _, vectors = np.linalg.eigh(power)
+    # Rows v^H so that a channel's coefficients are h v and the channel is their sum with v^H.
+    return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
+
+
+def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool = False) -> Schedule:
+    """The plan of a fit: each receiver learns from what it observed.
+
+    Args:
+        config: settings.
+        targets: of the record.
+        split: rows that train and rows that choose.
+        joint: whether Gaussians are trained beside paths of a scene.
+
+    Raises:
+        InputError: see `wrf_mi.training.schedule.plan`, or no step is left for the Gaussians.
+    """
+    everything = [targets.received(r, split.all_train) for r in range(len(targets.truth))]
+    train = [targets.received(r, split.train) for r in range(len(targets.truth))]
+    # A receiver whose few rows all are to choose by learns from these.
+    train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
+    first = round(config.traced.alone * config.steps) if joint else 0
+    if joint and config.patience and 0 < config.hold_out <= config.traced.alone:
+        text = f"{config.traced.alone} of the steps are not less than hold_out, {config.hold_out}"
+        raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
+    rng = np.random.default_rng([config.seed, 1])
+    return plan(config, train, everything, rng, density_rounds(config.density, config.steps, first), first)

@@ -1,0 +1,355 @@
+"""Training of Gaussians, of the paths of a scene, or of both."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend import init
+from ..backend.device import to_float, to_tensor
+from ..core import InputError, Record, Split
+from ..datasets.observations import check_observations
+from ..gaussians import InitialGaussians
+from ..gaussians.density import adapt, reset_opacity
+from ..gaussians.tiles import perception_plane
+from ..graph.graph import LEVEL, SHARE, Field, Graph
+from ..graph.settings import TRACED_NAMES
+from ..tasks import task_of
+from ..tasks.conditions import placed_receivers
+from .adam import NonFiniteReport
+from .config import PATHS_ALONE, TrainConfig
+from .fields import make_field
+from .initial import initial_gaussians
+from .loop import TrainingLoop
+from .predictor import Predictor
+from .reach import Reach, choose_reach, hold_out_groups
+from .state import FitState
+from .step import Loss, TrainingData, device_pose, evaluated, make_step
+from .targets import form_of, plan_rows, targets_of
+
+logger = logging.getLogger(__name__)
+
+AT_ONCE = 64
+"""Observations of a receiver by which its level starts."""
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def check_rows(split: Split, record: Record, source: str) -> None:
+    """Refuse a split with rows that the record has not; ``source`` says where the split comes from.
+
+    Raises:
+        InputError: such a row.
+    """
+    rows = np.concatenate([split.train, split.validation, split.test])
+    bad = rows[(rows < 0) | (rows >= len(record))]
+    if len(bad):
+        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
+
+
+class Trainer(TrainingLoop):
+    """Fits one field to the training rows of one split.
+
+    Args:
+        record: of any task that a receiver model reports.
+        split: which rows train and which choose.
+        config: settings.
+        field: a model of your own in place of the one that ``config.model`` names.
+        initial: starting values in place of those that ``config.initial`` describes.
+        state: of a fit that was stopped, to go on from.
+        loss: in place of the task's: ``loss(prediction, truth, batch, *shape)`` of flat Dr.Jit arrays in the
+            receiver's unit, NaN in the truth where nothing was received.
+        scene: from `wrf_mi.tracing.open_scene`, at the record's carrier: its paths are trained together with the
+            Gaussians. None: Gaussians alone.
+
+    Raises:
+        InputError: settings or data that cannot be trained on.
+        BackendError: a deterministic fit in a process that computes on a GPU already.
+    """
+
+    config: TrainConfig
+
+    def __init__(
+        self,
+        record: Record,
+        split: Split,
+        config: TrainConfig,
+        *,
+        field: Field | None = None,
+        initial: InitialGaussians | None = None,
+        state: FitState | None = None,
+        loss: Loss | None = None,
+        scene: Any | None = None,
+    ) -> None:
+        check_rows(split, record, f"split {split.name}")
+        self.task = task_of(record)
+        self.label, self.higher_is_better = self.task.label, self.task.higher_is_better
+        check_observations(record, split, complete=self.task.image)
+        if record.carriers_hz is not None:
+            raise InputError(f"{record.name} has several carriers; train on one of them")
+        known = split.all_train
+        config = config.resolved(record.tx_pos_m[known])
+        self.record, self.split, self.config = record, split, config
+        self.targets = targets_of(record, known, scene is not None)
+        form = form_of(record, config, self.targets, known, scene is not None)
+        receivers = placed_receivers(record, by_uplink=bool(form.features))
+        self.graph = Graph(
+            field or (None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)),
+            receivers,
+            form,
+            scene,
+            config.traced,
+            record.tx_antenna,
+            config.evaluation,
+        )
+        self._shape = self.targets.truth.shape[2:]
+        self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
+        # Gaussians that correct something are chosen on rows away from those that train, too.
+        self._chooses_reach = self.graph.corrects and config.patience > 0 and config.hold_out > 0
+        self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
+        unjudged = self._chooses_reach and self._choosing is split
+        joint = self.graph.field is not None and scene is not None
+        self.schedule = plan_rows(config, self.targets, self._choosing, joint)
+        if config.deterministic:
+            # Sums over threads, and on a GPU, add in the order in which parts finish.
+            init("llvm", threads=1)
+        # Slots of the traced sides: all rows that train or choose.
+        self._known = known
+        self.graph.check(record.tx_pos_m)
+        turned = record.tx_heading_rad[known] if form.headings and record.tx_heading_rad is not None else None
+        self._sides = [self.graph.trace(record.tx_pos_m[known], r, turned) for r in range(len(receivers))]
+        self._poses = [device_pose(r) for r in receivers]
+        self._plane = perception_plane(*form.size, mi.Float)
+        self._data = TrainingData(
+            to_tensor(self.targets.condition),
+            to_float(self.targets.truth),
+            to_float(1 / self.targets.unit),
+            None if self.targets.weight is None else to_float(self.targets.weight),
+        )
+        if state is None:
+            self.graph.check_polarization(record.tx_pos_m[known])
+            state = FitState(self._start(initial))
+            if unjudged:
+                logger.warning("%d training rows do not tell how far Gaussians hold: none are used", len(split.train))
+                state.reach_m = 0.0
+        self.state = state
+        if state.chosen:
+            self.schedule, _ = self.schedule.after(state.chosen)
+        self._restore_paths()
+        self.record_functions()
+
+    @property
+    def field(self) -> Field:
+        """The Gaussians of the graph.
+
+        Raises:
+            ValueError: it has none.
+        """
+        if self.graph.field is None:
+            raise ValueError("paths are trained alone: there are no Gaussians")
+        return self.graph.field
+
+    def record_functions(self) -> None:
+        """Forget recorded kernels: the number of Gaussians stands in them as a constant."""
+        self._steps: dict[Any, Callable[..., Any]] = {}
+        self._predictor: Predictor | None = None
+
+    def _restore_paths(self) -> None:
+        """Go back to the paths of the state: a receiver that training moves is searched from where it was then."""
+        sides = [side for side in self._sides if side is not None]
+        if sides and not len(self.state.searched_m):
+            self.state.searched_m = np.stack([side.searched_at_m for side in sides])
+        for side, searched_m in zip(sides, self.state.searched_m, strict=True):
+            if not np.array_equal(side.searched_at_m, searched_m):
+                side.search(searched_m)
+
+    def _start(self, initial: InitialGaussians | None) -> dict[str, NDArray[np.float32]]:
+        """Starting values: Gaussians, gains and levels with which each side reports what was observed, on average."""
+        rng, own = np.random.default_rng([self.config.seed, 0]), self.config.initial
+        values: dict[str, NDArray[np.float32]] = {}
+        if self.graph.field is not None:
+            seen = replace(self.record, receivers=self.graph.receivers)
+            drawn = initial or initial_gaussians(own, seen, self.split.train, rng, self.graph.sphere)
+            values = self.graph.field.init(drawn, rng)
+        values |= self.graph.parameters(self._sides)
+        for r, side in enumerate(self._sides):
+            if side is not None and side.gain_name in values:
+                values |= self.graph.match_gain(r, side, {}, self.targets.truth[r, self._known])
+        if LEVEL in values:
+            values[LEVEL][0] = [self._level(values, r) for r in range(len(self.record.receivers))]
+        return values
+
+    def _level(self, values: Mapping[str, NDArray[np.float32]], receiver: int) -> float:
+        """Level at which Gaussians alone report what a receiver observed, or far below what its paths bring."""
+        params = {name: to_tensor(value) for name, value in values.items()}
+        if (side := self._sides[receiver]) is not None:
+            return self.graph.power_level(side, params) + float(np.log(SHARE))
+        rows = self.targets.received(receiver, self._known)[:AT_ONCE]
+        alone, own = self.graph.report(receiver, None), self.targets.condition[:, rows]
+        found = evaluated(alone, params, own, receiver, self._poses[receiver], self._plane).numpy().astype(float)
+        observed = self.targets.truth[receiver, rows].astype(float)
+        return self.graph.models[receiver].missing_gain(found.reshape(observed.shape), observed)
+
+    def _step_of(self, receiver: int) -> Callable[..., Any]:
+        """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""
+        side = self._sides[receiver]
+        state = self.state
+        if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
+            state.searched_m[receiver] = side.searched_at_m
+        learned = side is None or (
+            state.step >= self.schedule.first_stage and not (state.chosen and state.reach_m == 0)
+        )
+        arrays = self.graph.arrays(receiver, side)
+        key = None if side is None and not arrays else (receiver, side and side.searches, learned)
+        if key not in self._steps:
+            self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
+            report = self.graph.report(receiver, side, learned)
+            own = None if key is None else partial(self.graph.arrays, receiver, side)
+            if own is not None:
+                # What is made from NumPy's memory at first use must be there before a recording.
+                params = {name: self.state.adam[name] for name in self.state.adam}
+                first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
+                evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
+            ends = self._loss, self._shape, own, self.graph.evaluation
+            self._steps[key] = make_step(report, self._rates(), *ends)
+        return self._steps[key]
+
+    def _rates(self) -> dict[str, float]:
+        o = self.config.optimiser
+        own = {
+            "position": o.position,
+            "log_scale": o.scale,
+            "rotation": o.rotation,
+            "opacity": o.opacity,
+            "signal": o.signal,
+            "image": 0.0,
+            LEVEL: o.level,
+        }
+        traced = self.graph.traced
+        return {
+            name: traced.rate(name) if name.startswith(TRACED_NAMES) else own.get(name, o.network)
+            for name in self.state.adam
+        }
+
+    def predictor(self) -> Predictor:
+        """Predictions with the running mean of the parameters as it is now."""
+        if self._predictor is None:
+            params, own = self.state.mean_params(), self.graph
+            self._predictor = Predictor(own.field, params, own.receivers, *own.form.size, self.config.skip, graph=own)
+        else:
+            self._predictor.update(self.state.mean)
+        self._predictor.reach = self.reach()
+        return self._predictor
+
+    def reach(self) -> Reach | None:
+        """Where the Gaussians are trusted, by the rows that train now; None: they correct nothing."""
+        if not self.graph.corrects:
+            return None
+        joined = self.state.chosen and self.schedule.joined < self.config.steps
+        rows = self._known if joined else self._choosing.train
+        known = [self.record.tx_pos_m[self.targets.received(r, rows)] for r in range(len(self.record.receivers))]
+        return Reach(tuple(known), self.state.reach_m)
+
+    def _corrected_score(self) -> float:
+        """Median score where Gaussians correct something; with the best reach until one is chosen."""
+        predict, record, reach = self.predictor(), self.record, self.reach()
+        chosen = self._choosing if self._chooses_reach and not self.state.chosen else self.split
+        rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
+        assert reach is not None
+
+        def score(r: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+            ends = self._sides[r], np.searchsorted(self._known, rows[r]), weight
+            found = predict.of_side(record.tx_pos_m[rows[r]], r, *ends)
+            return self.task.training_score(found, record.observation[r, rows[r]])
+
+        held = [record.tx_pos_m[own] for own in rows]
+        lengths = reach.lengths(held) if chosen is not self.split else [reach.length_m]
+        self.state.reach_m, median = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
+        return median
+
+    def validate(self) -> float:
+        """Median score on the validation rows, all receivers pooled; NaN without such rows."""
+        if self.graph.corrects:
+            return self._corrected_score()
+        rows, record = self.split.validation, self.record
+        if len(rows) == 0:
+            return float("nan")
+        predict = self.predictor()
+        scores = [
+            self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
+            for r in range(len(record.receivers))
+        ]
+        return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
+
+    def choose(self, score: float) -> bool:
+        """See `TrainingLoop`."""
+        chosen = super().choose(score)
+        if chosen:
+            self._restore_paths()
+        if chosen and self.state.reach_m == 0 and self.graph.scene is None:
+            self.state.step = self.config.steps  # nothing is predicted better than zero: there is nothing to train
+        return chosen
+
+    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """See `TrainingLoop`."""
+        state, schedule, t = self.state, self.schedule, self.state.step
+        receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
+        if 0 < t == schedule.first_stage:
+            state.forget_moments()
+        state.mean, trouble, report = self._step_of(receiver)(
+            state.adam,
+            state.mean,
+            self._data,
+            mi.UInt32(rows.tolist()),
+            mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
+            dr.opaque(mi.UInt32, receiver),
+            self._poses[receiver],
+            self._plane,
+            dr.opaque(mi.Float, float(schedule.factor[t])),
+            dr.opaque(mi.Float, float(schedule.decay[t])),
+            dr.opaque(mi.UInt32, t + 1),
+            trouble,
+        )
+        state.urge += report.urge
+        state.urge_steps += 1
+        dr.schedule(state.urge)  # evaluated together with the loop's sum of losses
+        return report.loss, trouble
+
+    def adapt(self) -> None:
+        """A round of density control."""
+        d, state = self.config.density, self.state
+        names = self.field.per_gaussian
+        params = {name: values for name, values in state.params().items() if name in names}
+        receivers = np.stack([r.position_m for r in self.record.receivers])
+        distance = np.linalg.norm(params["position"].T[:, None].astype(float) - receivers, axis=2).min(axis=1)
+        # Its own generator for each round: a resumed run draws what an uninterrupted one would.
+        rng = np.random.default_rng([self.config.seed, 2, state.step])
+        change = adapt(
+            params,
+            state.urge.numpy() / max(1, state.urge_steps),
+            distance,
+            rng,
+            d.grow,
+            max(d.most, self.config.initial.gaussians),
+            float(np.radians(d.split_deg)),
+            d.least_opacity,
+        )
+        state.change_density(change)
+        self.record_functions()
+        rounds = sorted(self.schedule.density)
+        if d.reset_every and "opacity" in names and (rounds.index(state.step) + 1) % d.reset_every == 0:
+            state.set_param("opacity", reset_opacity(change.parameters["opacity"], d.reset_opacity))
