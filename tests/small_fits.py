@@ -14,7 +14,7 @@ QUICK = (
     "initial.gaussians=8",
     "initial.size_deg=15",
     "optimiser.warm_up=5",
-    "optimiser.averaging=0.9",
+    "optimiser.ema_decay=0.9",
     "density.every=0",
     "log_every=5",
     "validate_every=20",
@@ -29,7 +29,7 @@ def settings(*own: str, model: str = "wrf-gs+") -> TrainConfig:
 def network_settings(kind: Any, steps: int, batch: int, rate: float = 1e-3, every: int = 0, **own: Any) -> Any:
     """Settings of a network that is trained for few steps; its last fifth sees the validation rows."""
     ends = (f"steps={steps}", f"batch={batch}", f"optimiser.network={rate}", f"validate_every={every or steps}")
-    return with_settings(kind(**own), [*ends, "optimiser.warm_up=20", "optimiser.averaging=0.98"])
+    return with_settings(kind(**own), [*ends, "optimiser.warm_up=20", "optimiser.ema_decay=0.98"])
 
 
 def official(record: Record) -> Split:

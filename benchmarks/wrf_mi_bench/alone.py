@@ -192,7 +192,7 @@ def _step(job: Job, work: Path) -> Arrays:
     config = trainer.config
     tx, truth = data.select(mi.UInt32(split.train[: config.batch].tolist()), mi.UInt32(0), plane.pixels)
     image = grey(trainer.field, params, tx, pose, plane)
-    loss = spectrum_loss(image, truth, config.batch, plane.height, plane.width, config.structural_weight)[0]
+    loss = spectrum_loss(image, truth, config.batch, plane.height, plane.width, config.loss.ssim_weight)[0]
     dr.backward(loss)
     gradients = {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
     return {"image": dr.detach(image).numpy(), **gradients}

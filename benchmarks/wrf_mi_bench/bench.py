@@ -97,7 +97,7 @@ MEASURED, STORED_CHECK = "bench.json", "check.json"
 """In the folder of a case that is finished, and of a check."""
 
 
-SHORT = ("--set", "steps=3000", "--set", "hold_out=0")
+SHORT = ("--set", "steps=3000", "--set", "holdout_steps_fraction=0")
 """The schedule of the blocked split, whose five folds are fitted in turn."""
 
 

@@ -46,7 +46,7 @@ class Budget:
 
 
 def _factorised(gaussians: int, terms: int, width: int) -> tuple[str, ...]:
-    sizes = {"initial.gaussians": min(gaussians, 270), "density.most": gaussians}
+    sizes = {"initial.gaussians": min(gaussians, 270), "density.max_gaussians": gaussians}
     sizes |= {"network.terms": terms, "network.width": width}
     return ("model=factorised", *(f"{name}={value}" for name, value in sizes.items()))
 

@@ -28,7 +28,7 @@ SCORE = 0.02
 """Median SSIM after a short fit: a fit carries the last digits on until two fits differ as two seeds do."""
 REPEATS = 3
 BATCHES = (1, 4)
-SHORT = ("steps=1000", "hold_out=0", "validate_every=1000", "density.every=250")
+SHORT = ("steps=1000", "holdout_steps_fraction=0", "validate_every=1000", "density.every=250")
 SMALL = (
     *("steps=400", "initial.gaussians=60", "density.every=100", "density.start=0", "density.stop=0.8"),
     *("checkpoint_every=100", "validate_every=200"),

@@ -43,7 +43,7 @@ SCANNED = "scene"
 """Folder of the scene that `scanned_scene` makes."""
 STEPS = 1000
 LEARNED = (
-    "hold_out=0",
+    "holdout_steps_fraction=0",
     "patience=0",
     "batch=16",
     "initial.gaussians=150",
@@ -51,7 +51,7 @@ LEARNED = (
     "encoding.position_octaves=6",
     "encoding.tx_octaves=6",
     "encoding.tx_scale_m=4",
-    "optimiser.averaging=0.99",
+    "optimiser.ema_decay=0.99",
 )
 """Settings of the learned field alone."""
 

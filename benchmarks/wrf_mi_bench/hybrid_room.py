@@ -26,7 +26,7 @@ from wrf_mi.tasks.scores import ssim, summary
 
 SIZES = (100, 400, 1600)
 SEEDS = (0, 1, 2)
-SHORT = ("steps=6000", "hold_out=0")
+SHORT = ("steps=6000", "holdout_steps_fraction=0")
 """Schedule of WRF-GS+; three times the steps gain 0.016 with 1,280 rows (docs/model.md)."""
 LENGTH_M, NOISE = 0.4, 0.1
 """Of the kriging, a wavelength or so: likelihood over tens of thousands of pixels takes longer than all the rest."""

@@ -68,7 +68,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Ready:
+class FittedMethod:
     """A method that can predict.
 
     Attributes:
@@ -102,7 +102,7 @@ class Method:
 
     name: str
     family: str
-    make: Callable[[Place], Ready]
+    make: Callable[[Place], FittedMethod]
     batches: bool = True
 
 
@@ -110,37 +110,37 @@ def _megabytes(arrays: Sequence[Any]) -> float:
     return sum(np.asarray(array).nbytes for array in arrays) / 1e6
 
 
-def _blend(place: Place) -> Ready:
+def _blend(place: Place) -> FittedMethod:
     rows, record = place.split.all_train, place.record
     fitted = InverseDistance().fit(record.tx_pos_m[rows], record.observation[0][rows])
     # Spectra are kept as the instrument writes them, 8 bits a pixel.
-    return Ready(fitted.predict, record.observation[0][rows].size / 1e6)
+    return FittedMethod(fitted.predict, record.observation[0][rows].size / 1e6)
 
 
-def _kriging(place: Place) -> Ready:
+def _kriging(place: Place) -> FittedMethod:
     from .hybrid_room import LENGTH_M, NOISE
 
     rows, record = place.split.all_train, place.record
     fitted = Kriging(LENGTH_M, NOISE).fit(record.tx_pos_m[rows], record.observation[0][rows])
-    return Ready(fitted.predict, _megabytes([record.observation[0][rows].astype(np.float32)]))
+    return FittedMethod(fitted.predict, _megabytes([record.observation[0][rows].astype(np.float32)]))
 
 
 def field_run(place: Place, model: str, gaussians: int) -> Run:
     """A field of a fixed number of Gaussians, trained with the place's short schedule or used again."""
     settings = [f"model={model}", f"steps={place.steps}", f"initial.gaussians={gaussians}"]
-    settings += ["hold_out=0", "density.every=0", f"validate_every={place.steps}"]
+    settings += ["holdout_steps_fraction=0", "density.every=0", f"validate_every={place.steps}"]
     config = with_settings(TrainConfig(seed=place.seed), settings)
     folder = place.folder / f"{model}-{gaussians}-{fit_key(place.record, place.split, config)}"
     fit_once(folder, lambda: train(place.record, folder, model, settings=config, n_train=place.rows))
     return Run(folder, place.record)
 
 
-def _field(place: Place, model: str, gaussians: int) -> Ready:
+def _field(place: Place, model: str, gaussians: int) -> FittedMethod:
     run = field_run(place, model, gaussians)
-    return Ready(run.predictor(), _megabytes(list(run.field.params.values())), run.metrics["train_seconds"])
+    return FittedMethod(run.predictor(), _megabytes(list(run.field.params.values())), run.metrics["train_seconds"])
 
 
-def _stock(place: Place, gaussians: int) -> Ready:
+def _stock(place: Place, gaussians: int) -> FittedMethod:
     """The same WRF-GS+, its Gaussians computed by us and rendered by Mitsuba's own integrator."""
     run = field_run(place, "wrf-gs+", gaussians)
     predictor = run.predictor()
@@ -151,10 +151,10 @@ def _stock(place: Place, gaussians: int) -> Ready:
         with rgb_variant():
             return np.stack([np.abs(renderer.field(predictor.gaussians(one))) for one in np.asarray(tx_pos_m)[:, None]])
 
-    return Ready(predict, _megabytes(list(run.field.params.values())), run.metrics["train_seconds"], rgb_variant)
+    return FittedMethod(predict, _megabytes(list(run.field.params.values())), run.metrics["train_seconds"], rgb_variant)
 
 
-def _hybrid(place: Place) -> Ready:
+def _hybrid(place: Place) -> FittedMethod:
     settings = kind_of(place.record, True).settings()
     key = fit_key(place.record, place.split, scene_files(place.scene), settings, place.seed)
     folder = place.folder / f"hybrid-{key}"
@@ -162,15 +162,15 @@ def _hybrid(place: Place) -> Ready:
     fit_once(folder, lambda: train(place.record, folder, "hybrid", **asked))
     run = Run(folder, place.record)
     size = (folder / FITTED).stat().st_size / 1e6
-    return Ready(lambda tx_pos_m: run.predict(tx_pos_m).mean, size, run.metrics["train_seconds"])
+    return FittedMethod(lambda tx_pos_m: run.predict(tx_pos_m).mean, size, run.metrics["train_seconds"])
 
 
-def _tracer(place: Place, rays: int, depth: int) -> Ready:
+def _tracer(place: Place, rays: int, depth: int) -> FittedMethod:
     """The mesh as given, walls let through; what rays from the array find is kept from one prediction to the next."""
     options = TraceOptions(transmission=True, max_depth=depth, rays=rays)
     tracer = RayTracer(place.scene, instrument_of(place.record), options)
     size = sum(one.stat().st_size for one in Path(place.scene).rglob("*.ply")) / 1e6
-    return Ready(lambda tx_pos_m: tracer(tx_pos_m)[0], size)
+    return FittedMethod(lambda tx_pos_m: tracer(tx_pos_m)[0], size)
 
 
 def _tracer_method(rays_log2: int, depth: int) -> Method:

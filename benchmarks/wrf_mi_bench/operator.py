@@ -15,6 +15,7 @@ from wrf_mi.backend.device import to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.operator import PixelOperator
 from wrf_mi.gaussians.render import splat
@@ -26,7 +27,7 @@ from wrf_mi.graph.operator import ArrayOperator, SectorOperator
 from wrf_mi.receivers import Array
 from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.step import DARK, device_pose
+from wrf_mi.training.step import device_pose
 
 GAUSSIANS, HEIGHT, WIDTH, BATCH = 10_000, 90, 360, 64
 SIZE_DEG = 3.0
@@ -109,7 +110,7 @@ class Direct:
     def pixels(self, tx_pos_m: NDArray[Any]) -> NDArray[Any]:
         """Greys [pixels]."""
         re, im = self.splat(self.parts(tx_pos_m))
-        return dr.sqrt(re * re + im * im + DARK).numpy()
+        return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS).numpy()
 
 
 def _gathered(parts: Any, product: bool) -> Gaussians:
@@ -130,7 +131,8 @@ def differences(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m:
     return {
         "array": relative(own.spectrum(signal)[0], array),
         "pixels": relative(
-            PixelOperator.of(gaussians, pose, plane).magnitude(signal, DARK)[0], direct.pixels(tx_pos_m)
+            PixelOperator.of(gaussians, pose, plane).magnitude(signal, SQUARED_MAGNITUDE_EPS)[0],
+            direct.pixels(tx_pos_m),
         ),
         "rssi_db": float(np.abs(SectorOperator.of(gaussians, pose, plane).power_db(signal) - power).max()),
     }
@@ -155,7 +157,7 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "splatting": lambda d=direct, p=parts: d.splat(p),  # type: ignore[misc]
             "both": lambda d=direct: d.pixels(tx[0]),  # type: ignore[misc]
         }
-        if field.still:
+        if field.static_geometry:
             predictor = Predictor(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
             calls["operator"] = lambda p=predictor: p(tx[:1])  # type: ignore[misc]
             calls[f"operator, {BATCH}"] = lambda p=predictor: p(tx)  # type: ignore[misc]
@@ -196,8 +198,8 @@ def main() -> dict[str, Any]:
         "array": each(lambda at: small.spectrum(signals.coefficients(at)), tx),
         "array, scaled": each(lambda at: small.spectrum(signals.coefficients(at), scale=True), tx),
         "array, signals of 10,000 given": each(by_array.spectrum, given),
-        "pixels": each(lambda at: images.magnitude(signals.coefficients(at), DARK), tx),
-        "pixels, signals of 10,000 given": each(lambda s: pixels.magnitude(s, DARK), given),
+        "pixels": each(lambda at: images.magnitude(signals.coefficients(at), SQUARED_MAGNITUDE_EPS), tx),
+        "pixels, signals of 10,000 given": each(lambda s: pixels.magnitude(s, SQUARED_MAGNITUDE_EPS), given),
         "RSSI of 24 sectors": each(lambda at: power.power_db(signals.coefficients(at)), tx),
     }
     calls: dict[str, Callable[[], Any]] = {

@@ -16,7 +16,7 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio, split, typical_split
 from wrf_mi.tasks.scores import ssim
 
-from .methods import Method, Place, Ready
+from .methods import FittedMethod, Method, Place
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def measure_methods(
     tx, truth = record.tx_pos_m[rows], record.observation[0][rows]
     one, many = tx[:1], tx[:BATCH]
     points: list[dict[str, Any]] = []
-    ready: dict[str, Ready] = {}
+    ready: dict[str, FittedMethod] = {}
     for method in methods:
         logger.info("%s", method.name)
         made = ready[method.name] = method.make(place)

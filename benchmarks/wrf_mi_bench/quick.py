@@ -111,7 +111,13 @@ def _record(rows: int) -> Record:
 
 def _training() -> tuple[Call, Call]:
     record = _record(20)
-    settings = ("steps=100000", "density.every=0", "log_every=100000", "validate_every=100000", "hold_out=0")
+    settings = (
+        "steps=100000",
+        "density.every=0",
+        "log_every=100000",
+        "validate_every=100000",
+        "holdout_steps_fraction=0",
+    )
     config = with_settings(TrainConfig(), settings)
     frozen, fresh = (Trainer(record, make_splits(record, "random")[0], config) for _ in range(2))
 

@@ -19,7 +19,7 @@ from wrf_mi.training.config import TrainConfig
 
 ROWS = 100
 SEEDS = (0, 1, 2)
-SHORT = ("steps=2000", "hold_out=0")
+SHORT = ("steps=2000", "holdout_steps_fraction=0")
 """Few steps: what a start is worth shows before the field has forgotten it."""
 NOTHING = "nothing"
 

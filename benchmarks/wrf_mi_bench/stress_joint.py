@@ -31,9 +31,10 @@ from wrf_mi.backend.device import on_device
 from wrf_mi.core import Antenna, Receiver, pixel_directions
 from wrf_mi.core.angles import FloatArray, solid_angles
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import DARK, LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.learned import learned_field
 from wrf_mi.receivers import array_response, bartlett_spectrum
 from wrf_mi.tracing import TraceOptions, open_scene
@@ -300,8 +301,8 @@ class _Reference:
         steering = array_response(ELEMENTS_M, directions, HZ)
         if isinstance(model, ArrayReceiver):
             h = here + (there * _solid(model)) @ steering
-            return np.sqrt(bartlett_spectrum(h, ELEMENTS_M, HZ, *SIZE) ** 2 + DARK).ravel()
-        return np.sqrt(np.abs(here @ steering.conj().T + there) ** 2 + DARK).ravel()
+            return np.sqrt(bartlett_spectrum(h, ELEMENTS_M, HZ, *SIZE) ** 2 + SQUARED_MAGNITUDE_EPS).ravel()
+        return np.sqrt(np.abs(here @ steering.conj().T + there) ** 2 + SQUARED_MAGNITUDE_EPS).ravel()
 
 
 def _directions() -> FloatArray:

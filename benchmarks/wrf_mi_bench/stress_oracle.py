@@ -1,5 +1,5 @@
 """The traced side of the joint graph in NumPy, complex128: what the stress rows compare
-`wrf_mi.tracing.evaluate_paths` with.
+`wrf_mi.tracing.field_calculator` with.
 
 It shares the chains of planes and the stated constants with the graph, no device code: planes move by `Walls.moved`,
 antennas are `wrf_mi.core.Antenna`. The receiver is mirrored backwards as the transmitter is forwards, so each leg's

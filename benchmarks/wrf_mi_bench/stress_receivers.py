@@ -22,10 +22,11 @@ from wrf_mi.backend.device import on_device as to_device
 from wrf_mi.core import pixel_directions
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import DARK, LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.learned import hemisphere_pair, learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
 from wrf_mi.receivers import Array, Pattern, array_response, bartlett_spectrum, minmax_scale
@@ -105,11 +106,13 @@ def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray
     wave, waves = (weight * seen).sum(), float((weight * np.abs(seen)).sum()) or 1.0
     directions = pixel_directions(*SIZE).reshape(-1, 3)
     h = (weight * seen)[:half] @ array_response(ELEMENTS_M, directions, CARRIER_HZ)
-    spectrum = np.sqrt(bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE) ** 2 + DARK)
+    spectrum = np.sqrt(bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE) ** 2 + SQUARED_MAGNITUDE_EPS)
     channel = np.tile([wave.real, wave.imag], len(TONES_HZ))
     amplitude = np.sqrt(np.abs(wave) ** 2 + LEAST_POWER)
     return {
-        "pixels": relative(found["pixels"] - (pixels := np.sqrt(np.abs(seen[:half]) ** 2 + DARK)), pixels),
+        "pixels": relative(
+            found["pixels"] - (pixels := np.sqrt(np.abs(seen[:half]) ** 2 + SQUARED_MAGNITUDE_EPS)), pixels
+        ),
         "Bartlett spectrum": relative(found["spectrum"] - spectrum.ravel(), spectrum),
         "Bartlett spectrum, scaled": relative(
             found["scaled spectrum"] - (scaled := minmax_scale(spectrum).ravel()), scaled

@@ -165,7 +165,7 @@ PARTS = (
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
 BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
-    **{("spectrum", name): _set("steps=3000", "hold_out=0") for name in ("wrf-gs", "wrf-gs+")},
+    **{("spectrum", name): _set("steps=3000", "holdout_steps_fraction=0") for name in ("wrf-gs", "wrf-gs+")},
     ("spectrum", "dcgan"): _set("steps=750", "validate_every=75"),
     ("spectrum", "nerf2"): _set("steps=2500", "validate_every=250"),
 }

@@ -33,7 +33,7 @@ MIRRORED = 1e-5
 """Cosines of the angles before and after a reflection: 1e-6 m over the shortest segments."""
 SHORTEST_M = 1e-2
 """Sionna RT drops paths with a shorter segment."""
-PAIRS_AT_ONCE = 1 << 20
+PAIRS_PER_CHUNK = 1 << 20
 
 
 def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) -> dict[str, Any]:

@@ -151,7 +151,7 @@ def work_of(of: Trainer) -> Work:
         terms = shapes["signal"][0]
         flop += 3 * 2 * batch * terms * 2 * n
         moved += 4 * 3 * (batch * terms + 2 * terms * n + 2 * batch * n)
-    visits, sets = _visits(of), 1 if of.field.still else batch
+    visits, sets = _visits(of), 1 if of.field.static_geometry else batch
     splat = visits * (sets * (FORWARD + BACKWARD) + (batch - sets) * (SHARED_FORWARD + SHARED_BACKWARD))
     count = sum(int(np.prod(shape)) for shape in shapes.values())
     # Adam reads value, gradient and two moments, the mean is read; all but the gradient are written again.

@@ -23,7 +23,7 @@ from wrf_mi.gaussians.skip import NOTHING, Skip
 from wrf_mi.gaussians.tiles import Plane
 from wrf_mi.graph.learned import facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
-from wrf_mi.tracing.evaluate_paths import Complex
+from wrf_mi.tracing.field_calculator import Complex
 from wrf_mi.tracing.material_parameters import Materials, slabs_of_faces
 from wrf_mi.tracing.surfaces import scene_surfaces
 

@@ -21,7 +21,7 @@ from wrf_mi.training.trainer import Trainer
 
 FIT = (
     *(*QUICK, "steps=30", "checkpoint_every=10"),
-    *("density.every=12", "density.start=0", "density.stop=1", "density.grow=0.3"),
+    *("density.every=12", "density.start=0", "density.stop=1", "density.growth_fraction=0.3"),
 )
 STEP = ("initial.gaussians=8", "batch=4")
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from wrf_mi_bench.methods import METHODS, Method, Place, Ready
+from wrf_mi_bench.methods import METHODS, FittedMethod, Method, Place
 from wrf_mi_bench.pareto_front import front, full_table, measure_methods, pareto_figure, table
 
 from wrf_mi.core import Record
@@ -88,16 +88,16 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
     truth = one_gateway.observation[0]
     entered: list[bool] = []
 
-    def true(place: Place) -> Ready:
+    def true(place: Place) -> FittedMethod:
         def predict(tx_pos_m: np.ndarray) -> np.ndarray:
             np.sort(np.random.default_rng(0).random(BUSY_ROWS))
             np.ones(HELD_MB * 1_000_000 // 8)
             apart = np.linalg.norm(place.record.tx_pos_m[None] - tx_pos_m[:, None], axis=-1)
             return truth[apart.argmin(axis=1)]
 
-        return Ready(predict, stored_mb=3.0, train_seconds=7.0)
+        return FittedMethod(predict, stored_mb=3.0, train_seconds=7.0)
 
-    def grey(place: Place) -> Ready:
+    def grey(place: Place) -> FittedMethod:
         from contextlib import contextmanager
 
         @contextmanager
@@ -105,7 +105,7 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
             entered.append(True)
             yield
 
-        return Ready(lambda tx: np.full((len(tx), *truth.shape[1:]), 0.5), stored_mb=0.0, context=context)
+        return FittedMethod(lambda tx: np.full((len(tx), *truth.shape[1:]), 0.5), stored_mb=0.0, context=context)
 
     methods = [Method("true", "mine", true, batches=False), Method("grey", "mine", grey)]
     place = Place(replace(one_gateway), Path("none"), tmp_path, rows=5)

@@ -274,11 +274,11 @@ def progress(**values: Any) -> Progress:
 
 def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with Watch() as watch:
-        watch.listen("training", 0.25, progress())
-        watch.listen("training", 0.5, progress(step=20, validation_score=0.5))
-        watch.listen("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
-        watch.listen("fold2", 0.5, progress(step=20, validation_score=float("nan")))
-        watch.listen("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
+        watch.on_progress("training", 0.25, progress())
+        watch.on_progress("training", 0.5, progress(step=20, validation_score=0.5))
+        watch.on_progress("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
+        watch.on_progress("fold2", 0.5, progress(step=20, validation_score=float("nan")))
+        watch.on_progress("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
@@ -295,7 +295,7 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     with Watch() as watch:
         for fold in ("fold0", "fold1"):
             for step in (20, 40):
-                watch.listen(fold, step / 40, progress(step=step, validation_score=0.5))
+                watch.on_progress(fold, step / 40, progress(step=step, validation_score=0.5))
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
     assert "fold0" in shown
     assert "fold1" in shown

@@ -49,7 +49,7 @@ def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
         (["--set", "stepz=3"], "unknown setting stepz"),
         (["--set", "steps=many"], "setting steps: expected int, got 'many'"),
         (["--set", "steps=[1"], "is no YAML value"),
-        (["--set", "hold_out=2"], "setting hold_out: 2.0 is out of range, choose 0 to 1"),
+        (["--set", "holdout_steps_fraction=2"], "setting holdout_steps_fraction: 2.0 is out of range, choose 0 to 1"),
         (["--set", "initial.points=none.ply"], "none.ply: no such file"),
         (["--set", "batch=0"], "setting batch: 0 is out of range, choose 1 or more"),
         (["--set", "model=nerf3"], r"setting model: nerf3, where the model is wrf-gs\+; choose it with --model"),

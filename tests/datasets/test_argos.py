@@ -146,7 +146,7 @@ def test_frames_cells_and_starts_can_be_chosen(tmp_path: Path, monkeypatch: pyte
     assert_found(read_argos(path, cell=1, frames=slice(1, None, 2)), 4, slice(1, None, 2))
     with pytest.raises(InputError, match="select none of 4"):
         read_argos(path, cell=1, frames=slice(9, None))
-    monkeypatch.setattr("wrf_mi.datasets.argos.AT_ONCE", 1)  # frame by frame
+    monkeypatch.setattr("wrf_mi.datasets.argos.CHUNK_SIZE", 1)  # frame by frame
     assert_found(read_argos(path, cell=1), 4)
     assert_found(read_argos(sounder(tmp_path / "bare.h5", PREFIX_LEN=""), start=82 + 16), 4)
     # A window that begins early, within the guard, sees the same channel with a delay.

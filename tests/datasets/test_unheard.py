@@ -69,7 +69,9 @@ def test_every_split_is_looked_at(unheard: Path, room: Path, tmp_path: Path) -> 
     told: list[str] = []
     for start in (
         lambda: train(record, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked"),
-        lambda: train(record, tmp_path / "run", "hybrid", split="blocked", listen=lambda *said: told.append(said[0])),
+        lambda: train(
+            record, tmp_path / "run", "hybrid", split="blocked", on_progress=lambda *said: told.append(said[0])
+        ),
     ):
         with pytest.raises(InputError, match="receiver far: received none of"):
             start()

@@ -36,7 +36,7 @@ RECEIVER = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0
 ENCODING = Encoding(2, 4.0, 2, 1.0)
 FIELDS: dict[str, Any] = {
     "wrf-gs": WrfGs(ENCODING, layers=2, width=16, signal_widths=(16, 8)),
-    "wrf-gs+": WrfGsPlus(ENCODING, layers=2, width=16, skip=1, still=True),
+    "wrf-gs+": WrfGsPlus(ENCODING, layers=2, width=16, skip=1, static_geometry=True),
     "factorised": Factorised(ENCODING, terms=4, layers=1, width=16),
 }
 

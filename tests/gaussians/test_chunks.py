@@ -121,7 +121,7 @@ def test_predictions_of_many_gaussians(monkeypatch: pytest.MonkeyPatch):
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
     recorded = Predictor(field, params, RECEIVERS, *SIZE)
     expected = recorded(tx)
-    monkeypatch.setattr(step, "AT_ONCE", 1)
+    monkeypatch.setattr(step, "CHUNK_SIZE", 1)
     monkeypatch.setattr(tiles, "RESERVED", 0)
     parts = Predictor(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)

@@ -46,7 +46,7 @@ def made_up(n: int, seed: int = 0, opacity: bool = True) -> dict[str, np.ndarray
     return {name: values.astype(np.float32) for name, values in parameters.items()}
 
 
-def one_round(parameters: dict[str, np.ndarray], urge: Any, **changes: Any) -> DensityChange:
+def one_round(parameters: dict[str, np.ndarray], view_gradient_norm: Any, **changes: Any) -> DensityChange:
     n = parameters["position"].shape[1]
     arguments = {
         "distance_m": np.ones(n),
@@ -56,15 +56,15 @@ def one_round(parameters: dict[str, np.ndarray], urge: Any, **changes: Any) -> D
         "split_rad": SPLIT_RAD,
         "least_opacity": LEAST_OPACITY,
     }
-    return adapt(parameters, np.asarray(urge, float), **(arguments | changes))
+    return adapt(parameters, np.asarray(view_gradient_norm, float), **(arguments | changes))
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
     parameters = made_up(8)
     parameters["log_scale"][:] = np.log(0.01)
     parameters["log_scale"][1, 5] = np.log(0.5)  # one axis is enough
-    urge = [1, 9, 2, 3, 4, 8, 5, 6]
-    change = one_round(parameters, urge)
+    view_gradient_norm = [1, 9, 2, 3, 4, 8, 5, 6]
+    change = one_round(parameters, view_gradient_norm)
     assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
     # The two that ask most, 1 and 5, stand once more behind the old ones.
     np.testing.assert_array_equal(change.source, [0, 1, 2, 3, 4, 5, 6, 7, 1, 5])
@@ -140,8 +140,8 @@ def test_what_every_round_keeps(n: int, most: int, grow: float, seed: int, opaci
     parameters = made_up(n, seed, opacity)
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
-    urge, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
-    change = one_round(parameters, urge, distance_m=distance, most=most, grow=grow)
+    view_gradient_norm, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
+    change = one_round(parameters, view_gradient_norm, distance_m=distance, most=most, grow=grow)
     count = len(change.source)
     assert count >= 1
     # Growth ends at the most; a field that is larger to begin with is not cut.
@@ -178,7 +178,7 @@ def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
         dr.backward(sum(dr.sum(dr.square(p.array + 1)) for p in state.adam.values()))
         state.adam.step()
     state.mean = {name: mi.TensorXf(values + 7) for name, values in state.params().items()}
-    state.urge, state.urge_steps = to_float(np.arange(n)), 3
+    state.view_gradient_norm, state.view_gradient_steps = to_float(np.arange(n)), 3
     return state, state.params()
 
 
@@ -210,8 +210,8 @@ def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
         np.testing.assert_array_equal(new_mean[name][:, ~new], mean[name][:, change.source[~new]])
     for new, old in ((new_first, first), (new_second, second), (state.params(), before), (new_mean, mean)):
         np.testing.assert_array_equal(new["net.bias"], old["net.bias"])
-    assert state.urge_steps == 0
-    np.testing.assert_array_equal(state.urge.numpy(), np.zeros(7))
+    assert state.view_gradient_steps == 0
+    np.testing.assert_array_equal(state.view_gradient_norm.numpy(), np.zeros(7))
 
 
 def test_a_step_works_after_a_round() -> None:
@@ -253,8 +253,8 @@ def test_the_best_moment_stays_as_it_was() -> None:
     state, _ = trained_state(4)
     state.keep_best(1.0)
     for _ in range(3):
-        state.urge += to_float(np.ones(4))
-        dr.eval(state.urge)
+        state.view_gradient_norm += to_float(np.ones(4))
+        dr.eval(state.view_gradient_norm)
     assert state.best is not None
     np.testing.assert_array_equal(state.best["urge"], np.arange(4))
 

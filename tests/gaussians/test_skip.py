@@ -42,7 +42,7 @@ def test_boxes_change_nothing(seed: int, product: bool) -> None:
 )
 def test_skips_stay_within_their_bounds(seed: int, product: bool, contribution: float, rest: float) -> None:
     gaussians = fields(seed, product)
-    skip = Skip(contribution=contribution, rest=rest)
+    skip = Skip(contribution=contribution, early_stop_tolerance=rest)
     error = np.abs(image(gaussians, skip) - image(gaussians, Skip()))
     assert error.max() <= skip.error + ROUNDING
 
@@ -67,7 +67,7 @@ def walled(product: bool) -> tuple[Gaussians, Any]:
 def test_early_end_evaluates_nothing_behind_an_opaque_wall(product: bool) -> None:
     """Opacities and attenuations that are not numbers do not reach the image from there."""
     gaussians, wall = walled(product)
-    exact, early = image(gaussians, Skip()), image(gaussians, Skip(rest=1e-3))
+    exact, early = image(gaussians, Skip()), image(gaussians, Skip(early_stop_tolerance=1e-3))
     assert 0 < np.abs(exact - early).max() <= 1e-3
     if product:
         assert gaussians.attenuation is not None
@@ -75,11 +75,11 @@ def test_early_end_evaluates_nothing_behind_an_opaque_wall(product: bool) -> Non
     else:
         gaussians.opacity = dr.select(wall, gaussians.opacity, np.nan)
     assert np.isnan(image(gaussians, Skip())).all()
-    np.testing.assert_array_equal(image(gaussians, Skip(rest=1e-3)), early)
+    np.testing.assert_array_equal(image(gaussians, Skip(early_stop_tolerance=1e-3)), early)
 
 
 @pytest.mark.parametrize("product", [False, True])
-@pytest.mark.parametrize("skip", [Skip(rest=1e-3), Skip(contribution=1e-3)])
+@pytest.mark.parametrize("skip", [Skip(early_stop_tolerance=1e-3), Skip(contribution=1e-3)])
 def test_skips_hide_no_signal_that_is_not_a_number(product: bool, skip: Skip) -> None:
     """What it can change has no bound, so that neither skip may leave it out."""
     gaussians, wall = walled(product)
@@ -93,7 +93,7 @@ def test_early_end_gives_no_gradients() -> None:
     gaussians = fields(0, False)
     dr.enable_grad(gaussians.signal)
     with pytest.raises(ValueError, match="give no gradients"):
-        image(gaussians, Skip(rest=1e-3))
+        image(gaussians, Skip(early_stop_tolerance=1e-3))
 
 
 @pytest.mark.parametrize("product", [False, True])

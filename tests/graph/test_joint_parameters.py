@@ -37,7 +37,7 @@ OPTIONS = TraceOptions(max_depth=1, rays=4096)
 TRUE_PERMITTIVITY, START_PERMITTIVITY = BELOW_1_GHZ["concrete"][0], 4.5
 PERMITTIVITY = "material.itu_concrete.permittivity"
 ONE_REFLECTION = ("traced.depth=1", "traced.reflections=1", "traced.transmission=false", "traced.rays=4096")
-QUICK = ("optimiser.warm_up=10", "optimiser.averaging=0.9", "hold_out=0", "patience=0")
+QUICK = ("optimiser.warm_up=10", "optimiser.ema_decay=0.9", "holdout_steps_fraction=0", "patience=0")
 
 
 def rooms(folder: Path) -> tuple[Any, Any]:
@@ -213,7 +213,14 @@ def test_materials_are_replaced_for_a_block_only(tmp_path: Path) -> None:
 
 def test_a_resumed_fit_goes_on_with_the_paths_that_it_had(tmp_path: Path) -> None:
     """Paths are searched again where a receiver has moved by a quarter of a wavelength; a resumed fit does not know."""
-    own = ("traced.position=0.05", "optimiser.warm_up=1", "steps=40", "hold_out=0", "patience=0", "deterministic=true")
+    own = (
+        "traced.position=0.05",
+        "optimiser.warm_up=1",
+        "steps=40",
+        "holdout_steps_fraction=0",
+        "patience=0",
+        "deterministic=true",
+    )
     whole, part = (small(tmp_path / name, *own) for name in ("whole", "part"))
     whole.run()
     stated = np.stack([one.position_m for one in whole.graph.receivers])

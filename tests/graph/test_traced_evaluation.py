@@ -182,7 +182,14 @@ def made_record(rows: int = 60) -> tuple[Record, Any]:
     return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, **own), start
 
 
-FEW_STEPS = ("steps=60", "batch=2", "hold_out=0", "network.width=32", "network.layers=3", "optimiser.network=5e-3")
+FEW_STEPS = (
+    "steps=60",
+    "batch=2",
+    "holdout_steps_fraction=0",
+    "network.width=32",
+    "network.layers=3",
+    "optimiser.network=5e-3",
+)
 
 
 def test_training_by_tracing_scores_as_by_splatting_with_the_kernels_of_its_first_steps() -> None:
@@ -300,8 +307,10 @@ def test_a_traced_run_with_a_scene_predicts_what_was_scored(tmp_path: Path) -> N
 def test_what_cannot_be_traced_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set traced.shift=0 and traced.tilt=0, or evaluation=splatted"):
         behind_the_ceiling(tmp_path, shift=1e-3)
-    with pytest.raises(InputError, match=r"skip.contribution and skip.rest belong to evaluation=splatted"):
-        settings("evaluation=traced", "skip.rest=0.01")
+    with pytest.raises(
+        InputError, match=r"skip.contribution and skip.early_stop_tolerance belong to evaluation=splatted"
+    ):
+        settings("evaluation=traced", "skip.early_stop_tolerance=0.01")
     with pytest.raises(InputError, match="'cast' is unknown; choose from splatted, traced"):
         Graph(MODELS["wrf-gs"], RECEIVERS[:1], Form("pixel", SIZE), evaluation="cast")
     record, _ = made_record(24)

@@ -92,7 +92,7 @@ def test_registered_model_is_trained_resumed_evaluated_asked_and_compared(
         train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
     refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     told: list[tuple[str, float]] = []
-    run = resume(out, listen=lambda stage, share, _: told.append((stage, share)))
+    run = resume(out, on_progress=lambda stage, share, _: told.append((stage, share)))
     assert told == [("nearest rows", 0.0)]
     assert (run.metrics["model"], run.metrics["rows"]) == ("nearest", 24)
     assert 0 < run.metrics["inside_90"] <= 1

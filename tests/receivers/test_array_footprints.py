@@ -92,7 +92,7 @@ def test_chunks_are_the_whole(monkeypatch: pytest.MonkeyPatch):
     covariance = root @ root.swapaxes(-1, -2)
     whole = gaussian_signals(n, covariance, ELEMENTS, FREQUENCY_HZ)
     for pairs in (2 * len(ELEMENTS), 3):
-        monkeypatch.setattr(footprints, "PAIRS_AT_ONCE", pairs)
+        monkeypatch.setattr(footprints, "PAIRS_PER_CHUNK", pairs)
         np.testing.assert_allclose(gaussian_signals(n, covariance, ELEMENTS, FREQUENCY_HZ), whole, rtol=1e-12)
         same = gaussian_signals(n, covariance[0, 0], ELEMENTS, FREQUENCY_HZ)
         np.testing.assert_allclose(same[0, 0], whole[0, 0], rtol=1e-12)

@@ -58,7 +58,7 @@ def test_channel_coefficients():
 
 @pytest.mark.parametrize("at_once", [1, 1 << 20])
 def test_channel_coefficients_at_antennas(at_once: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(channel, "WAVES_AT_ONCE", at_once)
+    monkeypatch.setattr(channel, "WAVES_PER_CHUNK", at_once)
     paths, arrays, array_m = made(), receivers(), planar_array(2, 3, 0.06)
     frequencies = 2.4e9 + 1e6 * np.array([0.0, 1.0, 3.0, 4.0, 2.0])  # gaps of several widths
     result = antenna_csi(paths, arrays, array_m, frequencies)
@@ -110,6 +110,6 @@ def test_signals_of_several_arrays_and_parts(monkeypatch: pytest.MonkeyPatch):
     centre = element_signals(paths, everyone, [[0.0, 0, 0]], 1e9)[..., 0]
     np.testing.assert_allclose(centre, csi(paths, 1e9)[..., 0], atol=1e-10)
     coefficients = csi(paths, [1e9, 2e9])
-    monkeypatch.setattr(channel, "PAIRS_AT_ONCE", 20)
+    monkeypatch.setattr(channel, "PAIRS_PER_CHUNK", 20)
     np.testing.assert_allclose(element_signals(paths, everyone, array_m, 1e9), signals, rtol=EXACT)
     np.testing.assert_allclose(csi(paths, [1e9, 2e9]), coefficients, rtol=EXACT)

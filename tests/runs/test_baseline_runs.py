@@ -133,7 +133,7 @@ def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: P
             out,
             "kriging",
             split="blocked",
-            listen=lambda stage, share, _: stages.append(stage),
+            on_progress=lambda stage, share, _: stages.append(stage),
             stop=lambda: stages[-1].startswith("fold1"),
         )
     assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
@@ -160,16 +160,16 @@ def test_a_stopped_network_goes_on_to_the_same_bits(name: str, two_gateways: Rec
     whole = train(record, tmp_path / "whole", name, **ends).folder
     told: list[tuple[str, int]] = []
 
-    def listen(stage: str, share: float, progress: Progress | None) -> None:
+    def on_progress(stage: str, share: float, progress: Progress | None) -> None:
         if progress is not None:
             told.append((stage, progress.step))
 
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped after step 12 of 20 of {networks[-1]}; .* --resume {out}"):
-        train(record, out, name, **ends, listen=listen, stop=lambda: told[-1:] == [(networks[-1], 12)])
+        train(record, out, name, **ends, on_progress=on_progress, stop=lambda: told[-1:] == [(networks[-1], 12)])
     assert (out / "checkpoint.npz").exists()
     del told[:]
-    resume(out, record=record, listen=listen)
+    resume(out, record=record, on_progress=on_progress)
     assert min(step for _, step in told) > 12, "no step is taken again"
     assert {stage for stage, _ in told} == {networks[-1]}
     assert not (out / "checkpoint.npz").exists()
@@ -188,7 +188,7 @@ def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(two_gateways, tmp_path / "killed", "vae", **ends, listen=kill)
+        train(two_gateways, tmp_path / "killed", "vae", **ends, on_progress=kill)
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 8
     resume(tmp_path / "killed", record=two_gateways)
     train(two_gateways, tmp_path / "whole", "vae", **ends)

@@ -20,7 +20,7 @@ from wrf_mi.gaussians.static_signals import host_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
 from wrf_mi.training import static_operator as still
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.static_operator import RecordedSignals, StillField, read_weights
+from wrf_mi.training.static_operator import RecordedSignals, StaticOperator, read_weights
 
 GREYS = 1e-5
 """Largest difference of greys up to about one: float32 sums of some ten terms in another order."""
@@ -37,7 +37,7 @@ def made(model: str) -> tuple[Any, dict[str, np.ndarray]]:
     field: Any = (
         Factorised(encoding=OCTAVES, terms=5, layers=2, width=16)
         if model == "factorised"
-        else WrfGsPlus(encoding=OCTAVES, width=16, layers=3, skip=1, still=True)
+        else WrfGsPlus(encoding=OCTAVES, width=16, layers=3, skip=1, static_geometry=True)
     )
     start = random_gaussians(RECEIVERS[:1], 8, rng, (1.0, 4.0), 12.0, 0.5, 1.0)
     return field, field.init(start, rng)
@@ -86,7 +86,7 @@ def test_networks_in_numpy_are_those_of_the_field(field: Any, monkeypatch: pytes
     params = {k: v + 0.1 * rng.standard_normal(v.shape).astype(np.float32) for k, v in params.items()}
     tx = rng.uniform(-3, 3, (7, 3))
     expected = RecordedSignals(field, params).coefficients(tx)
-    monkeypatch.setattr("wrf_mi.gaussians.static_signals.PAIRS_AT_ONCE", 100)  # three transmitters at a time
+    monkeypatch.setattr("wrf_mi.gaussians.static_signals.PAIRS_PER_CHUNK", 100)  # three transmitters at a time
     signals = host_signals(field, params)
     assert signals is not None
     found = signals.coefficients(tx)
@@ -162,10 +162,10 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_what_ends_an_operator(what: str, tmp_path: Path) -> None:
     field, params = made("factorised")
-    before = StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)
+    before = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
     before(TX, 0)
     field, params, receiver, size = CHANGES[what](field, params, RECEIVERS[0], SIZE)
-    after = StillField(field, params, [receiver], *size, tmp_path)
+    after = StaticOperator(field, params, [receiver], *size, tmp_path)
     assert after.key(0) != before.key(0)
     expected = Predictor(field, params, [receiver], *size)(TX)
     np.testing.assert_allclose(after(np.float32(TX), 0), expected, atol=GREYS)
@@ -180,17 +180,17 @@ def test_signals_alone_do_not_end_it(model: str) -> None:
     field, params = made(model)
     changed = {k: v * 2 if k.startswith(field.signal_parameters) else v for k, v in params.items()}
     assert any(k.startswith(field.signal_parameters) for k in params)
-    keys = {StillField(field, p, RECEIVERS[:1], *SIZE).key(0) for p in (params, changed)}
+    keys = {StaticOperator(field, p, RECEIVERS[:1], *SIZE).key(0) for p in (params, changed)}
     assert len(keys) == 1
     if model == "wrf-gs":
         other = params | {"attenuation.1.bias": params["attenuation.1.bias"] + np.float32(0.1)}
-        assert StillField(field, other, RECEIVERS[:1], *SIZE).key(0) not in keys
+        assert StaticOperator(field, other, RECEIVERS[:1], *SIZE).key(0) not in keys
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "outside", "short", "format"])
 def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
     field, params = made("factorised")
-    expected = StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
+    expected = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
     path = tmp_path / "operator0.npz"
     with np.load(path) as stored:
         arrays = dict(stored)
@@ -206,7 +206,7 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
         else:
             arrays["format"] = np.asarray(99)
         np.savez(path, **arrays)
-    again = StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)
+    again = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
     np.testing.assert_array_equal(again(TX, 0), expected)
     assert read_weights(path, again.key(0), (SIZE[0] * SIZE[1], 8)) is not None
 
@@ -215,8 +215,8 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
 def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
     field, params = made("factorised")
     tmp_path.chmod(0o500)
-    found = StillField(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
-    np.testing.assert_array_equal(found, StillField(field, params, RECEIVERS[:1], *SIZE)(TX, 0))
+    found = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
+    np.testing.assert_array_equal(found, StaticOperator(field, params, RECEIVERS[:1], *SIZE)(TX, 0))
     assert not any(tmp_path.iterdir())
 
 
@@ -250,7 +250,7 @@ def test_the_factorised_field_is_its_sum() -> None:
 
 def test_another_receiver_has_its_own(tmp_path: Path) -> None:
     field, params = made("factorised")
-    both = StillField(field, params, RECEIVERS, *SIZE, tmp_path)
+    both = StaticOperator(field, params, RECEIVERS, *SIZE, tmp_path)
     assert isinstance(RECEIVERS[1], Receiver)
     assert np.abs(both(TX, 0) - both(TX, 1)).max() > 0.01
     assert sorted(p.name for p in tmp_path.iterdir()) == ["operator0.npz", "operator1.npz"]

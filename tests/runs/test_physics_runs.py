@@ -390,7 +390,9 @@ def test_headings_that_are_refused(name: str, run: Path, tmp_path: Path, capsys:
 def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     heard: list[tuple[str, float]] = []
     record = wave_record(36, 10, receivers=1)
-    out = train(record, tmp_path / "run", "hybrid", settings=QUICK, listen=lambda *told: heard.append(told[:2])).folder
+    out = train(
+        record, tmp_path / "run", "hybrid", settings=QUICK, on_progress=lambda *told: heard.append(told[:2])
+    ).folder
     assert {what for what, _ in heard} == {"one: element signals of spectra", "one: signals", "one: weights"}
     assert stored(out)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
 

@@ -49,7 +49,7 @@ RESUMED = (
     "density.every=12",
     "density.start=0",
     "density.stop=1",
-    "density.grow=0.3",
+    "density.growth_fraction=0.3",
 )
 
 
@@ -74,11 +74,11 @@ def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -
     assert [entry["step"] for entry in log_of(out)] == [s for s in range(5, 41, 5) if s <= at]
     heard: list[int] = []
 
-    def listen(stage: str, share: float, progress: Progress) -> None:
+    def on_progress(stage: str, share: float, progress: Progress) -> None:
         heard.append(progress.step)
         keep_checkpoint(out, progress)
 
-    resume(out, listen=listen)
+    resume(out, on_progress=on_progress)
     assert heard == [s for s in range(5, 41, 5) if s > at]  # it went on, and did not start anew
 
 
@@ -86,7 +86,10 @@ def test_resumed_run_is_the_same_bit_for_bit(folder: Path, tmp_path: Path) -> No
     """Stopped after a round of density control, and once more between two; parameters, moments, mean, scores."""
     config = settings(*RESUMED, "deterministic=true")
     train(
-        folder, tmp_path / "whole", settings=config, listen=lambda *said: keep_checkpoint(tmp_path / "whole", said[2])
+        folder,
+        tmp_path / "whole",
+        settings=config,
+        on_progress=lambda *said: keep_checkpoint(tmp_path / "whole", said[2]),
     )
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
     for arrays in (checkpoint_of, arrays_of):
@@ -128,7 +131,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "killed", settings=config, listen=kill)
+        train(folder, tmp_path / "killed", settings=config, on_progress=kill)
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 24
     assert log_of(tmp_path / "killed")[-1]["step"] == 30
     resume(tmp_path / "killed")
@@ -144,8 +147,8 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     """The loss of one row is not a number; with that mended, the run goes on as if nothing had been."""
     paper = Spectrum.loss
 
-    def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, structural_weight: float) -> Any:
-        found = paper(task, prediction, truth, *shape, structural_weight=structural_weight)
+    def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, ssim_weight: float) -> Any:
+        found = paper(task, prediction, truth, *shape, ssim_weight=ssim_weight)
         return dr.select(dr.max(truth) > 1.5, np.nan, found)
 
     config = settings("steps=20", "checkpoint_every=2", "log_every=20", "validate_every=20", "deterministic=true")
@@ -171,7 +174,7 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
         raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "run", settings=settings("steps=10"), listen=kill)
+        train(folder, tmp_path / "run", settings=settings("steps=10"), on_progress=kill)
     assert not (tmp_path / "run" / "checkpoint.npz").exists()
     with pytest.raises(InputError, match=r"model\.npz: missing, the fit was stopped; finish it with train"):
         open_run(tmp_path / "run").predictor()

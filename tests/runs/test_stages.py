@@ -10,7 +10,7 @@ from wrf_mi.runs.watch import Watch
 def test_stages_are_named_once(capsys: pytest.CaptureFixture[str]) -> None:
     with Watch() as stages:
         for what, share in (("a", 0.0), ("a", 0.5), ("b", 0.1), ("b", 1.0)):
-            stages.listen(what, share)
+            stages.on_progress(what, share)
     assert capsys.readouterr().err.splitlines() == ["a", "b"]
 
 
@@ -18,8 +18,8 @@ def test_stages_show_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys:
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("FORCE_COLOR", "1")
     with Watch() as stages:
-        stages.listen("first", 0.5)
-        stages.listen("second", 1.0)
+        stages.on_progress("first", 0.5)
+        stages.on_progress("second", 1.0)
     shown = capsys.readouterr().err
     assert "first" in shown
     assert "second" in shown

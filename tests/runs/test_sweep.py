@@ -23,18 +23,20 @@ from wrf_mi.runs.sweep import check_failures, plan_sweep, run_sweep, sweep_table
 
 SECONDS = 60
 """For a worker to begin its part, on a busy machine."""
-NAMES = ["seed=0,structural_weight=0.1", "seed=0,structural_weight=0.2", "seed=1,structural_weight=0.1"]
-NAMES += ["seed=1,structural_weight=0.2"]
-VARY = ["--vary", "seed=0,1", "--vary", "structural_weight=0.1,0.2"]
+NAMES = ["seed=0,loss.ssim_weight=0.1", "seed=0,loss.ssim_weight=0.2", "seed=1,loss.ssim_weight=0.1"]
+NAMES += ["seed=1,loss.ssim_weight=0.2"]
+VARY = ["--vary", "seed=0,1", "--vary", "loss.ssim_weight=0.1,0.2"]
 
 
 def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) -> None:
     options = {"dataset": "rfid-lab", "model": "hybrid"}
-    plan = plan_sweep(tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["hold_out=0"], ["--flag"])
+    plan = plan_sweep(
+        tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["holdout_steps_fraction=0"], ["--flag"]
+    )
     assert plan.varied == ["split", "steps"]
     names = ["split=official,steps=1", "split=official,steps=2", "split=blocked-2,steps=1", "split=blocked-2,steps=2"]
     assert [run.folder for run in plan.runs] == [tmp_path / name for name in names]
-    command = "train rfid-lab --model hybrid --split blocked:2 --flag --set hold_out=0 --set steps=1"
+    command = "train rfid-lab --model hybrid --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
     assert " ".join(plan.runs[2].arguments) == command
     assert not any(tmp_path.iterdir())
 
@@ -99,7 +101,7 @@ def test_table_holds_what_the_runs_scored(swept: Path) -> None:
     assert sorted(path.name for path in swept.iterdir() if path.is_dir()) == NAMES
     with (swept / "scores.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert [(row["seed"], row["structural_weight"]) for row in rows] == [
+    assert [(row["seed"], row["loss.ssim_weight"]) for row in rows] == [
         ("0", "0.1"),
         ("0", "0.2"),
         ("1", "0.1"),
@@ -112,7 +114,7 @@ def test_table_holds_what_the_runs_scored(swept: Path) -> None:
         assert float(row["reference_median"]) == pytest.approx(np.median(run.reference_score))
     lines = (swept / "scores.md").read_text().splitlines()
     assert len(lines) == 6
-    assert lines[0].startswith("| seed | structural_weight | score | median |")
+    assert lines[0].startswith("| seed | loss.ssim_weight | score | median |")
     assert len({len(line.split("|")) for line in lines}) == 1
 
 
@@ -171,7 +173,7 @@ def test_finished_runs_are_kept_and_others_added_or_done_again(
     assert {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]} == dates
     for name in NAMES:
         np.testing.assert_array_equal(read_run(out / name).prediction, read_run(swept / name).prediction)
-    refused([*command, "--set", "hold_out=0"], "holds a sweep with other settings", capsys)
+    refused([*command, "--set", "holdout_steps_fraction=0"], "holds a sweep with other settings", capsys)
     refused([*command[:-2], folder], "holds no sweep", capsys)
 
 

@@ -183,8 +183,14 @@ def test_calibration_is_kept_and_scores_again(
     for setting in ("steps=5", "patience=2"):
         with pytest.raises(InputError, match=f"^setting {setting}: of a training, and nothing is calibrated"):
             train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=[setting])
-    with pytest.raises(InputError, match=r"setting hold_out: 2\.0 is out of range, choose 0 to 1"):
-        train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=gain", "hold_out=2"])
+    with pytest.raises(InputError, match=r"setting holdout_steps_fraction: 2\.0 is out of range, choose 0 to 1"):
+        train(
+            flat_folder,
+            tmp_path / "other",
+            "ray-tracing",
+            scene=room,
+            settings=["calibration=gain", "holdout_steps_fraction=2"],
+        )
     with pytest.raises(InputError, match="calibration everything: choose of gain, materials, planes, patterns, pose"):
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 

@@ -182,7 +182,7 @@ def record_of(receivers: tuple[Receiver, ...], tx: np.ndarray, observation: np.n
 def trainer_of(record: Record, scene: Any, parts: str, *settings: str) -> Trainer:
     """Paths alone, trained on all rows."""
     rows = np.arange(len(record))
-    own = ("traced.rays=4096", "optimiser.warm_up=10", "hold_out=0", "patience=0", f"batch={len(record)}")
+    own = ("traced.rays=4096", "optimiser.warm_up=10", "holdout_steps_fraction=0", "patience=0", f"batch={len(record)}")
     config = with_settings(calibration_config(parts.split(","), record.task == "spectrum"), [*own, *settings])
     return Trainer(record, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=scene)
 

@@ -197,11 +197,11 @@ def test_the_same_seed_gives_the_same_paths_in_any_parts(divided: Any, monkeypat
     options = replace(UPRIGHT, transmission=True, rays=1 << 13)
     whole = trace_paths(divided, tx, rx, options).paths
     equal(trace_paths(divided, tx, rx, options).paths, whole)
-    monkeypatch.setattr(solve_module, "TARGETS_AT_ONCE", 5)
-    monkeypatch.setattr(images_module, "CANDIDATES_AT_ONCE", 37)
-    monkeypatch.setattr(search_module, "PAIRS_AT_ONCE", 100)
-    monkeypatch.setattr(search_module, "RAYS_AT_ONCE", 1000)
-    monkeypatch.setattr("wrf_mi.tracing.fields.PATHS_AT_ONCE", 50)
+    monkeypatch.setattr(solve_module, "TARGETS_PER_CHUNK", 5)
+    monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
+    monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
+    monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
+    monkeypatch.setattr("wrf_mi.tracing.fields.PATHS_PER_CHUNK", 50)
     parts = trace_paths(divided, tx, rx, options).paths
     np.testing.assert_allclose(parts.gain, whole.gain, rtol=1e-5)  # other widths of vector instructions
     equal(replace(parts, gain=whole.gain), whole)

@@ -98,7 +98,7 @@ def run(one_gateway: Record, folder: Path, tmp_path_factory: pytest.TempPathFact
     """A short fit of eight Gaussians."""
     out = tmp_path_factory.mktemp("runs") / "run"
     return train(
-        str(folder), out, settings=small("steps=60", "hold_out=0", "network.width=32", "network.layers=4")
+        str(folder), out, settings=small("steps=60", "holdout_steps_fraction=0", "network.width=32", "network.layers=4")
     ).folder
 
 
@@ -192,13 +192,17 @@ def test_sizes_of_networks_are_settings() -> None:
         return make_field(small(*own).resolved(np.zeros((1, 3))))
 
     assert (field().width, field().layers) == (256, 8)
-    plus = field("network.width=32", "network.layers=4", "network.still=true")
-    assert (plus.width, plus.layers, plus.skip, plus.still) == (32, 4, 2, True)
+    plus = field("network.width=32", "network.layers=4", "network.static_geometry=true")
+    assert (plus.width, plus.layers, plus.skip, plus.static_geometry) == (32, 4, 2, True)
     first = field("model=wrf-gs", "network.width=16")
     assert (first.width, first.signal_widths, first.layers) == (16, (16, 8), 8)
     terms = field("model=factorised", "network.terms=5", "network.width=16")
     assert (terms.terms, terms.width, terms.layers) == (5, 16, 3)
-    for bad in (("model=wrf-gs", "network.still=true"), ("model=wrf-gs", "network.phase_hz=1e9"), ("network.terms=4",)):
+    for bad in (
+        ("model=wrf-gs", "network.static_geometry=true"),
+        ("model=wrf-gs", "network.phase_hz=1e9"),
+        ("network.terms=4",),
+    ):
         with pytest.raises(InputError, match="leave it away"):
             field(*bad)
 
@@ -209,7 +213,7 @@ def test_settings_say_what_predictions_skip(run: Path, one_gateway: Record) -> N
     split = make_splits(one_gateway, "official")[0]
     say = {}
     for rest in (0.0, 1.0):
-        trainer = Trainer(one_gateway, split, small("steps=3", f"skip.rest={rest}"))
+        trainer = Trainer(one_gateway, split, small("steps=3", f"skip.early_stop_tolerance={rest}"))
         trainer.run()
         say[rest] = trainer.state.params(), trainer.predictor()(one_gateway.tx_pos_m[:2])
     for name, values in say[0.0][0].items():
@@ -225,7 +229,7 @@ def test_budgets_are_measured_beside_each_other(folder: Path, one_gateway: Recor
         "small, 8": Budget(small_one, Compression(precision="8bit")),
         "fewer": Budget((), Compression(budget=5), of="large"),
     }
-    schedule = (*QUICK, "steps=10", "hold_out=0")
+    schedule = (*QUICK, "steps=10", "holdout_steps_fraction=0")
     found = budgets(record, tmp_path, schedule, given=given)
     assert found["large"]["times_smaller"] == 1
     assert found["small, 8"]["times_smaller"] > 10

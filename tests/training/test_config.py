@@ -35,15 +35,15 @@ DEFAULTS = leaves(asdict(TrainConfig()))
 INSIDE = {"initial.opacity", "density.least_opacity", "density.reset_opacity"}
 """Shares that must be neither 0 nor 1: their logits are stored."""
 LARGEST = {
-    "hold_out": 1.0,
-    "structural_weight": 1.0,
+    "holdout_steps_fraction": 1.0,
+    "loss.ssim_weight": 1.0,
     "initial.size_deg": 89.0,
     "optimiser.cosine_start": 1.0,
     "optimiser.final": 1.0,
-    "optimiser.averaging": 0.9999,
+    "optimiser.ema_decay": 0.9999,
     "density.start": 1.0,
     "density.stop": 1.0,
-    "density.grow": 1.0,
+    "density.growth_fraction": 1.0,
     "traced.alone": 0.4,
     "traced.faint": 0.4,
     "traced.depth": 12,
@@ -120,7 +120,7 @@ def test_settings_as_text_make_any_configuration(config: TrainConfig) -> None:
 def test_what_is_not_named_keeps_its_default() -> None:
     assert read({}) == TrainConfig()
     config = read({"steps": 5, "density": {"grow": 0.5}})
-    assert (config.steps, config.density.grow, config.density.every) == (5, 0.5, TrainConfig().density.every)
+    assert (config.steps, config.density.growth_fraction, config.density.every) == (5, 0.5, TrainConfig().density.every)
 
 
 @pytest.mark.parametrize(
@@ -187,8 +187,8 @@ def test_settings_that_are_refused(setting: str, message: str) -> None:
     [
         *(f"{name}=0" for name in ("batch", "log_every", "validate_every", "checkpoint_every")),
         "seed=-1",
-        "hold_out=1.01",
-        "structural_weight=-0.1",
+        "holdout_steps_fraction=1.01",
+        "loss.ssim_weight=-0.1",
         "initial.gaussians=0",
         "initial.opacity=1",
         "initial.opacity=0",
@@ -204,9 +204,9 @@ def test_settings_that_are_refused(setting: str, message: str) -> None:
         "optimiser.network=-1e-3",
         "optimiser.network=.nan",
         "optimiser.signal=.inf",
-        "optimiser.averaging=1",
+        "optimiser.ema_decay=1",
         "density.every=-1",
-        "density.grow=2",
+        "density.growth_fraction=2",
         "density.least_opacity=0",
         "density.reset_opacity=1",
     ],
@@ -220,16 +220,16 @@ def test_values_out_of_range(setting: str) -> None:
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("hold_out", 0.0),
-        ("hold_out", 1.0),
+        ("holdout_steps_fraction", 0.0),
+        ("holdout_steps_fraction", 1.0),
         ("encoding.tx_octaves", 0),
         ("density.every", 0),
-        ("optimiser.averaging", 0.0),
+        ("optimiser.ema_decay", 0.0),
         ("seed", 0),
     ],
 )
 def test_ends_of_ranges_are_accepted(setting: str, value: float) -> None:
-    other = with_settings(TrainConfig(), ["hold_out=0.5", "seed=7"])
+    other = with_settings(TrainConfig(), ["holdout_steps_fraction=0.5", "seed=7"])
     config = with_settings(other, [f"{setting}={value}"])
     assert attrgetter(setting)(config) == value
     assert config != other
@@ -261,7 +261,7 @@ def test_paper_preset_has_what_the_paper_states() -> None:
     """Section V-A: L = 9, ten octaves, for Gaussians and transmitter; eta = 0.2."""
     config = with_settings(TrainConfig(), PRESETS["paper"])
     assert (config.encoding.position_octaves, config.encoding.tx_octaves) == (10, 10)
-    assert config.structural_weight == 0.2
+    assert config.loss.ssim_weight == 0.2
 
 
 def test_zero_steps_are_as_many_as_the_model_needs() -> None:

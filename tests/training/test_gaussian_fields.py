@@ -33,10 +33,10 @@ MODELS = tuple(FIELDS)
 SMALL = (
     "steps=500",
     "batch=8",
-    "hold_out=0.5",
+    "holdout_steps_fraction=0.5",
     "optimiser.network=2e-3",
     "optimiser.warm_up=20",
-    "optimiser.averaging=0.98",
+    "optimiser.ema_decay=0.98",
     "initial.gaussians=12",
     "network.layers=2",
     "network.width=16",
@@ -258,23 +258,30 @@ def test_any_number_of_rows_is_predicted_alike() -> None:
     np.testing.assert_array_equal(everything[chosen], [predict(record.tx_pos_m[i : i + 1], 0)[0] for i in chosen])
 
 
-@pytest.mark.parametrize("hold_out", [0.5, 1.0])
-def test_a_fit_goes_on_from_its_best_moment(hold_out: float) -> None:
+@pytest.mark.parametrize("holdout_steps_fraction", [0.5, 1.0])
+def test_a_fit_goes_on_from_its_best_moment(holdout_steps_fraction: float) -> None:
     """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
     record = strengths()
-    own = config(record, "steps=160", "validate_every=10", "patience=2", f"hold_out={hold_out}", "deterministic=true")
+    own = config(
+        record,
+        "steps=160",
+        "validate_every=10",
+        "patience=2",
+        f"holdout_steps_fraction={holdout_steps_fraction}",
+        "deterministic=true",
+    )
     given, seen, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), [], {}
     trainer = Trainer(record, halves(record), own)
     trainer.validate = lambda: next(given)  # type: ignore[method-assign]
 
-    def listen(progress) -> None:
+    def on_progress(progress) -> None:
         if progress.validation_score is not None:
             seen.append((progress.step, progress.held_out))
         if progress.step == 30:
             kept.update(trainer.state.params())
 
-    trainer.run(listen)
-    left = 80 * 30 // 80 if hold_out < 1 else 0
+    trainer.run(on_progress)
+    left = 80 * 30 // 80 if holdout_steps_fraction < 1 else 0
     assert [step for step, held_out in seen if held_out] == [10, 20, 30, 40, 50]
     assert trainer.state.chosen == 30
     assert trainer.state.step == 160
@@ -328,7 +335,7 @@ def test_differences_are_divided_by_the_stated_noise() -> None:
     for r in (0, 1):
         number = mi.UInt32(batch.tolist())
         truth, factor = data.select(number, r, 1)[1], data.factor(number, r, 1)
-        found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), structural_weight=0.0)
+        found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), ssim_weight=0.0)
         # Everything is 2 dB too high; the sum of two numbers near -50 in single precision.
         np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
 

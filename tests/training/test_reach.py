@@ -171,12 +171,12 @@ def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
     assert np.abs(trainer.predictor()(position[7:])).max() > 0
 
 
-@pytest.mark.parametrize(("hold_out", "known"), [(0.7, 45), (1.0, None)])
-def test_rows_that_never_train_are_not_known(hold_out: float, known: int | None) -> None:
+@pytest.mark.parametrize(("holdout_steps_fraction", "known"), [(0.7, 45), (1.0, None)])
+def test_rows_that_never_train_are_not_known(holdout_steps_fraction: float, known: int | None) -> None:
     """Kept out to the end, held-out rows are judged by their distance from those that trained."""
     rng = np.random.default_rng(0)
     record, rows = channels(np.ones((60, 1)), rng.uniform(1, 2, (60, 3))), np.arange(60)
-    config = with_settings(default_config("csi"), [*SMALL, f"hold_out={hold_out}"])
+    config = with_settings(default_config("csi"), [*SMALL, f"holdout_steps_fraction={holdout_steps_fraction}"])
     trainer = Trainer(record, Split("own", 0, rows[:40], rows[40:45], rows[45:]), config)
     trainer.run()
     reach = trainer.reach()

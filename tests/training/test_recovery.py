@@ -31,8 +31,8 @@ def recover(model: str, steps: int, rows: int, **size: Any) -> tuple[float, floa
     split = Split("own", 0, np.arange(rows - 14), np.arange(rows - 14, rows - 10), np.arange(rows - 10, rows))
     config = with_settings(
         TrainConfig(model=model),
-        [f"steps={steps}", "batch=4", "hold_out=1", "density.every=0", "optimiser.network=3e-4",
-         "optimiser.averaging=0.99", "log_every=500"],
+        [f"steps={steps}", "batch=4", "holdout_steps_fraction=1", "density.every=0", "optimiser.network=3e-4",
+         "optimiser.ema_decay=0.99", "log_every=500"],
     )  # fmt: skip
     trainer = Trainer(record, split, config, field=field)
     rng = np.random.default_rng(7)

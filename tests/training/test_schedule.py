@@ -44,7 +44,7 @@ def test_each_epoch_visits_each_row_at_each_receiver_once(
     train *= batch
     split = split_of(train, validation)
     steps = epochs * receivers * train // batch
-    schedule = plan_of(split, receivers, batch=batch, steps=steps, hold_out=1.0, seed=seed)
+    schedule = plan_of(split, receivers, batch=batch, steps=steps, holdout_steps_fraction=1.0, seed=seed)
     assert schedule.rows.shape == (steps, batch)
     per_epoch = steps // epochs
     for e in range(epochs):
@@ -65,15 +65,22 @@ def test_a_batch_holds_no_row_twice(train: int, batch: int, seed: int) -> None:
 
 def test_every_row_comes_although_the_batch_does_not_divide_them() -> None:
     split = split_of(7)
-    schedule = plan_of(split, 1, batch=3, steps=40, hold_out=1.0)
+    schedule = plan_of(split, 1, batch=3, steps=40, holdout_steps_fraction=1.0)
     assert set(schedule.rows.ravel()) == set(split.train)
 
 
-@given(hold_out=st.floats(0, 1), steps=st.integers(1, 200), receivers=st.integers(1, 3), seed=st.integers(0, 99))
-def test_validation_rows_wait_and_test_rows_never_come(hold_out: float, steps: int, receivers: int, seed: int) -> None:
+@given(
+    holdout_steps_fraction=st.floats(0, 1),
+    steps=st.integers(1, 200),
+    receivers=st.integers(1, 3),
+    seed=st.integers(0, 99),
+)
+def test_validation_rows_wait_and_test_rows_never_come(
+    holdout_steps_fraction: float, steps: int, receivers: int, seed: int
+) -> None:
     split = split_of(9, 3)
-    schedule = plan_of(split, receivers, steps=steps, hold_out=hold_out, seed=seed)
-    assert schedule.joined == round(hold_out * steps)
+    schedule = plan_of(split, receivers, steps=steps, holdout_steps_fraction=holdout_steps_fraction, seed=seed)
+    assert schedule.joined == round(holdout_steps_fraction * steps)
     assert not np.isin(schedule.rows[: schedule.joined], split.validation).any()
     assert not np.isin(schedule.rows, split.test).any()
     assert np.isin(schedule.rows, split.all_train).all()
@@ -83,9 +90,9 @@ def test_validation_rows_wait_and_test_rows_never_come(hold_out: float, steps: i
 
 
 def test_hold_out_of_one_never_joins() -> None:
-    schedule = plan_of(split_of(9), 1, steps=100, hold_out=1.0)
+    schedule = plan_of(split_of(9), 1, steps=100, holdout_steps_fraction=1.0)
     assert schedule.joined == 100
-    assert plan_of(split_of(9), 1, steps=100, hold_out=0.0).joined == 0
+    assert plan_of(split_of(9), 1, steps=100, holdout_steps_fraction=0.0).joined == 0
 
 
 def same(a: Schedule, b: Schedule) -> bool:
@@ -106,7 +113,7 @@ def test_plan_depends_on_settings_split_and_seed_alone() -> None:
 
 
 def test_epochs_differ_in_order() -> None:
-    schedule = plan_of(split_of(30), 1, steps=60, hold_out=1.0)
+    schedule = plan_of(split_of(30), 1, steps=60, holdout_steps_fraction=1.0)
     assert not np.array_equal(schedule.rows[:30], schedule.rows[30:])
 
 
@@ -129,12 +136,12 @@ def test_no_warm_up() -> None:
 
 def test_the_mean_forgets_its_start() -> None:
     """Decay rises from 1/10 to the setting: the starting values' share of the mean is soon nothing."""
-    decay = plan_of(split_of(9), 1, "optimiser.averaging=0.99", steps=3000).decay
+    decay = plan_of(split_of(9), 1, "optimiser.ema_decay=0.99", steps=3000).decay
     assert decay[0] == pytest.approx(0.1)
     assert (np.diff(decay) >= 0).all()
     assert decay.max() == 0.99
     assert np.prod(decay[:20]) < 1e-6
-    assert not plan_of(split_of(9), 1, "optimiser.averaging=0", steps=30).decay.any()
+    assert not plan_of(split_of(9), 1, "optimiser.ema_decay=0", steps=30).decay.any()
 
 
 def test_rounds_of_density_control() -> None:
@@ -157,9 +164,11 @@ def test_rates_stay_until_the_cosine_starts() -> None:
 
 def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
     assert plan_of(split_of(3, 2), 1, "batch=4", steps=10).rows.shape == (10, 3)
-    assert plan_of(split_of(3, 1), 1, "batch=5", "hold_out=0", steps=10).rows.shape == (10, 4)
+    assert plan_of(split_of(3, 1), 1, "batch=5", "holdout_steps_fraction=0", steps=10).rows.shape == (10, 4)
     rows = [np.array([4, 7, 9]), np.array([1, 2, 3, 5, 6, 8])]
-    schedule = plan(with_settings(TrainConfig(batch=5, steps=9), ["hold_out=1"]), rows, rows, np.random.default_rng(0))
+    schedule = plan(
+        with_settings(TrainConfig(batch=5, steps=9), ["holdout_steps_fraction=1"]), rows, rows, np.random.default_rng(0)
+    )
     assert schedule.rows.shape == (9, 3)
     # An epoch has one batch of the first receiver and two of the second, each of its own rows.
     for three in range(0, 9, 3):
@@ -173,6 +182,6 @@ def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
 
 def test_rows_that_join_at_once_count() -> None:
     split = split_of(0, 4)
-    schedule = plan_of(split, 1, steps=10, batch=4, hold_out=0.0)
+    schedule = plan_of(split, 1, steps=10, batch=4, holdout_steps_fraction=0.0)
     assert schedule.rows.shape == (10, 4)
     np.testing.assert_array_equal(np.sort(schedule.rows, axis=1), np.tile(split.validation, (10, 1)))

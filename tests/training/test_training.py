@@ -34,7 +34,9 @@ FLOAT32_TOLERANCE = 1e-4
 def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> None:
     heard: list[Progress] = []
     split = official(one_gateway)
-    trainer = Trainer(one_gateway, split, settings("steps=120", "hold_out=0.5", "validate_every=40", model=model))
+    trainer = Trainer(
+        one_gateway, split, settings("steps=120", "holdout_steps_fraction=0.5", "validate_every=40", model=model)
+    )
     assert trainer.run(heard.append)
     assert [p.step for p in heard] == list(range(5, 121, 5))
     assert heard[-1].loss < 0.8 * heard[0].loss
@@ -52,7 +54,8 @@ def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> Non
 def test_density_rounds_within_a_run(one_gateway: Record) -> None:
     heard: list[Progress] = []
     own = (
-        "steps=100", "density.every=10", "density.start=0", "density.stop=0.4", "density.grow=0.5", "density.most=20"
+        "steps=100", "density.every=10", "density.start=0", "density.stop=0.4", "density.growth_fraction=0.5",
+        "density.max_gaussians=20",
     )  # fmt: skip
     trainer = Trainer(one_gateway, official(one_gateway), settings(*own))
     trainer.run(heard.append)
@@ -76,7 +79,7 @@ def test_a_round_that_changes_nothing_changes_nothing(one_gateway: Record) -> No
     states = []
     for own in ("density.every=0", "density.every=10"):
         config = settings(
-            "steps=30", "deterministic=true", own, "density.start=0", "density.stop=1", "density.grow=0"
+            "steps=30", "deterministic=true", own, "density.start=0", "density.stop=1", "density.growth_fraction=0"
         )  # fmt: skip
         trainer = Trainer(one_gateway, official(one_gateway), config)
         trainer.run()
@@ -88,7 +91,14 @@ def test_a_round_that_changes_nothing_changes_nothing(one_gateway: Record) -> No
 
 def test_opacity_reset_within_a_run(one_gateway: Record) -> None:
     """Opacities right after the reset, before a step changes them."""
-    own = ("steps=11", "density.every=10", "density.start=0", "density.stop=1", "density.grow=0", "initial.opacity=0.5")
+    own = (
+        "steps=11",
+        "density.every=10",
+        "density.start=0",
+        "density.stop=1",
+        "density.growth_fraction=0",
+        "initial.opacity=0.5",
+    )
     trainer = Trainer(one_gateway, official(one_gateway), settings(*own, "density.reset_every=1"))
     trainer.run(stop=stop_after(10))
     opacity = 1 / (1 + np.exp(-trainer.state.params()["opacity"]))
@@ -111,7 +121,7 @@ def test_a_loss_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
     for group in (trainer.state.params(), trainer.state.mean_params(), *trainer.state.moments()[:2]):
         for name, values in group.items():
             assert np.isfinite(values).all(), name
-    assert np.isfinite(trainer.state.urge.numpy()).all()
+    assert np.isfinite(trainer.state.view_gradient_norm.numpy()).all()
     reached = int(trainer.schedule.rows[:, 0].tolist().index(row)) + 1
     assert reached % 5 != 0  # not where a line of the log is due
     assert trainer.state.step == reached
@@ -129,7 +139,7 @@ def test_a_gradient_that_is_not_a_number_changes_nothing(one_gateway: Record) ->
     for name, values in trainer.state.params().items():
         np.testing.assert_array_equal(values, before[name], err_msg=name)
     assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
-    assert not trainer.state.urge.numpy().any()
+    assert not trainer.state.view_gradient_norm.numpy().any()
 
 
 def test_what_broke_is_reported_before_a_stop_is_asked_for(one_gateway: Record) -> None:
@@ -216,7 +226,7 @@ def test_every_part_can_be_replaced(one_gateway: Record) -> None:
         return dr.mean(dr.square(prediction - truth))
 
     heard: list[Progress] = []
-    config = settings("steps=1", "batch=2", "log_every=1", "hold_out=1")
+    config = settings("steps=1", "batch=2", "log_every=1", "holdout_steps_fraction=1")
     split = official(one_gateway)
     trainer = Trainer(one_gateway, split, config, field=small_field("wrf-gs"), initial=start, loss=squares)
     np.testing.assert_allclose(trainer.state.params()["position"].T, start.position_m, rtol=1e-6)
@@ -231,7 +241,13 @@ def test_every_part_can_be_replaced(one_gateway: Record) -> None:
 def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
     """On the batch's rows at the batch's receiver, before the step; with 8, 12 and 18 Gaussians too."""
     heard: list[Progress] = []
-    own = ("density.every=3", "density.start=0", "density.stop=0.7", "density.grow=0.5", "density.most=18")
+    own = (
+        "density.every=3",
+        "density.start=0",
+        "density.stop=0.7",
+        "density.growth_fraction=0.5",
+        "density.max_gaussians=18",
+    )
     trainer = Trainer(two_gateways, official(two_gateways), settings("steps=10", "batch=3", "log_every=1", *own))
     expected = []
     for t in range(10):

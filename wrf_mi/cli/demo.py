@@ -18,7 +18,7 @@ from ..synthetic import load_record
 from ..synthetic.laboratory import NAME as LABORATORY
 from ..synthetic.laboratory import SCAN
 from ..training.config import PRESETS
-from ..training.session import Listen
+from ..training.session import OnProgress
 
 REAL = "rfid-lab"
 FLAT = "flat-ble"
@@ -38,7 +38,7 @@ def here(name: str) -> Path | None:
         return None
 
 
-def demo(out: Path | None, listen: Listen, stop: Callable[[], bool]) -> tuple[Run, Path]:
+def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) -> tuple[Run, Path]:
     """Train on real spectra, trace real signal strengths, and draw both; or all in a room made up for it.
 
     Without real spectra, spectra of the embedded room take their place, traced in its true mesh; the ray tracer is
@@ -46,7 +46,7 @@ def demo(out: Path | None, listen: Listen, stop: Callable[[], bool]) -> tuple[Ru
 
     Args:
         out: run folder; None: a new one in ``runs/``. The traced run lies in ``traced/`` in it.
-        listen: progress callback.
+        on_progress: progress callback.
         stop: True stops at a checkpoint.
 
     Returns:
@@ -58,7 +58,7 @@ def demo(out: Path | None, listen: Listen, stop: Callable[[], bool]) -> tuple[Ru
         print(f"using the embedded room {LABORATORY}, traced here by Sionna RT, in its place", file=sys.stderr)
     dataset = REAL if real else LABORATORY
     print(f"training wrf-gs+ on {dataset}; results go to {folder}", file=sys.stderr)
-    run = train(dataset, folder, settings=PRESETS["quick"], listen=listen, stop=stop)
+    run = train(dataset, folder, settings=PRESETS["quick"], on_progress=on_progress, stop=stop)
     traced = _trace_flat(folder) if real else _trace_scan(folder)
     runs = [folder] if traced is None else [folder, traced]
     return run, compare(runs, folder / "compare")

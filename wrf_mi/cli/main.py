@@ -152,7 +152,7 @@ def _compress(a: Arguments) -> int:
 
     how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
     with progress_bar() as watch:
-        found = compress_run(a.run, a.out, how, listen=watch.listen)
+        found = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
     if a.json:
         print_json(found)
     else:
@@ -172,7 +172,7 @@ def _demo(a: Arguments) -> int:
     from .demo import demo
 
     with progress_bar() as watch:
-        run, index = demo(Path(a.out) if a.out else None, watch.listen, watch.stop)
+        run, index = demo(Path(a.out) if a.out else None, watch.on_progress, watch.stop)
     show_metrics(run.metrics, run.folder, a.json)
     print(f"pictures: {index}", file=sys.stderr if a.json else sys.stdout)
     return 0

@@ -53,7 +53,7 @@ def _train(a: Arguments, asked: dict[str, Any]) -> int:
     from ..runs.api import train
 
     with progress_bar() as watch:
-        asked |= {"listen": watch.listen, "stop": watch.stop, "progress": sys.stderr.isatty()}
+        asked |= {"listen": watch.on_progress, "stop": watch.stop, "progress": sys.stderr.isatty()}
         run = train(a.dataset, a.out, **asked)
     return show_metrics(run.metrics, run.folder, a.json)
 
@@ -64,7 +64,7 @@ def _resume(a: Arguments) -> int:
     from ..runs.api import resume
 
     with progress_bar() as watch:
-        run = resume(a.resume, watch.listen, watch.stop, progress=sys.stderr.isatty())
+        run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
 

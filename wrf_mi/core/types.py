@@ -12,6 +12,9 @@ from .antenna import ANTENNA, Antenna
 
 IntArray = NDArray[np.int64]
 
+SQUARED_MAGNITUDE_EPS = 1e-8
+"""Added to |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: the least magnitude is 1e-4."""
+
 
 @dataclass(frozen=True)
 class Receiver:

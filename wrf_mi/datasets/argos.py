@@ -44,7 +44,7 @@ TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
 ARGOS_START, ARGOS_SYMBOLS = 47, 2
 """Of the first pilot symbol in a user's slot, and how many there are (RENEWLab, ``samps2csi``)."""
 FULL_SCALE = 2.0**15
-AT_ONCE = 1 << 26
+CHUNK_SIZE = 1 << 26
 """Bytes of samples read at once."""
 
 
@@ -175,7 +175,7 @@ def _open(
     which = _cell(file, shape, cell) if len(shape) == 5 else None
 
     def parts() -> Iterator[NDArray[Any]]:
-        step = max(1, AT_ONCE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
+        step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
         for first in range(0, len(asked), step):
             own = asked[first : first + step]
             rows = slice(own.start, own[-1] + 1, own.step)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
 
-ROWS_AT_ONCE = 256
+ROWS_PER_CHUNK = 256
 """Rows that are looked at together: a record of spectra is not to be copied for it."""
 
 
@@ -84,8 +84,8 @@ def scorable(observation: NDArray[np.generic]) -> tuple[NDArray[np.generic], int
 def _states(observed: NDArray[np.generic], rows: IntArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Of a receiver's rows: whether nothing was received, and whether an observation is neither finite nor missing."""
     missing, broken = np.empty(len(rows), bool), np.empty(len(rows), bool)
-    for start in range(0, len(rows), ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
+    for start in range(0, len(rows), ROWS_PER_CHUNK):
+        part = slice(start, start + ROWS_PER_CHUNK)
         values = observed[rows[part]].reshape(len(rows[part]), -1)
         # NaN throughout says that nothing was received; anything else that is no number is a mistake in the data.
         missing[part] = np.isnan(values).all(axis=1)

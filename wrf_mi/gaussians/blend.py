@@ -280,5 +280,7 @@ def blend(
     own = attenuation if attenuation is not None else [opacity]
     columns = [*footprints.direction, *footprints.whitened[0], *footprints.whitened[1], *signal, *own]
     if reach is not None and dr.grad_enabled(columns):
-        raise ValueError("blend: walks that end early give no gradients; leave skip.rest at 0 in training")
+        raise ValueError(
+            "blend: walks that end early give no gradients; leave skip.early_stop_tolerance at 0 in training"
+        )
     return dr.custom(_Blend, lists, plane, n, product, batch, columns, reach)

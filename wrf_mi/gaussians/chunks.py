@@ -15,7 +15,7 @@ import numpy as np
 from ..backend.device import on_device
 from .parameters import Gaussians
 
-AT_ONCE = 1 << 14
+CHUNK_SIZE = 1 << 14
 """Pairs of Gaussian and transmitter at once: 64 MB of a network of width 256."""
 
 
@@ -30,7 +30,7 @@ class _Field(Protocol):
         ...
 
 
-def gaussians_in_parts(field: _Field, params: Mapping[str, Any], tx_pos: Any, at_once: int = AT_ONCE) -> Gaussians:
+def gaussians_in_parts(field: _Field, params: Mapping[str, Any], tx_pos: Any, at_once: int = CHUNK_SIZE) -> Gaussians:
     """What ``field.gaussians(params, tx_pos)`` gives, evaluated, without gradients.
 
     Args:

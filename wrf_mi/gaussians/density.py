@@ -49,11 +49,11 @@ def logit(p: float) -> float:
 
 def adapt(
     parameters: Arrays,
-    urge: NDArray[np.floating],
+    view_gradient_norm: NDArray[np.floating],
     distance_m: NDArray[np.float64],
     rng: np.random.Generator,
-    grow: float,
-    most: int,
+    growth_fraction: float,
+    max_gaussians: int,
     split_rad: float,
     least_opacity: float,
 ) -> DensityChange:
@@ -62,23 +62,24 @@ def adapt(
     Args:
         parameters: per-Gaussian parameters, [k, n] each; ``position``, ``log_scale`` and ``rotation`` among them.
             Under alpha blending also ``opacity`` (logits).
-        urge: mean gradient of the loss by each Gaussian's direction since the last round, [n]; zero: no pixel saw it.
+        view_gradient_norm: mean gradient of the loss by each Gaussian's direction since the last round, [n]; zero: no
+            pixel saw it.
         distance_m: of each Gaussian from the nearest receiver, [n].
         rng: draws where the parts of a split Gaussian go.
-        grow: share of the Gaussians that are cloned or split.
-        most: number of Gaussians that is never passed.
+        growth_fraction: share of the Gaussians that are cloned or split.
+        max_gaussians: number of Gaussians that is never passed.
         split_rad: angular size from which a Gaussian is split rather than cloned.
         least_opacity: Gaussians below it are removed.
     """
-    keep = urge > 0
+    keep = view_gradient_norm > 0
     if "opacity" in parameters:
         keep &= parameters["opacity"][0] >= logit(least_opacity)
     if not keep.any():
         # A field without Gaussians could never recover: the strongest stays.
-        keep[np.argmax(parameters["opacity"][0] if "opacity" in parameters else urge)] = True
+        keep[np.argmax(parameters["opacity"][0] if "opacity" in parameters else view_gradient_norm)] = True
     alive = np.flatnonzero(keep)
-    room = max(0, min(round(grow * len(alive)), most - len(alive)))
-    growing = alive[np.argsort(-urge[alive], kind="stable")[:room]]
+    room = max(0, min(round(growth_fraction * len(alive)), max_gaussians - len(alive)))
+    growing = alive[np.argsort(-view_gradient_norm[alive], kind="stable")[:room]]
     size = np.exp(parameters["log_scale"].max(axis=0)) / distance_m
     split = growing[size[growing] > split_rad]
     source = np.concatenate([alive, growing])

@@ -28,7 +28,7 @@ TIGHT = 1.2
 """The bound is refined until it is within this factor of an extinction that occurs ..."""
 MOST_SPLIT_PAIRS = 300_000
 """... or until this many pairs of a part of a cell and a Gaussian have been looked at."""
-SPLIT_AT_ONCE = 32
+SPLIT_PER_CHUNK = 32
 """Cells that are split together, those with the largest sums."""
 EIGHT = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Where the eight parts of a cell are, in half widths of a part."""
@@ -162,7 +162,7 @@ def largest_extinction(gaussians: HostGaussians, cells: Cells) -> float:
     heapq.heapify(heap)
     looked_at = 0
     while heap and -heap[0][0] > TIGHT * reached and looked_at < MOST_SPLIT_PAIRS:
-        boxes = [heapq.heappop(heap) for _ in range(min(len(heap), SPLIT_AT_ONCE))]
+        boxes = [heapq.heappop(heap) for _ in range(min(len(heap), SPLIT_PER_CHUNK))]
         # Pairs of a part, eight to a box, and a Gaussian, part by part.
         which = np.concatenate([np.tile(listed, 8) for *_, listed in boxes])
         part = np.repeat(np.arange(8 * len(boxes)), np.repeat([len(listed) for *_, listed in boxes], 8))

@@ -44,7 +44,7 @@ class Factorised:
     components: int = 1
 
     blending = "alpha"
-    still = True
+    static_geometry = True
     per_gaussian = (*GEOMETRY, "opacity", "signal")
     signal_parameters = ("signal", "terms.")
 

@@ -21,7 +21,7 @@ from .parameters import Gaussians, rows
 GEOMETRY = ("position", "log_scale", "rotation")
 """Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
 
-A field whose geometry and attenuation are the same for all transmitters says so by ``still``, and by
+A field whose geometry and attenuation are the same for all transmitters says so by ``static_geometry``, and by
 ``signal_parameters`` which of its parameters, by the start of their names, reach its signals alone.
 """
 
@@ -91,7 +91,7 @@ class WrfGs:
 
     blending = "product"
     per_gaussian = GEOMETRY
-    still = True
+    static_geometry = True
     signal_parameters = ("signal.",)
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
@@ -136,8 +136,8 @@ class WrfGsPlus:
 
     The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
     three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
-    With ``still`` the first head is the only one: Gaussians then stand as they are for every transmitter, and the
-    map from their signals to the receiver is the same for all.
+    With ``static_geometry`` the first head is the only one: Gaussians then stand as they are for every transmitter,
+    and the map from their signals to the receiver is the same for all.
     With ``phase_hz`` each signal turns as a wave does on its way from the transmitter's image, x' = A x + b, to the
     Gaussian: exp(-j 2 pi f abs(x' - position) / c), which a network need not learn; A and b stay as they started.
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
@@ -150,7 +150,7 @@ class WrfGsPlus:
     layers: int = 8
     width: int = 256
     skip: int = 4
-    still: bool = False
+    static_geometry: bool = False
     phase_hz: float = 0.0
     components: int = 1
 
@@ -165,7 +165,7 @@ class WrfGsPlus:
     @property
     def heads(self) -> tuple[tuple[str, int, float], ...]:
         """Name, size and starting gain of each head."""
-        moving = () if self.still else (("rotation", 4, 0.05), ("scale", 3, 0.05))
+        moving = () if self.static_geometry else (("rotation", 4, 0.05), ("scale", 3, 0.05))
         return (("signal", 2 * self.components, 0.5), *moving)
 
     def init(self, initial: InitialGaussians, rng: np.random.Generator) -> Weights:
@@ -209,7 +209,7 @@ class WrfGsPlus:
             signal=self._turned(deformed("signal", "signal"), params, tx_pos)
             if self.phase_hz
             else deformed("signal", "signal"),
-            opacity=opacity if self.still else dr.tile(opacity, batch),
+            opacity=opacity if self.static_geometry else dr.tile(opacity, batch),
             attenuation=None,
             batch=batch,
         )

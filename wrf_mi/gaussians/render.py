@@ -48,7 +48,7 @@ def splat(gaussians: Gaussians, pose: Pose, plane: Plane, skip: Skip = NOTHING) 
         if skip.contribution:
             small = negligible(gaussians.signal, beyond, gaussians.batch, skip.contribution, *parts)
             footprints.visible = seen & ~small
-        if skip.rest:
-            reach = sent * (1 / skip.rest)
+        if skip.early_stop_tolerance:
+            reach = sent * (1 / skip.early_stop_tolerance)
     lists = build_lists(footprints, order, plane, gaussians.batch, skip.boxes)
     return blend(footprints, gaussians.signal, lists, plane, gaussians.batch, *parts, reach)

@@ -30,20 +30,20 @@ class Skip:
     Attributes:
         boxes: leave out footprints that reach no pixel of a tile, those below the horizon among them. Changes nothing.
         contribution: leave out Gaussians whose removal changes no pixel by more than this in sum; 0: none.
-        rest: stop a pixel's walk from near to far once what is behind cannot change it by more than this; 0: never.
-            Only without gradients: those of what is behind are not bounded by it. What is behind is then not evaluated,
-            but for the magnitudes of its signals, which bound it; a signal that is not finite has no bound, so no walk
-            ends before it.
+        early_stop_tolerance: stop a pixel's walk from near to far once what is behind cannot change it by more than
+            this; 0: never. Only without gradients: those of what is behind are not bounded by it. What is behind is
+            then not evaluated, but for the magnitudes of its signals, which bound it; a signal that is not finite has
+            no bound, so no walk ends before it.
     """
 
     boxes: bool = True
     contribution: float = 0.0
-    rest: float = 0.0
+    early_stop_tolerance: float = 0.0
 
     @property
     def error(self) -> float:
         """Largest error of a pixel's field."""
-        return self.contribution + self.rest
+        return self.contribution + self.early_stop_tolerance
 
 
 NOTHING = Skip()

@@ -18,7 +18,7 @@ from .fields import WrfGs
 Array = NDArray[np.float32]
 ComplexArray = NDArray[np.complex64]
 
-PAIRS_AT_ONCE = 1 << 15
+PAIRS_PER_CHUNK = 1 << 15
 """Pairs of Gaussian and transmitter at once: 16 MB of a layer of 128."""
 
 
@@ -102,7 +102,7 @@ class WrfGsSignals:
         tx = np.asarray(tx_pos_m, np.float32)
         count = self._own.shape[1]
         out = np.empty((len(tx), count), np.complex64)
-        step = max(1, PAIRS_AT_ONCE // count)
+        step = max(1, PAIRS_PER_CHUNK // count)
         for first in range(0, len(tx), step):
             part = slice(first, first + step)
             encoded = encode(tx[part].T, self._encoding.tx_octaves, self._encoding.tx_scale_m)

@@ -30,19 +30,18 @@ from numpy.typing import NDArray
 
 from ..backend.device import on_device
 from ..core.angles import FloatArray, pixel_directions
-from ..tracing.evaluate_paths import Complex
+from ..core.types import SQUARED_MAGNITUDE_EPS
+from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import TracedPaths
 from .ports import Ports, Steering, direction_weights, matrix, path_sum, weighted
 
 How = Literal["coherent", "power"]
 
-DARK = 1e-8
-"""Added to a squared magnitude under the root, whose slope at zero is infinite: 1e-4 is the least magnitude."""
 LEAST_POWER = 1e-20
 """Added to a power before its logarithm: the report ends at -200 dB."""
 
 
-def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = DARK) -> Any:
+def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = SQUARED_MAGNITUDE_EPS) -> Any:
     """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is a side that is not there."""
     return dr.sqrt(power(traced, learned, how) + dark)
 

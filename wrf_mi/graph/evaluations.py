@@ -15,7 +15,7 @@ from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
-from ..tracing.evaluate_paths import Complex
+from ..tracing.field_calculator import Complex
 from .learned import learned_field
 from .settings import SPLATTED, TRACED, TracedConfig
 

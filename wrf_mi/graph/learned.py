@@ -14,7 +14,7 @@ from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
-from ..tracing.evaluate_paths import Complex
+from ..tracing.field_calculator import Complex
 
 
 class Field(Protocol):

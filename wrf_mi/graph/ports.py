@@ -15,7 +15,7 @@ from scipy.constants import speed_of_light
 
 from ..backend.device import on_device
 from ..core.angles import FloatArray, solid_angles
-from ..tracing.evaluate_paths import Complex
+from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import Float64, TracedPaths
 
 

@@ -13,7 +13,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..training.session import FitSession
 
-Listen = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 """Hears what is being done and the share of it that is done, 0 to 1."""
 
 

@@ -38,7 +38,7 @@ from ..tracing.corrected_scene import check_materials, write_corrected_scene
 from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.polarization import warn_of_cross_polarization
 from ..tracing.result import join_traces
-from ..tracing.solve import TARGETS_AT_ONCE
+from ..tracing.solve import TARGETS_PER_CHUNK
 from ..tracing.tracer import RayTracer
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
@@ -255,7 +255,7 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
         return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
     assert problem.scene is not None
     rays = tracer.rays(tx_pos_m)
-    parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_AT_ONCE)
+    parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_PER_CHUNK)
     ends = tracer.instrument, replace(tracer.options, rays=rays), problem.material
     given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
     sizes = [len(positions) for positions, *_ in given]

@@ -10,8 +10,8 @@ The beam former sum_m h_m exp(-j k p_m . u) takes all elements in all directions
   exp(-j k (a + b) . u): two small tables in place of a large one, and two sums, over the one line and then the other.
 
 Phases are those to the array's centre, wherever its origin is: magnitudes are the same. Double precision throughout,
-nothing is approximated. What is at work at once is bounded by `AT_ONCE`, the tables that are kept from call to call by
-`KEPT` in all: larger ones are made anew for each chunk.
+nothing is approximated. What is at work at once is bounded by `CHUNK_SIZE`, the tables that are kept from call to
+call by `KEPT` in all: larger ones are made anew for each chunk.
 
 Source: Van Trees, "Optimum Array Processing" (2002), sections 2.4 and 6.2 (conjugate symmetric and planar arrays).
 """
@@ -31,7 +31,7 @@ ComplexArray = NDArray[np.complex128]
 
 DIRECTIONS = 4096
 """In a chunk: what belongs to one transmitter then stays in a core's own cache."""
-AT_ONCE = 1 << 20
+CHUNK_SIZE = 1 << 20
 """Bytes of products at once, unless one transmitter takes more."""
 KEPT = 1 << 27
 """Bytes of all tables that are kept; 360 x 90 directions of a 4 x 4 array take 2 MB, of 32 x 32 elements 8 MB."""
@@ -154,7 +154,7 @@ class Beams:
         directions = unit_vectors(azimuth, elevation[:, None]).reshape(-1, 3)
         return [line.tables(directions, self._wavenumber) for line in self._lines]
 
-    def magnitude(self, signals: ComplexArray, directions: int = DIRECTIONS, at_once: int = AT_ONCE) -> FloatArray:
+    def magnitude(self, signals: ComplexArray, directions: int = DIRECTIONS, at_once: int = CHUNK_SIZE) -> FloatArray:
         """Magnitudes [n, height, width] of complex element signals [n, m].
 
         Args:

@@ -13,9 +13,9 @@ from ..core.angles import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
-PAIRS_AT_ONCE = 1 << 22
+PAIRS_PER_CHUNK = 1 << 22
 """Pairs of path and array element or subcarrier at once: 64 MiB of complex numbers for each of a few."""
-WAVES_AT_ONCE = 1 << 20
+WAVES_PER_CHUNK = 1 << 20
 """Pairs of path and antenna whose waves turn from subcarrier to subcarrier: less, as each is gone through again."""
 
 
@@ -44,7 +44,7 @@ def element_signals(
     everyone = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
     elements = np.stack([np.asarray(positions_m, float) @ receiver.to_world.T for receiver in everyone])
     signals = np.zeros((paths.n_rx, paths.n_tx, elements.shape[1]), np.complex128)
-    step = max(1, PAIRS_AT_ONCE // elements.shape[1])
+    step = max(1, PAIRS_PER_CHUNK // elements.shape[1])
     for start in range(0, len(paths), step):
         part = slice(start, start + step)
         length, rx = paths.length_m[part, None], paths.rx[part]
@@ -69,7 +69,7 @@ def csi(paths: Paths, frequencies_hz: ArrayLike) -> ComplexArray:
     """
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     channel = np.zeros((paths.n_rx, paths.n_tx, len(frequencies)), np.complex128)
-    step = max(1, PAIRS_AT_ONCE // len(frequencies))
+    step = max(1, PAIRS_PER_CHUNK // len(frequencies))
     for start in range(0, len(paths), step):
         part = slice(start, start + step)
         phase = np.exp(-2j * np.pi / speed_of_light * paths.length_m[part, None] * frequencies)
@@ -95,7 +95,7 @@ def antenna_csi(
     elements = np.stack([np.asarray(positions_m, float) @ receiver.to_world.T for receiver in everyone])
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     channel = np.zeros((paths.n_rx * paths.n_tx, elements.shape[1], len(frequencies)), np.complex128)
-    step = max(1, WAVES_AT_ONCE // elements.shape[1])
+    step = max(1, WAVES_PER_CHUNK // elements.shape[1])
     for start in range(0, len(paths), step):
         part = slice(start, start + step)
         length, rx = paths.length_m[part, None], paths.rx[part]

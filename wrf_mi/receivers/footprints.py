@@ -33,7 +33,7 @@ from ..core.angles import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
-PAIRS_AT_ONCE = 1 << 16
+PAIRS_PER_CHUNK = 1 << 16
 """Pairs of Gaussian and element at once: 1 MB of complex numbers for each of some arrays, in the cache of a core."""
 
 
@@ -64,7 +64,7 @@ def gaussian_signals(
     n = n.reshape(-1, 3)
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
     out = np.empty((len(n), len(p)), complex)
-    step = max(PAIRS_AT_ONCE // max(len(p), 1), 1)
+    step = max(PAIRS_PER_CHUNK // max(len(p), 1), 1)
     for first in range(0, len(n), step):
         own = slice(first, first + step)
         out[own] = _signals(n[own], spread[own], wavenumber * p, order)

@@ -1,7 +1,7 @@
 """The moving device's heading: directions in its own frame, for a pattern that turns with it.
 
 A device that is carried upright is turned by its yaw psi about +z, from +x towards +y: R_z(psi) takes its own frame to
-the world's. A direction u in which a wave leaves is R_z(psi)^T u for the device, as `wrf_mi.tracing.evaluate_paths`
+the world's. A direction u in which a wave leaves is R_z(psi)^T u for the device, as `wrf_mi.tracing.field_calculator`
 has it, and a pattern (`wrf_mi.receivers.physical_array.Pattern`, trained: `wrf_mi.tracing.pattern_parameters`) is a
 function of that alone.
 """

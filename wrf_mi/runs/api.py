@@ -22,7 +22,7 @@ from ..models.checks import check_record
 from ..parallel import Scheduler
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT
-from ..training.session import Interrupted, Listen, quiet
+from ..training.session import Interrupted, OnProgress, quiet
 from ..training.trainer import check_rows
 from .folder import FITTED, RunConfig, check_new, load_rows, run_parts, start_run, write_configs, write_fitted
 from .run import Run, load_part, open_run, predict_to_file
@@ -129,7 +129,7 @@ def train(
     seed: int = 0,
     settings: Settings = (),
     deterministic: bool = False,
-    listen: Listen = quiet,
+    on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
     scheduler: Scheduler | None = None,
     progress: bool = False,
@@ -150,7 +150,7 @@ def train(
         seed: of split and fit.
         settings: ``key=value`` of the model, or all settings as its dataclass; seed and determinism in it count.
         deterministic: on one thread of the CPU, so bit-identical from run to run.
-        listen: progress callback: stage, fraction done, and loss, score and time where steps are taken.
+        on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
         stop: asked wherever nothing would be lost; True ends the run, to be gone on with by `resume`.
         scheduler: computes parts of the work of models that have some (ray tracing); None: this process. Its workers
             must see the scene under the same name. What comes of it is the same.
@@ -173,7 +173,7 @@ def train(
         init("llvm", threads=1)
     start_run(folder, config, splits)
     try:
-        _complete(folder, config, problem, Session(folder, folder, listen, stop, scheduler, progress))
+        _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
     except InputError:
         if not any(True for name in (FITTED, CHECKPOINT) for _ in folder.rglob(name)):
             shutil.rmtree(folder)
@@ -183,7 +183,7 @@ def train(
 
 def resume(
     folder: str | Path,
-    listen: Listen = quiet,
+    on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
     scheduler: Scheduler | None = None,
     progress: bool = False,
@@ -199,7 +199,7 @@ def resume(
     run = open_run(folder, record)
     if run.config.deterministic:
         init("llvm", threads=1)
-    session = Session(run.folder, run.folder, listen, stop, scheduler, progress)
+    session = Session(run.folder, run.folder, on_progress, stop, scheduler, progress)
     _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
 

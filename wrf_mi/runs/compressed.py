@@ -30,7 +30,7 @@ COMPRESSION = "compression.json"
 REPEATS = 60
 """Interleaved pairs of spectra that are timed."""
 
-Listen = Callable[[str, int, Progress], None]
+OnProgress = Callable[[str, int, Progress], None]
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def compress_run(
     out: str | Path,
     how: Compression,
     record: Record | None = None,
-    listen: Listen = lambda stage, steps, progress: None,
+    on_progress: OnProgress = lambda stage, steps, progress: None,
 ) -> dict[str, Any]:
     """Make a smaller run of a run and score it on the same held-out rows.
 
@@ -75,7 +75,7 @@ def compress_run(
         out: run folder to make; must not exist or be empty.
         how: what is made smaller.
         record: the data set of the run; None: loaded by its name.
-        listen: hears of progress.
+        on_progress: hears of progress.
 
     Returns:
         What ``compression.json`` says: ``before`` and ``after`` with ``gaussians``, ``bytes``, ``ssim`` (median) and
@@ -99,7 +99,7 @@ def compress_run(
     def heard(stage: str, steps: int, progress: Progress) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         append_log(folder, progress)
-        listen(stage, steps, progress)
+        on_progress(stage, steps, progress)
 
     settings, params = compress(field.config, field.params, data, split, how, heard)
     seconds = time.perf_counter() - start

@@ -24,7 +24,7 @@ RESAMPLES = 4000
 """Draws of all test rows: each end of a 95 % interval then has 100 of them beyond it."""
 INTERVAL = (2.5, 97.5)
 """Percentiles that bound 95 %."""
-VALUES_AT_ONCE = 1 << 23
+VALUES_PER_CHUNK = 1 << 23
 """Weights of resampled values at once: 32 MiB."""
 
 
@@ -135,7 +135,7 @@ def _bootstrap(
     rng = np.random.default_rng(seed)
     order = [np.argsort(v, kind="stable") for v in values]
     median, mean = np.empty(resamples), np.empty(resamples)
-    step = max(1, VALUES_AT_ONCE // len(row))
+    step = max(1, VALUES_PER_CHUNK // len(row))
     for start in range(0, resamples, step):
         part = slice(start, min(start + step, resamples))
         weight = rng.multinomial(rows, np.full(rows, 1 / rows), size=part.stop - part.start).astype(np.int32)

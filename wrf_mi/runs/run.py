@@ -26,7 +26,7 @@ from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, write_prediction_file
 
-PREDICTED_AT_ONCE = 256
+PREDICTED_PER_CHUNK = 256
 """Positions of one part at most, for a scheduler: 33 MB of spectra of 90 x 360 for each receiver."""
 
 
@@ -250,7 +250,7 @@ def predict_to_file(
     if scheduler is None or not len(asked):
         parts = [_predict_part(run, asked)]
     else:
-        given = [asked.rows(rows) for rows in row_parts(len(asked), scheduler.workers, most=PREDICTED_AT_ONCE)]
+        given = [asked.rows(rows) for rows in row_parts(len(asked), scheduler.workers, most=PREDICTED_PER_CHUNK)]
         opener = partial(open_run, path, operator=operator)
         parts = scheduler.map(_predict_part, given, opener, what="predicting", sizes=[len(one) for one in given])
     means, stds, names = zip(*parts, strict=True)

@@ -53,7 +53,7 @@ class Watch:
         """Whether Ctrl-C was pressed."""
         return self._stop
 
-    def listen(self, stage: str, share: float, p: FitProgress | None = None) -> None:
+    def on_progress(self, stage: str, share: float, p: FitProgress | None = None) -> None:
         """Show that ``share`` (0..1) of a stage is done, and how a training goes."""
         new = stage != self._stage
         if new:

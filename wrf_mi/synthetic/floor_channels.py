@@ -61,7 +61,7 @@ DOWNLINK_HZ: FloatArray = CARRIER_HZ + SPACING_HZ * np.arange(1, HALF + 1, dtype
 ORIENTATION = (0.5, 0.5, 0.5, 0.5)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
-AT_ONCE = 100
+CHUNK_SIZE = 100
 """Users' places traced at once."""
 
 
@@ -201,14 +201,14 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     for material in scene.radio_materials.values():
         material.scattering_coefficient = walk.scattering
     with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
-        for start in bar.track(range(0, len(positions), AT_ONCE), description=f"tracing {name}"):
-            part = positions[start : start + AT_ONCE]
+        for start in bar.track(range(0, len(positions), CHUNK_SIZE), description=f"tracing {name}"):
+            part = positions[start : start + CHUNK_SIZE]
             ends = [Receiver(str(row), one, np.array(UPRIGHT)) for row, one in enumerate(part, start=start + 1)]
             for options in (specular, rough):
                 paths = trace_paths(scene, receiver.position_m, ends, options).paths
                 if options.scattering:
                     paths = paths.select((paths.interactions == SCATTERING).any(axis=1))
-                channel[start : start + AT_ONCE] += array_channels(paths, receiver, array_m, frequencies)
+                channel[start : start + CHUNK_SIZE] += array_channels(paths, receiver, array_m, frequencies)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(

@@ -96,7 +96,7 @@ DEFAULT = TracedRoom()
 OPAQUE = "itu_metal"
 """Edges of other materials diffract little, as most of the wave passes through them; Sionna RT takes every sheet for
 opaque at its edges, and so would put a strong wave there that a thin board does not make."""
-AT_ONCE = 200
+CHUNK_SIZE = 200
 """Transmitters traced at once."""
 
 
@@ -175,8 +175,8 @@ def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
     opaque = tuple(name for name, (material, _) in furnished_parts().items() if material == OPAQUE)
     spectra = np.empty((1, len(positions), 90, 360), np.float32)
     with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
-        for start in bar.track(range(0, len(positions), AT_ONCE), description="tracing the furnished room"):
-            part = positions[start : start + AT_ONCE]
+        for start in bar.track(range(0, len(positions), CHUNK_SIZE), description="tracing the furnished room"):
+            part = positions[start : start + CHUNK_SIZE]
             ends = [Receiver(str(i), place, np.array([0.0, 0.0, 0.0, 1.0])) for i, place in enumerate(part)]
             signals = np.zeros((len(part), len(array_m)), complex)
             for options in (exact, rough):

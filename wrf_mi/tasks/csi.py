@@ -33,7 +33,7 @@ class Csi(Task):
         """See `wrf_mi.tasks.scores.cea_db`."""
         return cea_db(prediction, truth)
 
-    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """The mean squared difference over what was received."""
         from .losses import squared_error
 

@@ -31,11 +31,11 @@ class Spectrum(Task):
         """See `wrf_mi.tasks.scores.ssim`."""
         return ssim(prediction, truth)
 
-    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """The papers' loss, see `wrf_mi.tasks.spectrum_loss.spectrum_loss`."""
         from .spectrum_loss import spectrum_loss
 
-        return spectrum_loss(prediction, truth, batch, shape[0], shape[1], structural_weight)[0]
+        return spectrum_loss(prediction, truth, batch, shape[0], shape[1], ssim_weight)[0]
 
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Structural similarity on the device, equal to scikit-image's."""

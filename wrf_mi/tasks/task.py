@@ -102,7 +102,7 @@ class Task(ABC):
         """The reference that stands for all: the first of `references` among those stored; None without any."""
         return next((key for key in self.references if key in stored), None)
 
-    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, structural_weight: float) -> Any:
+    def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """What training makes small, a Dr.Jit float of one value: the mean absolute difference over what was received.
 
         Args:
@@ -110,7 +110,7 @@ class Task(ABC):
             truth: the same; NaN where nothing was received.
             batch: number of observations.
             shape: of one; complex ones with a last axis of real and imaginary part.
-            structural_weight: weight of an image's structure, 0 to 1.
+            ssim_weight: weight of an image's structure, 0 to 1.
         """
         from .losses import absolute_error
 

@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray
-from ..receivers.channel import WAVES_AT_ONCE, add_waves
+from ..receivers.channel import WAVES_PER_CHUNK, add_waves
 
 SPECULAR_OR_THROUGH = (0, 1, 4)
 """Kinds of interaction (`wrf_mi.core.Paths`) that leave a spherical wave spherical."""
@@ -37,7 +37,7 @@ def array_channels(
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     radius, elements = _wave_radius(paths, receiver), array_m @ receiver.to_world.T
     channel = np.zeros((paths.n_rx, len(array_m), len(frequencies)), complex)
-    step = max(1, WAVES_AT_ONCE // len(array_m))
+    step = max(1, WAVES_PER_CHUNK // len(array_m))
     for start in range(0, len(paths), step):
         part = slice(start, start + step)
         own = radius[part, None]

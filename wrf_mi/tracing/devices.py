@@ -27,7 +27,7 @@ INSIDE_M = 1e-4
 """An antenna behind the wall that it is mounted on is traced from so far before it."""
 ON_M = 1e-6
 """So close to a plane float32 does not tell its sides apart; Sionna RT takes the antenna to be on the right one."""
-PAIRS_AT_ONCE = 1 << 20
+PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
@@ -127,7 +127,7 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     number = np.zeros(len(points))
     candidates = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    step = max(1, PAIRS_AT_ONCE // len(triangles))
+    step = max(1, PAIRS_PER_CHUNK // len(triangles))
     for start in range(0, len(candidates), step):
         part = candidates[start : start + step]
         a, b, c = (triangles[None, :, k] - points[part, None] for k in range(3))
@@ -150,7 +150,7 @@ def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
 
 def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     """Points and planes within `NEAREST_M` of each other, bounds of the plane's faces included, in parts."""
-    step = max(1, PAIRS_AT_ONCE // max(len(surfaces.normal), 1))
+    step = max(1, PAIRS_PER_CHUNK // max(len(surfaces.normal), 1))
     for start in range(0, len(points), step):
         part = points[start : start + step]
         point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < NEAREST_M)
@@ -162,7 +162,7 @@ def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArr
 def _touches(triangles: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
     """Which points have one of these triangles within `NEAREST_M`: a plane's bounds hold its doorways too."""
     nearest = np.full(len(points), np.inf)
-    step = max(1, PAIRS_AT_ONCE // len(triangles))
+    step = max(1, PAIRS_PER_CHUNK // len(triangles))
     for start in range(0, len(points), step):
         part = np.repeat(points[start : start + step], len(triangles), axis=0)
         every = np.tile(triangles, (len(part) // len(triangles), 1, 1))

@@ -19,7 +19,7 @@ from .buffer import Legs, to_buffer
 from .options import TraceOptions
 from .surfaces import Surfaces
 
-PATHS_AT_ONCE = 1 << 19
+PATHS_PER_CHUNK = 1 << 19
 """Paths of one call of the field calculator, which takes some 300 bytes per path and interaction."""
 
 
@@ -145,8 +145,8 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
         InputError: a gain that is not a number.
     """
     gain = np.zeros(len(legs), np.complex128)
-    for start in range(0, len(legs), PATHS_AT_ONCE):
-        part = slice(start, start + PATHS_AT_ONCE)
+    for start in range(0, len(legs), PATHS_PER_CHUNK):
+        part = slice(start, start + PATHS_PER_CHUNK)
         buffer = to_buffer(legs.select(part), surfaces, valid=True)
         real, imaginary = field_of(scene, buffer, ends, rays)
         gain[part] = real.numpy() + 1j * imaginary.numpy()

@@ -1,6 +1,6 @@
 """Image method in float64: sources mirrored at planes, and where the straight line to an image meets its plane.
 
-Planes are n . x = d with unit normals n. `wrf_mi.tracing.evaluate_paths` evaluates chains of planes with derivatives
+Planes are n . x = d with unit normals n. `wrf_mi.tracing.field_calculator` evaluates chains of planes with derivatives
 in Dr.Jit.
 
 Source: Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.

@@ -16,7 +16,7 @@ from .options import TraceOptions
 from .search import Chains, count_crossings, possible
 from .surfaces import Surfaces
 
-CANDIDATES_AT_ONCE = 1 << 20
+CANDIDATES_PER_CHUNK = 1 << 20
 """Candidates in one call of Sionna RT's image method, which takes some 100 bytes per candidate and interaction."""
 PARALLEL = 1e-9
 """A ray that runs along a plane keeps the point where Sionna RT saw it cross."""
@@ -65,7 +65,7 @@ def _in_parts(
     waiting = [(np.full(len(everyone), -1), everyone)]
     for pairs in possible(surfaces, chains, targets_m):
         waiting.append(pairs)
-        if sum(len(chain) for chain, _ in waiting) >= CANDIDATES_AT_ONCE:
+        if sum(len(chain) for chain, _ in waiting) >= CANDIDATES_PER_CHUNK:
             yield from _split(waiting)
             waiting = []
     yield from _split(waiting)
@@ -75,8 +75,8 @@ def _split(pairs: list[tuple[IntArray, IntArray]]) -> Iterator[tuple[IntArray, I
     if not pairs:
         return
     chain, target = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    for start in range(0, len(chain), CANDIDATES_AT_ONCE):
-        yield chain[start : start + CANDIDATES_AT_ONCE], target[start : start + CANDIDATES_AT_ONCE]
+    for start in range(0, len(chain), CANDIDATES_PER_CHUNK):
+        yield chain[start : start + CANDIDATES_PER_CHUNK], target[start : start + CANDIDATES_PER_CHUNK]
 
 
 def _lengths(chains: Chains, chain: IntArray) -> IntArray:

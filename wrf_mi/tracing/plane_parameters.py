@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import on_device
-from .evaluate_paths import Level, Vector
+from .field_calculator import Level, Vector
 from .surfaces import Surfaces
 from .walls import plane_centres
 

@@ -11,7 +11,7 @@ from .fields import point_array
 from .options import TraceOptions
 from .surfaces import Surfaces
 
-SLOTS_AT_ONCE = 1 << 22
+SLOTS_PER_CHUNK = 1 << 22
 """Rays x targets x interactions of one search. Sionna RT keeps 8 bytes for each to find doubles and we give it a buffer
 with room for every one (some 70 bytes and interaction), so that no path is dropped: about 1 GB at a depth of 3."""
 
@@ -35,7 +35,7 @@ def sampled_paths(
     import drjit as dr
     from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
-    step = max(1, SLOTS_AT_ONCE // (rays * options.max_depth))
+    step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
     parts = []
     for start in range(0, len(targets_m), step):
         batch = targets_m[start : start + step]

@@ -14,9 +14,9 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .surfaces import Surfaces
 
-PAIRS_AT_ONCE = 1 << 24
+PAIRS_PER_CHUNK = 1 << 24
 """Pairs of chain and position tested at once: 64 MiB of single-precision numbers for each of a few."""
-RAYS_AT_ONCE = 1 << 20
+RAYS_PER_CHUNK = 1 << 20
 """Rays in flight at once."""
 END_M = 1e-4
 """What lies so close to the end of a segment is the surface that reflects there."""
@@ -69,8 +69,8 @@ def shoot(
         return found[0]
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     for reflecting in _patterns(depth, reflections):
-        for start in range(0, rays, RAYS_AT_ONCE):
-            stop = min(start + RAYS_AT_ONCE, rays)
+        for start in range(0, rays, RAYS_PER_CHUNK):
+            stop = min(start + RAYS_PER_CHUNK, rays)
             sequence = np.full((stop - start, reflections), -1, np.int64)
             hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
             for column, level in enumerate(reflecting):
@@ -185,7 +185,7 @@ def possible(
         to_vectors(surfaces.low - margin_m, mi.Point2f),
         to_vectors(surfaces.high + margin_m, mi.Point2f),
     )
-    step = max(1, PAIRS_AT_ONCE // count)
+    step = max(1, PAIRS_PER_CHUNK // count)
     for reflections in range(1, chains.plane.shape[1] + 1):
         members = np.flatnonzero(length == reflections)
         for start in range(0, len(members), step):

@@ -28,7 +28,7 @@ from .surfaces import Surfaces, scene_surfaces
 
 logger = logging.getLogger(__name__)
 
-TARGETS_AT_ONCE = 4096
+TARGETS_PER_CHUNK = 4096
 """Positions that one source's paths are made for at once."""
 FIRST_RAYS = 1 << 14
 """What `converged_rays` begins with."""
@@ -113,7 +113,8 @@ def trace_paths(
     which are paths, and its field calculator gives their gains.
 
     Memory grows with the paths found, about 1 kB for each at six interactions (measured), and not with the positions
-    tried: parts are bounded by `wrf_mi.tracing.images.CANDIDATES_AT_ONCE` and `wrf_mi.tracing.search.PAIRS_AT_ONCE`.
+    tried: parts are bounded by `wrf_mi.tracing.images.CANDIDATES_PER_CHUNK` and
+        `wrf_mi.tracing.search.PAIRS_PER_CHUNK`.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`, at the carrier frequency.
@@ -181,8 +182,8 @@ def _search(
         task = bar.add_task("tracing paths", total=len(sources) * len(targets))
         for index, source in enumerate(sources):
             chains = kept.chains(source, options, rays)
-            for start in range(0, len(targets), TARGETS_AT_ONCE):
-                batch = targets[start : start + TARGETS_AT_ONCE]
+            for start in range(0, len(targets), TARGETS_PER_CHUNK):
+                batch = targets[start : start + TARGETS_PER_CHUNK]
                 found = [specular_paths(scene, surfaces, chains, source, batch, options)]
                 if options.sampled and len(surfaces.plane):
                     found.append(sampled_paths(scene, surfaces, source, batch, options, rays))

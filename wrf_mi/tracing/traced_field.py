@@ -1,7 +1,7 @@
 """The traced side of a hybrid: Sionna RT's paths, whose gains, lengths and directions follow parameters.
 
 Which surfaces a wave meets is searched for by `wrf_mi.tracing` and has no derivative; it is kept. What has one, the
-image method and the field along each path, is evaluated anew in each call (`wrf_mi.tracing.evaluate_paths`) with the
+image method and the field along each path, is evaluated anew in each call (`wrf_mi.tracing.field_calculator`) with the
 present
 parameters: materials, the scene's planes, the instrument's gain, antenna patterns and the receiver's pose.
 
@@ -34,7 +34,7 @@ from ..core.types import IntArray
 from ..gaussians.footprint import Pose
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
-from .evaluate_paths import Chains, Complex, Level, Tables, Vector, follow
+from .field_calculator import Chains, Complex, Level, Tables, Vector, evaluate_paths
 from .material_parameters import Materials, SlabMaterials, slabs_of_faces
 from .pattern_parameters import pattern_coefficients, pattern_factor
 from .plane_parameters import PlaneTables
@@ -246,7 +246,7 @@ class TracedField:
         tables = Tables(*self._materials.tables(parameters, stated), *fixed)
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
-        followed = follow(chains, pose, tables, self.frequency_hz, *antennas)
+        followed = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
         # Evaluated here, the kernels of the reverse pass read it instead of computing it each.
         dr.eval(followed)
         amplitude, phase = Float64(np.log(self.options.gain)), Float64(0)

@@ -12,7 +12,7 @@ from .surfaces import Surfaces
 
 ON_LINE_M = 1e-4
 """Edges whose ends are so close to one line lie on it: a triangulation's inner edges cancel along it."""
-PAIRS_AT_ONCE = 1 << 22
+PAIRS_PER_CHUNK = 1 << 22
 """Pairs of point and edge that are worked on at once."""
 
 
@@ -69,7 +69,7 @@ class Walls:
         for q in np.unique(plane):
             edges = self.edge_m[self.first_edge[q] : self.first_edge[q + 1]]
             members = order[bounds[q] : bounds[q + 1]]
-            step = max(1, PAIRS_AT_ONCE // max(len(edges), 1))
+            step = max(1, PAIRS_PER_CHUNK // max(len(edges), 1))
             for start in range(0, len(members) if len(edges) else 0, step):
                 part = members[start : start + step]
                 result[part], edge = _inside(edges, flat_m[part])

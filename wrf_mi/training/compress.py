@@ -133,15 +133,20 @@ def _taught(config: TrainConfig, params: Params, record: Record, split: Split) -
 
 
 def _fit(
-    record: Record, rows: NDArray[Any], config: TrainConfig, params: Params, steps: int, listen: Callable[..., None]
+    record: Record,
+    rows: NDArray[Any],
+    config: TrainConfig,
+    params: Params,
+    steps: int,
+    on_progress: Callable[..., None],
 ) -> Params:
     """Train given parameters for some steps on given rows, all Gaussians kept."""
     nothing = np.empty(0, np.int64)
     density, optimiser = replace(config.density, every=0), config.optimiser
     optimiser = replace(optimiser, warm_up=min(optimiser.warm_up, max(1, steps // 10)))
-    own = replace(config, steps=steps, hold_out=0.0, density=density, optimiser=optimiser)
+    own = replace(config, steps=steps, holdout_steps_fraction=0.0, density=density, optimiser=optimiser)
     trainer = Trainer(record, Split("compress", config.seed, rows, nothing, nothing), own, state=FitState(params))
-    trainer.run(listen)
+    trainer.run(on_progress)
     return trainer.state.mean_params()
 
 
@@ -151,7 +156,7 @@ def compress(
     record: Record,
     split: Split,
     how: Compression,
-    listen: Callable[[str, int, Progress], None] = lambda stage, steps, progress: None,
+    on_progress: Callable[[str, int, Progress], None] = lambda stage, steps, progress: None,
 ) -> tuple[TrainConfig, Params]:
     """A smaller field from a trained one. Reads training rows alone.
 
@@ -161,7 +166,7 @@ def compress(
         record: that it was fitted to.
         split: whose training and validation rows are used.
         how: what is made smaller.
-        listen: hears of progress: stage, its steps, and the progress.
+        on_progress: hears of progress: stage, its steps, and the progress.
 
     Returns:
         Settings and parameters, these still in single precision.
@@ -180,8 +185,8 @@ def compress(
         if how.distil:
             lesson = _taught(*teacher, record, split)
             rows = np.arange(len(lesson.tx_pos_m))
-            params = _fit(lesson, rows, config, params, how.distil, lambda p: listen("distil", how.distil, p))
+            params = _fit(lesson, rows, config, params, how.distil, lambda p: on_progress("distil", how.distil, p))
     if how.fine_tune:
         rows = split.all_train
-        params = _fit(record, rows, config, params, how.fine_tune, lambda p: listen("fine-tune", how.fine_tune, p))
+        params = _fit(record, rows, config, params, how.fine_tune, lambda p: on_progress("fine-tune", how.fine_tune, p))
     return config, params

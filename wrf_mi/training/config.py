@@ -73,8 +73,8 @@ class NetworkConfig:
         layers: hidden layers; 0: the paper's eight, three for a factorised field. WRF-GS+ joins its input again
             half-way.
         terms: of a factorised field; 0: 32.
-        still: WRF-GS+ moves signals alone with the transmitter, not rotation and scale: the map from signals to
-            the receiver is then the same for all transmitters.
+        static_geometry: WRF-GS+ moves signals alone with the transmitter, not rotation and scale: the map from
+            signals to the receiver is then the same for all transmitters.
         phase_hz: carrier frequency of a phase that signals of WRF-GS+ have from the distance of the transmitter's
             image, which ``initial.paths`` tells, else of the transmitter; 0: none.
     """
@@ -82,7 +82,7 @@ class NetworkConfig:
     width: int = 0
     layers: int = 0
     terms: int = 0
-    still: bool = False
+    static_geometry: bool = False
     phase_hz: float = 0.0
 
 
@@ -130,8 +130,9 @@ class DensityConfig:
         every: steps between two rounds; 0 turns it off.
         start: share of the steps before the first round.
         stop: share of the steps after the last round.
-        grow: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a round.
-        most: number of Gaussians that is never passed.
+        growth_fraction: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a
+            round.
+        max_gaussians: number of Gaussians that is never passed.
         split_deg: a grown Gaussian larger than this is split, a smaller one cloned, degrees.
         least_opacity: a Gaussian below this is pruned (alpha blending).
         reset_every: rounds between two opacity resets; 0 turns them off.
@@ -141,12 +142,23 @@ class DensityConfig:
     every: int = 1000
     start: float = 0.05
     stop: float = 0.4
-    grow: float = 0.05
-    most: int = 320
+    growth_fraction: float = 0.05
+    max_gaussians: int = 320
     split_deg: float = 5.0
     least_opacity: float = 0.005
     reset_every: int = 0
     reset_opacity: float = 0.05
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Loss of spectra: (1 - eta) L1 + eta (1 - SSIM), as in the WRF-GS papers.
+
+    Attributes:
+        ssim_weight: eta.
+    """
+
+    ssim_weight: float = 0.2
 
 
 PATHS_ALONE = "ray-tracing"
@@ -168,7 +180,7 @@ class TrainConfig(LoopConfig):
         model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         seed: of starting values and of the order of rows.
         deterministic: bit-identical results from run to run, at the price of computing on one thread of the CPU.
-        structural_weight: eta of the loss (1 - eta) L1 + eta (1 - SSIM).
+        loss: the loss of images.
         receiver: how the field becomes what is observed, a name of `wrf_mi.graph.receivers`. Of spectra ``"pixel"``:
             its magnitude at each direction (the papers'), ``"array"``: the Bartlett spectrum of the array's element
             signals, scaled as the instrument does; ``"auto"``: array with a scene, else pixel. Of signal strengths
@@ -186,7 +198,7 @@ class TrainConfig(LoopConfig):
     model: str = "wrf-gs+"
     seed: int = 0
     deterministic: bool = False
-    structural_weight: float = 0.2
+    loss: LossConfig = field(default_factory=LossConfig)
     initial: InitialConfig = field(default_factory=InitialConfig)
     encoding: EncodingConfig = field(default_factory=EncodingConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -217,13 +229,15 @@ class TrainConfig(LoopConfig):
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
         if self.evaluation == TRACED and self.skip.error:
-            raise InputError("settings skip.contribution and skip.rest belong to evaluation=splatted; set them to 0")
+            raise InputError(
+                "settings skip.contribution and skip.early_stop_tolerance belong to evaluation=splatted; set them to 0"
+            )
 
 
 _RANGES: Mapping[str, Range] = {
     **RANGES,
     "steps": NOT_NEGATIVE,
-    "structural_weight": SHARE,
+    "loss.ssim_weight": SHARE,
     "initial.gaussians": COUNT,
     "initial.size_deg": (lambda x: 0 < x < 90, "more than 0 and less than 90"),
     "initial.nearest_m": POSITIVE,
@@ -236,8 +250,8 @@ _RANGES: Mapping[str, Range] = {
     "view.components": COUNT,
     "density.start": SHARE,
     "density.stop": SHARE,
-    "density.grow": SHARE,
-    "density.most": COUNT,
+    "density.growth_fraction": SHARE,
+    "density.max_gaussians": COUNT,
     "density.split_deg": POSITIVE,
     "density.least_opacity": INSIDE,
     "density.reset_opacity": INSIDE,
@@ -276,7 +290,7 @@ ONE_ANTENNA = (
     "patience=8",
 )
 """What a field of signal strengths or channels departs from one of spectra in: it ends in few numbers."""
-PATHS = ("steps=500", "batch=128", "hold_out=0.9", "validate_every=50", "patience=8", "density.every=0")
+PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every=50", "patience=8", "density.every=0")
 """What paths alone depart in: few parameters are fitted, soon."""
 PATHS_OF_IMAGES = ("batch=8",)
 """And where observations are images, each of thousands of numbers."""

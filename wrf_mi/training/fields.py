@@ -33,15 +33,15 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
         sizes["width"] = n.width
     if n.layers:
         sizes["layers"] = n.layers
-    if n.still and config.model != "wrf-gs+":
-        raise InputError(f"setting network.still: {config.model} moves signals alone anyway; leave it away")
+    if n.static_geometry and config.model != "wrf-gs+":
+        raise InputError(f"setting network.static_geometry: {config.model} moves signals alone anyway; leave it away")
     if config.model == "wrf-gs":
         if n.width:
             sizes["signal_widths"] = (n.width, max(1, n.width // 2))
     elif config.model == "wrf-gs+":
         if n.layers:
             sizes["skip"] = n.layers // 2
-        sizes["still"], sizes["phase_hz"] = n.still, n.phase_hz
+        sizes["still"], sizes["phase_hz"] = n.static_geometry, n.phase_hz
     if n.phase_hz and config.model != "wrf-gs+":
         raise InputError(f"setting network.phase_hz: {config.model} has no such phase; leave it away")
     if n.phase_hz and (components > 1 or features):

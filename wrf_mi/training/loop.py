@@ -80,14 +80,14 @@ class TrainingLoop(ABC):
 
     def run(
         self,
-        listen: Callable[[Progress], None] = lambda progress: None,
+        on_progress: Callable[[Progress], None] = lambda progress: None,
         save: Callable[[], None] = lambda: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> bool:
         """Train from the current step to the last.
 
         Args:
-            listen: hears of progress every ``log_every`` steps and at the end.
+            on_progress: hears of progress every ``log_every`` steps and at the end.
             save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
             stop: asked after each step; True ends the run there.
 
@@ -124,7 +124,7 @@ class TrainingLoop(ABC):
                 left = (self.seconds - before) / taken * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
                 told = state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left, self.label
-                listen(Progress(*told))
+                on_progress(Progress(*told))
                 losses, since = dr.zeros(mi.Float), 0
                 if score is not None and choosing and self.choose(score):
                     state, schedule = self.state, self.schedule

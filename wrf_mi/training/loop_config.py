@@ -28,13 +28,13 @@ NOT_NEGATIVE: Range = at_least(0)
 RANGES: dict[str, Range] = {
     "steps": COUNT,
     "batch": COUNT,
-    "hold_out": SHARE,
+    "holdout_steps_fraction": SHARE,
     "checkpoint_every": COUNT,
     "log_every": COUNT,
     "validate_every": COUNT,
     "optimiser.cosine_start": SHARE,
     "optimiser.final": SHARE,
-    "optimiser.averaging": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
+    "optimiser.ema_decay": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
 }
 """What numbers of the loop may be, and words for it."""
 
@@ -48,14 +48,14 @@ class AdamConfig:
         warm_up: steps over which rates rise from zero.
         cosine_start: share of the steps after which rates begin to fall.
         final: share of each rate that is left at the last step.
-        averaging: decay per step of the running mean of the parameters, which is what is evaluated and stored.
+        ema_decay: decay per step of the running mean of the parameters, which is what is evaluated and stored.
     """
 
     network: float = 1e-3
     warm_up: int = 100
     cosine_start: float = 0.0
     final: float = 0.01
-    averaging: float = 0.999
+    ema_decay: float = 0.999
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class LoopConfig:
     Attributes:
         steps: optimiser steps.
         batch: samples in a step, at most.
-        hold_out: share of the steps in which the validation rows are kept out of training. 1 keeps them out
-            to the end, as every choice of settings must; less ends with a fit on all training rows.
+        holdout_steps_fraction: share of the steps in which the validation rows are kept out of training. 1 keeps them
+            out to the end, as every choice of settings must; less ends with a fit on all training rows.
         patience: scores on the validation rows without a better one after which no more are waited for. From the best
             of them the fit then goes on with all training rows, for a share of the steps that led there. 0: all steps
             are taken, and the last ones count.
@@ -78,7 +78,7 @@ class LoopConfig:
 
     steps: int = 1000
     batch: int = 1
-    hold_out: float = 0.7
+    holdout_steps_fraction: float = 0.7
     patience: int = 0
     checkpoint_every: int = 2000
     log_every: int = 100
@@ -101,7 +101,7 @@ class LoopOptions:
 
     steps: int | None = None
     batch: int | None = None
-    hold_out: float | None = None
+    holdout_steps_fraction: float | None = None
     patience: int | None = None
     checkpoint_every: int | None = None
     log_every: int | None = None

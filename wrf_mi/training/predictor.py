@@ -27,7 +27,7 @@ from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
-from .static_operator import StillField, stands_still
+from .static_operator import StaticOperator, stands_still
 from .step import CompiledPredictor, Params, device_pose, evaluated
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class Predictor:
         self._field, self._skip, self._count = field, skip, -1
         self._by_operator, self._store = operator and self._pixels and stands_still(field), store
         self._reports: dict[int, Recorded] = {}
-        self._still: StillField | None = None
+        self._still: StaticOperator | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
@@ -104,12 +104,12 @@ class Predictor:
             raise ValueError("paths alone: there are no Gaussians")
         return self._field
 
-    def still(self) -> StillField:
+    def static_geometry(self) -> StaticOperator:
         """The field as operators; forgotten when parameters change."""
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
             size = self._plane.height, self._plane.width
-            self._still = StillField(self._gaussians, params, self.receivers, *size, self._store)
+            self._still = StaticOperator(self._gaussians, params, self.receivers, *size, self._store)
         return self._still
 
     @property
@@ -272,7 +272,7 @@ class Predictor:
             raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
         if self._by_operator:
             try:
-                return self.still()(positions, index)
+                return self.static_geometry()(positions, index)
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False

@@ -80,7 +80,7 @@ def plan(
         InputError: a receiver without rows that train.
     """
     steps = config.steps
-    joined = steps if config.hold_out >= 1 else round(config.hold_out * steps)
+    joined = steps if config.holdout_steps_fraction >= 1 else round(config.holdout_steps_fraction * steps)
     batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
     if not batch:
         beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
@@ -92,7 +92,7 @@ def plan(
         receiver=np.concatenate([receiver for _, receiver in plans]),
         factor=np.concatenate([_falling(part, o) for part in (first_stage, steps - first_stage)]),
         # A young mean forgets faster, or it would be mostly the starting values.
-        decay=np.minimum(o.averaging, (t + 1) / (t + 10)),
+        decay=np.minimum(o.ema_decay, (t + 1) / (t + 10)),
         density=density,
         joined=joined,
         first_stage=first_stage,

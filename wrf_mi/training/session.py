@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .loop import Progress
 
-Listen = Callable[[str, float, "Progress | None"], None]
+OnProgress = Callable[[str, float, "Progress | None"], None]
 """Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time where steps are taken."""
 
 
@@ -32,13 +32,13 @@ class FitSession:
         folder: for files of this fit; that of one fold where there are several. ``checkpoint.npz`` in it is removed
             when the fitted model is stored. None: nothing is kept.
         run: the run folder, for files that all folds share.
-        listen: progress callback.
+        on_progress: progress callback.
         stop: asked whether to stop, wherever nothing would be lost.
     """
 
     folder: Path | None = None
     run: Path | None = None
-    listen: Listen = quiet
+    on_progress: OnProgress = quiet
     stop: Callable[[], bool] = lambda: False
 
     @property
@@ -48,7 +48,7 @@ class FitSession:
 
     def tell(self, stage: str, share: float, progress: Progress | None = None) -> None:
         """Report progress of a stage, named after its fold."""
-        self.listen(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
+        self.on_progress(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
 
     def report(self, stage: str, share: float) -> None:
         """Report progress of what is made in one go.

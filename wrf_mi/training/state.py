@@ -28,8 +28,8 @@ class FitState:
         adam: Dr.Jit's optimiser, which owns the current parameters.
         mean: running mean of the parameters, which is what is evaluated.
         step: steps taken.
-        urge: sum since the last round of density control of each Gaussian's directional gradient, [n].
-        urge_steps: steps in that sum.
+        view_gradient_norm: sum since the last round of density control of each Gaussian's directional gradient, [n].
+        view_gradient_steps: steps in that sum.
         reach_m: how far from training transmitters the Gaussians are trusted, metres (`wrf_mi.training.reach`);
             infinite: everywhere.
         searched_m: where each receiver was when paths were searched last, [n_rx, 3], metres; empty without a scene.
@@ -56,8 +56,8 @@ class FitState:
         return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
 
     def _clear_urge(self) -> None:
-        self.urge, self.urge_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
-        dr.make_opaque(self.urge)
+        self.view_gradient_norm, self.view_gradient_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
+        dr.make_opaque(self.view_gradient_norm)
 
     def params(self) -> Arrays:
         """Current parameters."""
@@ -131,8 +131,8 @@ class FitState:
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.urge_steps}
-        flat |= {"urge": self.urge.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
+        scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.view_gradient_steps}
+        flat |= {"urge": self.view_gradient_norm.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
         flat |= {"searched_m": self.searched_m.copy()}
         return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
@@ -147,8 +147,8 @@ class FitState:
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
-        state.urge_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
-        state.urge, state.searched_m = to_float(arrays["urge"]), np.array(arrays["searched_m"])
+        state.view_gradient_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
+        state.view_gradient_norm, state.searched_m = to_float(arrays["urge"]), np.array(arrays["searched_m"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

@@ -24,11 +24,12 @@ from ..backend.device import to_tensor
 from ..backend.recorded import Recorded
 from ..core import Receiver
 from ..core.files import write_arrays
+from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights
 from ..gaussians.static_signals import ComplexArray, Signals, host_signals
 from ..gaussians.tiles import perception_plane
-from .step import DARK, Field, device_pose
+from .step import Field, device_pose
 
 FORMAT = 1
 """Version of the file."""
@@ -71,7 +72,7 @@ class RecordedSignals:
         return np.stack(rows)
 
 
-class StillField:
+class StaticOperator:
     """A field that stands still, ready to predict by operator.
 
     Args:
@@ -105,7 +106,7 @@ class StillField:
             if self._signals.factors is not None:
                 operator = PixelOperator(weights, *self._size).composed(self._signals.factors)
             self._ready[receiver] = operator
-        return self._ready[receiver].magnitude(self._signals.coefficients(tx_pos_m), DARK)
+        return self._ready[receiver].magnitude(self._signals.coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
 
     def key(self, receiver: int) -> str:
         """Digest of all that the weights at a receiver depend on."""

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from ..backend.device import on_device, to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core import Receiver
-from ..gaussians.chunks import AT_ONCE, gaussians_in_parts
+from ..core.types import SQUARED_MAGNITUDE_EPS
+from ..gaussians.chunks import CHUNK_SIZE, gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
 from ..gaussians.skip import NOTHING, Skip
@@ -34,8 +35,6 @@ Loss = Callable[..., Any]
 
 CENTRES = "position"
 """Parameter [3, n] of every field; where it is missing there are no Gaussians."""
-DARK = 1e-8
-"""Added to |R|^2 under the root, whose slope at zero is infinite: greys below 1e-4 are rounded to it."""
 
 
 def device_pose(receiver: Receiver) -> Pose:
@@ -59,7 +58,7 @@ def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane
         skip: what is not evaluated.
     """
     re, im = splat(field.gaussians(params, tx_pos), pose, plane, skip)
-    return dr.sqrt(re * re + im * im + DARK)
+    return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
 
 
 @dataclass
@@ -100,15 +99,15 @@ class TrainingData:
 
 @dataclass
 class StepReport:
-    """What a step tells: arrays of one value, but ``urge`` [n].
+    """What a step tells: arrays of one value, but ``view_gradient_norm`` [n].
 
     Attributes:
         loss: of the batch before the step.
-        urge: length of the gradient by each Gaussian's direction from the receiver.
+        view_gradient_norm: length of the gradient by each Gaussian's direction from the receiver.
     """
 
     loss: Any
-    urge: Any
+    view_gradient_norm: Any
 
 
 def make_step(
@@ -157,13 +156,13 @@ def make_step(
         scale = data.factor(rows, receiver, values)
         loss = loss_of(prediction * scale, truth * scale, batch, *shape)
         mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
-        urge = mi.Float(0)
+        view_gradient_norm = mi.Float(0)
         if CENTRES in params:
             offset = [dr.detach(params[CENTRES])[k].array - pose.position[k] for k in range(3)]
             pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
             distance = dr.sqrt(sum(c * c for c in offset))
-            urge = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
-        told = StepReport(dr.detach(loss), urge)
+            view_gradient_norm = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
+        told = StepReport(dr.detach(loss), view_gradient_norm)
         dr.eval(adam, mean, trouble, told)
         return mean, trouble, told
 
@@ -234,11 +233,11 @@ class CompiledPredictor:
 
     def __call__(self, params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
         """Greys [batch * height * width]."""
-        if params["position"].shape[1] * tx_pos.shape[1] <= AT_ONCE:
+        if params["position"].shape[1] * tx_pos.shape[1] <= CHUNK_SIZE:
             return self._recorded(params, tx_pos, pose, plane)
         with dr.suspend_grad():
             re, im = splat(gaussians_in_parts(self._field, params, tx_pos), pose, plane, self._skip)
-            return dr.sqrt(re * re + im * im + DARK)
+            return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
 
     @property
     def n_recordings(self) -> int:

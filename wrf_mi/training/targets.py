@@ -163,8 +163,9 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool =
     # A receiver whose few rows all are to choose by learns from these.
     train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
     first = round(config.traced.alone * config.steps) if joint else 0
-    if joint and config.patience and 0 < config.hold_out <= config.traced.alone:
-        text = f"{config.traced.alone} of the steps are not less than hold_out, {config.hold_out}"
+    if joint and config.patience and 0 < config.holdout_steps_fraction <= config.traced.alone:
+        end = config.holdout_steps_fraction
+        text = f"{config.traced.alone} of the steps are not less than holdout_steps_fraction, {end}"
         raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
     rng = np.random.default_rng([config.seed, 1])
     return plan(config, train, everything, rng, density_rounds(config.density, config.steps, first), first)

@@ -39,7 +39,7 @@ from .targets import form_of, plan_rows, targets_of
 
 logger = logging.getLogger(__name__)
 
-AT_ONCE = 64
+CHUNK_SIZE = 64
 """Observations of a receiver by which its level starts."""
 
 
@@ -117,9 +117,9 @@ class Trainer(TrainingLoop):
             config.evaluation,
         )
         self._shape = self.targets.truth.shape[2:]
-        self._loss = loss or partial(self.task.loss, structural_weight=config.structural_weight)
+        self._loss = loss or partial(self.task.loss, ssim_weight=config.loss.ssim_weight)
         # Gaussians that correct something are chosen on rows away from those that train, too.
-        self._chooses_reach = self.graph.corrects and config.patience > 0 and config.hold_out > 0
+        self._chooses_reach = self.graph.corrects and config.patience > 0 and config.holdout_steps_fraction > 0
         self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
         unjudged = self._chooses_reach and self._choosing is split
         joint = self.graph.field is not None and scene is not None
@@ -198,7 +198,7 @@ class Trainer(TrainingLoop):
         params = {name: to_tensor(value) for name, value in values.items()}
         if (side := self._sides[receiver]) is not None:
             return self.graph.power_level(side, params) + float(np.log(SHARE))
-        rows = self.targets.received(receiver, self._known)[:AT_ONCE]
+        rows = self.targets.received(receiver, self._known)[:CHUNK_SIZE]
         alone, own = self.graph.report(receiver, None), self.targets.condition[:, rows]
         found = evaluated(alone, params, own, receiver, self._poses[receiver], self._plane).numpy().astype(float)
         observed = self.targets.truth[receiver, rows].astype(float)
@@ -324,9 +324,9 @@ class Trainer(TrainingLoop):
             dr.opaque(mi.UInt32, t + 1),
             trouble,
         )
-        state.urge += report.urge
-        state.urge_steps += 1
-        dr.schedule(state.urge)  # evaluated together with the loop's sum of losses
+        state.view_gradient_norm += report.view_gradient_norm
+        state.view_gradient_steps += 1
+        dr.schedule(state.view_gradient_norm)  # evaluated together with the loop's sum of losses
         return report.loss, trouble
 
     def adapt(self) -> None:
@@ -340,11 +340,11 @@ class Trainer(TrainingLoop):
         rng = np.random.default_rng([self.config.seed, 2, state.step])
         change = adapt(
             params,
-            state.urge.numpy() / max(1, state.urge_steps),
+            state.view_gradient_norm.numpy() / max(1, state.view_gradient_steps),
             distance,
             rng,
-            d.grow,
-            max(d.most, self.config.initial.gaussians),
+            d.growth_fraction,
+            max(d.max_gaussians, self.config.initial.gaussians),
             float(np.radians(d.split_deg)),
             d.least_opacity,
         )

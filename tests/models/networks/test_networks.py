@@ -298,7 +298,7 @@ def trainer_of(goal: list[float], draw: Any, score: Any = None, *settings: str) 
     rows = [np.arange(8)], [np.arange(10)]
     start = {"x.bias": np.zeros(len(goal), np.float32)}
     network = Network("x", start, quadratic, to_float(goal), draw, *rows, score, "distance")
-    own = ("optimiser.warm_up=1", "optimiser.averaging=0", "log_every=1000", *settings)
+    own = ("optimiser.warm_up=1", "optimiser.ema_decay=0", "log_every=1000", *settings)
     return NetworkTrainer(network, with_settings(NetworkSettings(), own), (0,))
 
 
@@ -329,7 +329,7 @@ def test_steps_are_chosen_on_validation_and_all_rows_end_it():
     def score(params: Any) -> float:
         return abs(float(params["x.bias"].numpy()[0]) - 1.0)
 
-    own = ("steps=120", "batch=8", "optimiser.network=0.05", f"hold_out={80 / 120}", "validate_every=20")
+    own = ("steps=120", "batch=8", "optimiser.network=0.05", f"holdout_steps_fraction={80 / 120}", "validate_every=20")
     trainer = trainer_of([4], draw, score, *own)
     assert trainer.run()
     # Adam moves by about its rate a step: 1 after 20 steps.
@@ -341,7 +341,9 @@ def test_steps_are_chosen_on_validation_and_all_rows_end_it():
     assert 1.1 < trainer.state.mean_params()["x.bias"][0] < 1.6
 
 
-@pytest.mark.parametrize("wrong", ["steps=0", "optimiser.averaging=1", "hold_out=1.5", "validate_every=0", "batch=0"])
+@pytest.mark.parametrize(
+    "wrong", ["steps=0", "optimiser.ema_decay=1", "holdout_steps_fraction=1.5", "validate_every=0", "batch=0"]
+)
 def test_loops_that_are_none_are_refused(wrong: str):
     with pytest.raises(InputError, match=r"^setting .* is out of range, choose"):
         with_settings(NetworkSettings(), [wrong])

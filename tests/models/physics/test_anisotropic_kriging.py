@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from wrf_mi.core import InputError, Record
 from wrf_mi.models.physics import anisotropic_kriging as nearby
 from wrf_mi.models.physics import measured_spectrum
-from wrf_mi.models.physics.anisotropic_kriging import NearbySpectra, fit_nearby, line_of_sight, sight_axes
+from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_nearby, line_of_sight, sight_axes
 from wrf_mi.models.physics.measured_spectrum import (
     GAPS,
     LEAST_ROWS,
@@ -34,15 +34,15 @@ SINGLE = 2e-5
 """Observations are float32 and of size one; weights of some tens of rows go with them."""
 
 
-def some(count: int = 25, seed: int = 0, shape: tuple[int, ...] = (4, 5)) -> NearbySpectra:
+def some(count: int = 25, seed: int = 0, shape: tuple[int, ...] = (4, 5)) -> AnisotropicKriging:
     """Rows of random observations; two of them at one place."""
     where = positions(count, seed)
     where[1] = where[0]
     observed = np.random.default_rng(seed).uniform(size=(count, *shape)).astype(np.float32)
-    return NearbySpectra(where, observed, sight_axes(where, RECEIVER_M), LENGTH_M, NOISE)
+    return AnisotropicKriging(where, observed, sight_axes(where, RECEIVER_M), LENGTH_M, NOISE)
 
 
-def kriged(process: NearbySpectra, kept: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def kriged(process: AnisotropicKriging, kept: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights [q, kept] and variances [q] of ordinary kriging, as textbooks have it: one bordered system."""
     local = (process.tx_pos_m[kept] @ process.axes.T) / process.length_m
     asked = (where @ process.axes.T) / process.length_m
@@ -151,7 +151,7 @@ def test_kriging_is_stored_and_read(tmp_path: Path) -> None:
     process, where = some(), positions(3, seed=5)
     np.savez(tmp_path / "nearby.npz", **process.arrays())
     with np.load(tmp_path / "nearby.npz") as stored:
-        again = NearbySpectra.from_arrays(dict(stored))
+        again = AnisotropicKriging.from_arrays(dict(stored))
     np.testing.assert_array_equal(again.predict(where), process.predict(where))
     np.testing.assert_array_equal(again.std(where), process.std(where))
 
@@ -313,7 +313,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
         sizes.append(len(grey))
         return unscale(grey, lags)
 
-    monkeypatch.setattr(measured_spectrum, "UNSCALED_AT_ONCE", 9)
+    monkeypatch.setattr(measured_spectrum, "UNSCALED_PER_CHUNK", 9)
     monkeypatch.setattr(measured_spectrum, "unscale", counted)
     one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
     model = fit_measured_spectrum(one, record.official[0][:20], MeasuredSpectrumSettings(directions=20, lengths=2))

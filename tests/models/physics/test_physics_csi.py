@@ -207,7 +207,7 @@ def test_many_places_are_predicted_in_parts(
     fitted: CsiHybrid, measured: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = fitted.predict(measured.tx_pos_m[:30], 0)
-    monkeypatch.setattr(csi, "AT_ONCE", 7)
+    monkeypatch.setattr(csi, "CHUNK_SIZE", 7)
     parts = fitted.predict(measured.tx_pos_m[:30], 0)
     for one, other in ((parts.mean, whole.mean), (parts.std, whole.std)):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())

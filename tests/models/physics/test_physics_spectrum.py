@@ -224,7 +224,7 @@ def test_many_transmitters_are_predicted_in_parts(
     """Sums of some waves in another order; the deviation, the same for all, is held once."""
     record, hybrid = fitted
     whole = hybrid.predict(record.tx_pos_m[:20], 0)
-    monkeypatch.setattr(spectrum, "AT_ONCE", 7)
+    monkeypatch.setattr(spectrum, "CHUNK_SIZE", 7)
     parts = hybrid.predict(record.tx_pos_m[:20], 0)
     np.testing.assert_allclose(parts.mean, whole.mean, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(parts.std, whole.std)

@@ -14,7 +14,7 @@ from scipy.stats import rice
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.physics import signals as module
-from wrf_mi.models.physics.expected_spectrum import SpectrumReport, rician
+from wrf_mi.models.physics.expected_spectrum import ExpectedSpectrum, rician
 from wrf_mi.models.physics.signal_kernels import Covariances, departures, fit_shares
 from wrf_mi.models.physics.signals import Posterior, SignalProcess, fit_signals
 from wrf_mi.receivers.array import bartlett_spectrum, minmax_scale
@@ -290,7 +290,7 @@ def test_known_signals_give_their_spectrum(size: tuple[int, int]) -> None:
     A null is a cone; where its tip lies between the directions that are looked at, all is some per cent too low.
     """
     h = signals(positions(4), TOWARDS)
-    grey, deviation = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, *size)(certain(h, 1e-12))
+    grey, deviation = ExpectedSpectrum(ELEMENTS_M, FREQUENCY_HZ, *size)(certain(h, 1e-12))
     np.testing.assert_allclose(
         grey, minmax_scale(bartlett_spectrum(h, ELEMENTS_M, FREQUENCY_HZ, *size)), rtol=0, atol=0.03
     )
@@ -307,7 +307,7 @@ def test_expected_spectrum_is_the_mean_of_many() -> None:
     drawn = minmax_scale(
         bartlett_spectrum(posterior.mean + noise @ posterior.basis.T, ELEMENTS_M, FREQUENCY_HZ, 16, 32)
     )
-    grey, deviation = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
+    grey, deviation = ExpectedSpectrum(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
     assert np.abs(grey - drawn.mean(axis=0)).max() < 0.05
     assert np.sqrt(np.square(grey - drawn.mean(axis=0)).mean()) < 0.02
     # That the scale is a draw's own is not in the deviation stated.
@@ -319,7 +319,7 @@ def test_report_of_another_process_is_its_own() -> None:
     first = certain(h, 0.1)
     turned = np.linalg.qr(np.random.default_rng(1).normal(size=first.basis.shape))[0].astype(complex)
     second = replace(first, basis=turned, variance=first.variance * np.arange(1, 10))
-    used = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)
+    used = ExpectedSpectrum(ELEMENTS_M, FREQUENCY_HZ, 16, 32)
     for posterior in (first, second, first):
-        fresh = SpectrumReport(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
+        fresh = ExpectedSpectrum(ELEMENTS_M, FREQUENCY_HZ, 16, 32)(posterior)
         np.testing.assert_array_equal(used(posterior), fresh)

@@ -69,7 +69,7 @@ def test_the_penalty_of_the_validation_rows_and_all_training_rows() -> None:
     record, _ = linear_record(noise=1.5)
     split = split_of(8, 12)
     heard: list[float] = []
-    session = FitSession(listen=lambda stage, share, progress: heard.append(share))
+    session = FitSession(on_progress=lambda stage, share, progress: heard.append(share))
     fitted = METHOD.fit(record, split, LinearSettings(), 0, session)
     assert isinstance(fitted, LinearMap)
     assert heard[-1] == 1

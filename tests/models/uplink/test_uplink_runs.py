@@ -233,7 +233,7 @@ def test_data_that_were_read_are_named_by_their_place(
     what: str, turned: None, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, method, message = PLACED[what]
-    monkeypatch.setattr("wrf_mi.datasets.observations.ROWS_AT_ONCE", 7)  # the rows come in parts
+    monkeypatch.setattr("wrf_mi.datasets.observations.ROWS_PER_CHUNK", 7)  # the rows come in parts
     record = load(flat_folder)
     observation = record.observation.copy()
     if change:

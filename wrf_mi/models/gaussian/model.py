@@ -132,7 +132,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
 
     def heard(progress: Progress) -> None:
         append_log(folder, progress)
-        session.listen(session.fold or "training", progress.step / config.steps, progress)
+        session.on_progress(session.fold or "training", progress.step / config.steps, progress)
 
     if not trainer.run(heard, lambda: write_checkpoint(folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")

@@ -12,7 +12,7 @@ from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
-from ..method import Inputs, Listen
+from ..method import Inputs, OnProgress
 
 HEADING = "heading"
 """Key of the arrays that says whether headings were used."""
@@ -90,7 +90,7 @@ class ByReceiver:
 
 
 def fit_each(
-    name: str, record: Record, split: Split, listen: Listen, fit: FitSingle, heading: bool = False
+    name: str, record: Record, split: Split, on_progress: OnProgress, fit: FitSingle, heading: bool = False
 ) -> ByReceiver:
     """Fit every receiver to all training rows, those of each carrier by themselves.
 
@@ -98,7 +98,7 @@ def fit_each(
         name: of the method.
         record: its rows' positions must be known.
         split: rows.
-        listen: hears of each receiver.
+        on_progress: hears of each receiver.
         fit: of one receiver.
         heading: use headings where the record has them.
 
@@ -121,7 +121,7 @@ def fit_each(
             except InputError as error:
                 raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
             # Only now: what is refused at once is refused without a word of progress.
-            listen(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
+            on_progress(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
     return ByReceiver(name, models, turned is not None, carriers)
 
 

@@ -43,7 +43,7 @@ SLOPE = 0.2
 """Of the leaky ReLU below zero (Radford et al.)."""
 MOMENTUM = 0.5
 """Adam's decay of the first moment (Radford et al.)."""
-AT_ONCE = 16
+CHUNK_SIZE = 16
 """Spectra that are predicted together: bounds the memory."""
 
 
@@ -215,6 +215,6 @@ METHOD = SpectrumNetwork(
     network,
     generate_silent,
     "g.",
-    AT_ONCE,
+    CHUNK_SIZE,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
 ).method()

@@ -18,7 +18,7 @@ from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
 from ...core import InputError, Receiver, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
-from ...core.types import IntArray
+from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
 from ...tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import COUNT, AdamConfig
@@ -28,13 +28,11 @@ from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
 from .tensors import columns
 from .training import NetworkSettings, network_adam, opaque_rows
 
-DARK = 1e-8
-"""Added to |R|^2 under a root or a logarithm, whose slope at zero is infinite."""
 DB_UNIT = 10.0
 """Decibels that make one unit of the loss of signal strengths."""
-POINTS_AT_ONCE = 1 << 15
+POINTS_PER_CHUNK = 1 << 15
 """Points whose attenuation is evaluated together in predictions."""
-PAIRS_AT_ONCE = 1 << 18
+PAIRS_PER_CHUNK = 1 << 18
 """Pairs of a point and a condition that are evaluated together in predictions: bounds the memory."""
 
 
@@ -178,12 +176,12 @@ def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: Task, shape:
     re, im = parts
     tensor = type(params["offset"])
     if task.image:
-        return tensor(dr.sqrt(re * re + im * im + DARK), (batch, rays))
+        return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
     # Of equal solid angle; the root keeps incoherent sums at one size for any number of rays.
     re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
     if task.in_decibel:
         offset = dr.gather(type(re), params["offset"].array, rx)
-        power = offset + float(10 / np.log(10)) * dr.log(re * re + im * im + DARK)
+        power = offset + float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
         return tensor(power, (batch, 1))
     both = tensor(dr.concat([re, im]), (2 * outputs, batch))
     return dr.moveaxis(both, 0, 1)
@@ -249,7 +247,7 @@ class Field:
     def look(self, params: Mapping[str, Any], receiver: int, rays: IntArray | None = None) -> list[Seen]:
         """What the points of a receiver's rays, all by default, are: in parts for spectra, else in one."""
         everything = np.arange(self.frame.directions.shape[1]) if rays is None else rays
-        most = max(1, POINTS_AT_ONCE // self.settings.samples)
+        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
         count = -(-len(everything) // most) if self.frame.task.image else 1
         index = dr.opaque(mi.UInt32, receiver)
         return [
@@ -261,7 +259,7 @@ class Field:
         """What the instrument reports for conditions [features, m]: [m, values]."""
         m, index = condition.shape[1], dr.opaque(mi.UInt32, receiver)
         blocks = []
-        at_once = max(1, PAIRS_AT_ONCE // max(part.own.shape[1] for part in seen))
+        at_once = max(1, PAIRS_PER_CHUNK // max(part.own.shape[1] for part in seen))
         for first in range(0, m, at_once):
             chosen = columns(condition, opaque_rows(np.arange(first, min(m, first + at_once))))
             dr.eval(chosen)

@@ -38,14 +38,14 @@ FINISHED = "finished/"
 
 def network_adam(rate: float = 1e-3) -> AdamConfig:
     """Adam with a rate that is constant while validation rows choose, and then falls to zero."""
-    return AdamConfig(rate, cosine_start=HOLD_OUT, final=0.0, averaging=0.998)
+    return AdamConfig(rate, cosine_start=HOLD_OUT, final=0.0, ema_decay=0.998)
 
 
 @dataclass(frozen=True)
 class NetworkSettings(LoopConfig):
     """Settings of the loop, see `LoopConfig`, with the defaults of networks."""
 
-    hold_out: float = HOLD_OUT
+    holdout_steps_fraction: float = HOLD_OUT
     patience: int = 8
     optimiser: AdamConfig = field(default_factory=network_adam)
     ranges = LoopConfig.ranges | {"optimiser.network": POSITIVE}

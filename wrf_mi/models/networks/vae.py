@@ -34,7 +34,7 @@ from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .tensors import columns
 from .training import Network, NetworkSettings, opaque_rows
 
-AT_ONCE = 64
+CHUNK_SIZE = 64
 """Spectra that are predicted together: bounds the memory."""
 
 
@@ -170,6 +170,6 @@ METHOD = SpectrumNetwork(
     network,
     generate,
     "p.",
-    AT_ONCE,
+    CHUNK_SIZE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
 ).method()

@@ -53,7 +53,7 @@ def sight_axes(tx_pos_m: FloatArray, receiver_m: FloatArray) -> FloatArray:
     return np.stack([along, level, np.cross(along, level)])
 
 
-class NearbySpectra:
+class AnisotropicKriging:
     """The interpolation, of observations of any shape.
 
     Args:
@@ -123,7 +123,7 @@ class NearbySpectra:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> NearbySpectra:
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> AnisotropicKriging:
         """An interpolation as `arrays` gave it."""
         names = ("tx_pos_m", "observed", "axes", "length_m")
         positions, observed, axes, length = (arrays[name] for name in names)
@@ -136,7 +136,7 @@ def fit_nearby(
     receiver_m: FloatArray,
     wavelength_m: float,
     seed: int = 0,
-) -> NearbySpectra:
+) -> AnisotropicKriging:
     """Lengths and noise of most restricted likelihood.
 
     Args:
@@ -164,4 +164,4 @@ def fit_nearby(
     bounds = [tuple(np.log(LENGTH))] * 3 + [tuple(np.log(NOISE))]
     found = np.exp(minimize(cost, np.log(START), method="L-BFGS-B", bounds=bounds).x)
     length_m, noise = found[:3] * wavelength_m, float(found[3])
-    return NearbySpectra(tx_pos_m, np.asarray(observed, np.float32), axes, length_m, noise)
+    return AnisotropicKriging(tx_pos_m, np.asarray(observed, np.float32), axes, length_m, noise)

@@ -37,10 +37,10 @@ from .csi_residual import Diffuse, fit_diffuse
 from .csi_visibility import Visibility
 
 Complex = NDArray[np.complex128]
-Listen = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 DEFAULTS = CsiSettings()
-AT_ONCE = 1024
+CHUNK_SIZE = 1024
 """Positions that are predicted together: each has hundreds of candidates for paths."""
 CLEAR_M = 0.05
 """Rays search from so far off a wall that the antenna is mounted on."""
@@ -87,8 +87,8 @@ class CsiHybrid:
         if position.ndim != 2 or position.shape[1] != 3 or not np.isfinite(position).all():
             raise InputError(f"predict: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [m, 3]")
         index = receiver_index(self.receivers, receiver)
-        first = range(0, max(len(position), 1), AT_ONCE)
-        mean, std = zip(*(self._part(position[begin : begin + AT_ONCE], index) for begin in first), strict=True)
+        first = range(0, max(len(position), 1), CHUNK_SIZE)
+        mean, std = zip(*(self._part(position[begin : begin + CHUNK_SIZE], index) for begin in first), strict=True)
         return Prediction(np.concatenate(mean), np.concatenate(std))
 
     def _part(self, position: FloatArray, receiver: int) -> tuple[Complex, FloatArray]:
@@ -172,7 +172,7 @@ def fit_csi(
     scene: Any | None,
     settings: CsiSettings = DEFAULTS,
     seed: int = 0,
-    listen: Listen = lambda what, share: None,
+    on_progress: OnProgress = lambda what, share: None,
 ) -> CsiHybrid:
     """Fit a CSI hybrid.
 
@@ -182,7 +182,7 @@ def fit_csi(
         scene: from `wrf_mi.tracing.open_scene`, or None: the line of sight and a diffuse field.
         settings: see `CsiSettings`.
         seed: of the rays, and of folds and cells.
-        listen: hears what is being done, and how far it is from 0 to 1.
+        on_progress: hears what is being done, and how far it is from 0 to 1.
 
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.
@@ -193,7 +193,7 @@ def fit_csi(
     rows = np.asarray(rows, np.int64)
     if not len(rows) and scene is None:
         raise InputError(f"{record.name}: neither training rows nor a scene; give one of them")
-    listen("searching for paths", 0.0)
+    on_progress("searching for paths", 0.0)
     model = _start(record, scene, settings, seed)
     measured = _measured(record, rows)
     visibility = Visibility.of_scene(len(model.scan.edge_m), settings.outline_sd_m, seed)
@@ -203,15 +203,15 @@ def fit_csi(
         fit = Fit(model, measured, settings, seed)
         total = settings.repair_rounds + settings.visibility_rounds
         for number in range(settings.repair_rounds):
-            listen("repairing planes", number / total)
+            on_progress("repairing planes", number / total)
             fit.repair()
         for number in range(settings.visibility_rounds):
-            listen("learning what is seen", (settings.repair_rounds + number) / total)
+            on_progress("learning what is seen", (settings.repair_rounds + number) / total)
             fit.learn()
         model, visibility, covariance = fit.model, fit.visibility, fit.covariance
         sharpness, left = fit.finish()
         facts |= fit.facts
-    listen("kriging the rest", 1.0)
+    on_progress("kriging the rest", 1.0)
     k = float(model.k.mean())
     rest = tuple(
         fit_diffuse(measured.position_m[own], left[own], k)

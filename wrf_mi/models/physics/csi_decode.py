@@ -16,7 +16,7 @@ from ...core.types import IntArray
 
 FLIPS = (24, 24, 14, 9)
 """Hypotheses: of the so many most uncertain paths of a row, 1, 2, 3, 4 are otherwise than is likeliest beforehand."""
-NUMBERS_AT_ONCE = 1 << 21
+NUMBERS_PER_CHUNK = 1 << 21
 
 Complex = NDArray[np.complex128]
 
@@ -60,7 +60,7 @@ def decode(
     first = np.searchsorted(row, np.arange(count + 1))
     there = log_odds > 0
     blur = np.square(np.abs(gain)).mean(axis=1) * np.square(phase_sd_rad)
-    step = max(1, NUMBERS_AT_ONCE // (len(flips) * max(carriers, len(sd))))
+    step = max(1, NUMBERS_PER_CHUNK // (len(flips) * max(carriers, len(sd))))
     order = np.lexsort((np.abs(log_odds), row))
     for start in range(0, count, step):
         rows = np.arange(start, min(start + step, count))

@@ -18,7 +18,7 @@ from ...core.types import IntArray
 from ...tracing.image_method import image_sources, meeting_point
 from ...tracing.walls import Walls
 
-AT_ONCE = 1 << 19
+CHUNK_SIZE = 1 << 19
 """Pairs of chain and position that are worked on at once."""
 REACH_M = 0.1
 """A path that misses an outline by more than that, or is hidden by more, is none."""
@@ -127,7 +127,7 @@ def seen_from(walls: Walls, images: Images, positions_m: FloatArray, reach_m: fl
 
 
 def _rows(chains: int, count: int) -> Iterator[IntArray]:
-    step = max(1, AT_ONCE // max(chains, 1))
+    step = max(1, CHUNK_SIZE // max(chains, 1))
     for start in range(0, max(count, 1), step):
         yield np.arange(start, min(start + step, count))
 

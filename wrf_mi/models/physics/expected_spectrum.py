@@ -43,7 +43,7 @@ def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, Floa
     return expected, np.sqrt(np.where(far, variance / 2 * (1 - rest), left))
 
 
-class SpectrumReport:
+class ExpectedSpectrum:
     """From uncertain element signals to the spectrum that is expected.
 
     Args:

@@ -32,8 +32,8 @@ from ...core.types import IntArray
 from ...receivers.lags import Lags
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
-from .anisotropic_kriging import NearbySpectra, fit_nearby, line_of_sight
-from .expected_spectrum import SpectrumReport
+from .anisotropic_kriging import AnisotropicKriging, fit_nearby, line_of_sight
+from .expected_spectrum import ExpectedSpectrum
 from .signal_kernels import Covariances, departures
 from .signals import Posterior, SignalProcess, fit_signals
 
@@ -44,13 +44,13 @@ HELD_OUT = 80
 INTERVAL = 0.9
 NORMAL = 1.6449
 """Share of a normal distribution within so many standard deviations."""
-PREDICTED_AT_ONCE = 16
-UNSCALED_AT_ONCE = 256
+PREDICTED_PER_CHUNK = 16
+UNSCALED_PER_CHUNK = 256
 """Spectra: several times their own size is needed meanwhile."""
 LEAST_ROWS = 8
 """Fewer spectra tell no covariance of signals."""
 
-Listen = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 Image = NDArray[np.floating[Any]]
 
 
@@ -101,7 +101,7 @@ class Side:
     """
 
     signals: SignalProcess
-    nearby: NearbySpectra
+    nearby: AnisotropicKriging
     half: float
     spread: float
 
@@ -129,7 +129,7 @@ class MeasuredSpectrumHybrid:
         self.receivers, self.sides = receivers, sides
         self.frequency_hz, self.shape = frequency_hz, shape
         arrays = (one.array_m for one in receivers)
-        self._reports = [SpectrumReport(own, frequency_hz, *shape) for own in arrays if own is not None]
+        self._reports = [ExpectedSpectrum(own, frequency_hz, *shape) for own in arrays if own is not None]
 
     def predict(
         self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
@@ -151,8 +151,8 @@ class MeasuredSpectrumHybrid:
         std = np.zeros_like(mean)
         index = receiver_index(self.receivers, receiver)
         side, report = self.sides[index], self._reports[index]
-        for start in range(0, len(positions), PREDICTED_AT_ONCE):
-            part = slice(start, start + PREDICTED_AT_ONCE)
+        for start in range(0, len(positions), PREDICTED_PER_CHUNK):
+            part = slice(start, start + PREDICTED_PER_CHUNK)
             posterior = side.signals.predict(positions[part])
             mean[part], std[part] = _mixed(
                 posterior, report, side.nearby.predict(positions[part]), side.nearby.std(positions[part]), side
@@ -199,7 +199,7 @@ class MeasuredSpectrumHybrid:
         for number in range(len(receivers)):
             half, spread = arrays[f"{number}/weights"]
             process = SignalProcess.from_arrays(below(f"{number}/signals/"))
-            nearby = NearbySpectra.from_arrays(below(f"{number}/nearby/"))
+            nearby = AnisotropicKriging.from_arrays(below(f"{number}/nearby/"))
             sides.append(Side(process, nearby, float(half), float(spread)))
         height, width = (int(v) for v in arrays["shape"])
         return cls(receivers, tuple(sides), float(arrays["frequency_hz"]), (height, width))
@@ -210,7 +210,7 @@ def fit_measured_spectrum(
     rows: IntArray,
     settings: MeasuredSpectrumSettings = MeasuredSpectrumSettings(),
     seed: int = 0,
-    listen: Listen = lambda what, share: None,
+    on_progress: OnProgress = lambda what, share: None,
 ) -> MeasuredSpectrumHybrid:
     """Fit the hybrid to training rows.
 
@@ -219,7 +219,7 @@ def fit_measured_spectrum(
         rows: training rows [n].
         settings: see `MeasuredSpectrumSettings`.
         seed: of starts and of the rows that weights are fitted to.
-        listen: hears what is being done and the share that is done.
+        on_progress: hears what is being done and the share that is done.
 
     Raises:
         InputError: no spectra, no array, or too few rows.
@@ -232,7 +232,7 @@ def fit_measured_spectrum(
     frequency_hz = float(record.frequencies_hz[0])
     height, width = record.observation.shape[2:]
     sides = tuple(
-        _fit_side(record, r, rows, settings, frequency_hz, seed, listen) for r in range(len(record.receivers))
+        _fit_side(record, r, rows, settings, frequency_hz, seed, on_progress) for r in range(len(record.receivers))
     )
     return MeasuredSpectrumHybrid(record.receivers, sides, frequency_hz, (height, width))
 
@@ -244,22 +244,22 @@ def _fit_side(
     settings: MeasuredSpectrumSettings,
     frequency_hz: float,
     seed: int,
-    listen: Listen,
+    on_progress: OnProgress,
 ) -> Side:
     receiver = record.receivers[number]
     assert receiver.array_m is not None, "see `fit_measured_spectrum`"
     height, width = record.observation.shape[2:]
     lags = Lags(receiver.array_m, frequency_hz, height, width)
-    report = SpectrumReport(receiver.array_m, frequency_hz, height, width)
+    report = ExpectedSpectrum(receiver.array_m, frequency_hz, height, width)
     observed = np.asarray(record.observation[number, rows], np.float32)
     received = np.isfinite(observed).all(axis=(1, 2))
     observed, positions = observed[received], record.tx_pos_m[rows][received]
     if len(observed) < LEAST_ROWS:
         raise InputError(_too_few(f"{record.name}, receiver {receiver.name}", len(observed)))
     parts = []
-    for start in range(0, len(observed), UNSCALED_AT_ONCE):
-        listen(f"{receiver.name}: element signals of spectra", start / len(observed))
-        unscaled = unscale(observed[start : start + UNSCALED_AT_ONCE], lags)
+    for start in range(0, len(observed), UNSCALED_PER_CHUNK):
+        on_progress(f"{receiver.name}: element signals of spectra", start / len(observed))
+        unscaled = unscale(observed[start : start + UNSCALED_PER_CHUNK], lags)
         parts.append(retrieve_signals(unscaled, lags, seed, settings.starts).signals)
     signals = np.concatenate(parts)
     wavelength = speed_of_light / frequency_hz
@@ -269,11 +269,16 @@ def _fit_side(
         departures(towards, 2 * np.pi / wavelength, settings.cone_deg, settings.directions),
     )
     process = fit_signals(
-        signals, positions, receiver.array_m, covariances, seed, lambda done: listen(f"{receiver.name}: signals", done)
+        signals,
+        positions,
+        receiver.array_m,
+        covariances,
+        seed,
+        lambda done: on_progress(f"{receiver.name}: signals", done),
     )
     nearby = fit_nearby(positions, observed, receiver.position_m, wavelength, seed)
     side = Side(process, nearby, 1.0, 1.0)
-    _weigh(side, observed, report, wavelength, seed, lambda done: listen(f"{receiver.name}: weights", done))
+    _weigh(side, observed, report, wavelength, seed, lambda done: on_progress(f"{receiver.name}: weights", done))
     return side
 
 
@@ -282,7 +287,7 @@ def _too_few(what: str, count: int) -> str:
 
 
 def _mixed(
-    posterior: Posterior, report: SpectrumReport, nearby: Image, nearby_std: Image, side: Side
+    posterior: Posterior, report: ExpectedSpectrum, nearby: Image, nearby_std: Image, side: Side
 ) -> tuple[Image, Image]:
     """Mean and standard deviation of the two estimates weighed, [q, height, width]."""
     expected, deviation = report(posterior)
@@ -299,10 +304,10 @@ def _weight(ignorance: FloatArray, half: float) -> FloatArray:
 def _weigh(
     side: Side,
     observed: NDArray[np.float32],
-    report: SpectrumReport,
+    report: ExpectedSpectrum,
     wavelength: float,
     seed: int,
-    listen: Callable[[float], None],
+    on_progress: Callable[[float], None],
 ) -> None:
     """Fit c, then the factor on standard deviations, to training rows predicted across gaps.
 
@@ -322,7 +327,7 @@ def _weigh(
         missing = truth - nearby
         terms.append((posterior.ignorance, _inner(difference, difference), _inner(difference, missing)))
         kept.append((truth, posterior, nearby, nearby_std))
-        listen((number + 1) / (2 * len(GAPS)))
+        on_progress((number + 1) / (2 * len(GAPS)))
     if not kept:
         return
     ignorance, square, product = (np.concatenate(part) for part in zip(*terms, strict=True))
@@ -335,7 +340,7 @@ def _weigh(
     for truth, posterior, nearby, nearby_std in kept:
         mean, std = _mixed(posterior, report, nearby, nearby_std, side)
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
-        listen(0.5 + len(ratios) / (2 * len(kept)))
+        on_progress(0.5 + len(ratios) / (2 * len(kept)))
     side.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / NORMAL)
 
 

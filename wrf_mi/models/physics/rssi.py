@@ -24,18 +24,18 @@ from ...core.angles import FloatArray
 from ...core.receivers import receiver_index
 from ...core.types import IntArray
 from ...tasks import require
-from .rssi_fit import Base, Field, Fit, Knobs, Measured, shift_of, stopper, widening
+from .rssi_fit import Base, Field, Fit, Hyperparameters, Measured, shift_of, stopper, widening
 from .rssi_map import PowerMap, trace_map
 from .rssi_terms import Places, Priors, Stops
 
-Listen = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 HEADINGS = 8
 """Over so many the prediction is averaged where the heading is not told."""
 ROBUST_ROUNDS = 2
 WIDER = 2.0
 """While numbers are chosen, stops are so much wider: a third of the time for the same choice."""
-AT_ONCE = 1024
+CHUNK_SIZE = 1024
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ class RssiSettings:
                 raise InputError(f"{one.name} {value}: give 0 or more")
 
     @property
-    def knobs(self) -> Knobs:
+    def hyperparameters(self) -> Hyperparameters:
         """What the search begins with."""
-        return Knobs(**{one.name: getattr(self, one.name) for one in fields(Knobs)})
+        return Hyperparameters(**{one.name: getattr(self, one.name) for one in fields(Hyperparameters)})
 
     def priors(self, traced: bool) -> Priors:
         """Of the mean's coefficients."""
@@ -193,7 +193,7 @@ class RssiHybrid:
             headings = [np.full(len(position), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
         means, variances = [], []
         for own in headings:
-            parts = [self._part(position, own, index, first) for first in range(0, len(position), AT_ONCE)]
+            parts = [self._part(position, own, index, first) for first in range(0, len(position), CHUNK_SIZE)]
             means.append(np.concatenate([part[0] for part in parts]) if parts else np.zeros(0))
             variances.append(np.concatenate([part[1] for part in parts]) if parts else np.zeros(0))
         variance = np.mean(variances, axis=0) * self._widen[index] ** 2 + np.var(means, axis=0)
@@ -202,7 +202,7 @@ class RssiHybrid:
     def _part(
         self, position: FloatArray, heading: FloatArray | None, receiver: int, first: int
     ) -> tuple[FloatArray, FloatArray]:
-        own = slice(first, first + AT_ONCE)
+        own = slice(first, first + CHUNK_SIZE)
         return self._field.predict(Places(position[own], None if heading is None else heading[own]), receiver)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -224,7 +224,7 @@ class RssiHybrid:
             "widen": self._widen,
             "fact.name": np.array(list(self._facts)),
             "fact.value": np.array(list(self._facts.values()), float),
-            **{f"knob.{name}": value for name, value in asdict(field.knobs).items()},
+            **{f"knob.{name}": value for name, value in asdict(field.hyperparameters).items()},
         }
         if heading is not None:
             arrays["stop.heading_rad"] = heading
@@ -243,10 +243,12 @@ class RssiHybrid:
         base = Base(arrays["receiver_position_m"], transmit_dbm, frequency_hz, traced)
         offset, slope, factor, tx = ((float(a), float(b)) for a, b in arrays["prior.shared"])
         priors = Priors(offset, slope, factor, tx, float(arrays["prior.rx"]))
-        knobs = Knobs(**{one.name: float(arrays[f"knob.{one.name}"]) for one in fields(Knobs)})
+        hyperparameters = Hyperparameters(
+            **{one.name: float(arrays[f"knob.{one.name}"]) for one in fields(Hyperparameters)}
+        )
         places = Places(arrays["stop.position_m"], arrays.get("stop.heading_rad"))
         stops = Stops(places, arrays["stop.value_dbm"], arrays["stop.count"], arrays["stop.row"])
-        field = Field(base, priors, knobs, arrays["ratio"], stops, int(arrays["rounds"]))
+        field = Field(base, priors, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(receivers, field, stops, float(arrays["shift_db"]), arrays["widen"], facts)
 
@@ -256,7 +258,7 @@ class RssiHybrid:
             "stops": len(self._stops.places),
             "traced": self._field.base.traced is not None,
             "headings": self._field.headings,
-            **asdict(self._field.knobs),
+            **asdict(self._field.hyperparameters),
             "noise_ratio": [float(one) for one in self._field.ratio],
             "shift_db": self._shift_db,
             "widen": [float(one) for one in self._widen],
@@ -270,7 +272,7 @@ def fit_rssi(
     scene: Any | None,
     settings: RssiSettings = RssiSettings(),
     seed: int = 0,
-    listen: Listen = lambda what, share: None,
+    on_progress: OnProgress = lambda what, share: None,
 ) -> RssiHybrid:
     """Fit an RSSI hybrid.
 
@@ -281,7 +283,7 @@ def fit_rssi(
         scene: from `wrf_mi.tracing.open_scene`, or None: free space is expected.
         settings: see `RssiSettings`.
         seed: unused: nothing is drawn.
-        listen: hears what is being done, and how far it is from 0 to 1.
+        on_progress: hears what is being done, and how far it is from 0 to 1.
 
     Raises:
         InputError: a record of another task or without its frequency, or neither rows nor a scene.
@@ -297,7 +299,7 @@ def fit_rssi(
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
     traced = None
     if scene is not None:
-        listen("tracing a map", 0.0)
+        on_progress("tracing a map", 0.0)
         shape = settings.spacing_m, settings.smooth_m, settings.max_depth, settings.max_reflections
         traced = trace_map(scene, record, *shape)
     receivers_m = np.stack([one.position_m for one in record.receivers]).astype(float)
@@ -305,7 +307,7 @@ def fit_rssi(
     heading = None if record.tx_heading_rad is None else np.asarray(record.tx_heading_rad, float)[rows]
     places = Places(np.asarray(record.tx_pos_m, float)[rows], heading)
     measured = Measured(places, values, rows, record.precision(rows))
-    priors, knobs = settings.priors(traced is not None), settings.knobs
+    priors, hyperparameters = settings.priors(traced is not None), settings.hyperparameters
     join = stopper(settings.stop_m, settings.stop_rad, settings.stop_rows)
     ratio, shift, widen, facts = (
         np.ones(len(receivers_m)),
@@ -317,22 +319,24 @@ def fit_rssi(
         if settings.search_rounds and len(rows) >= settings.search_rows:
             wide = stopper(WIDER * settings.stop_m, WIDER * settings.stop_rad, settings.stop_rows)
             search = Fit(base, priors, measured, wide)
-            search.set_ratio(knobs)
-            knobs = search.search(knobs, settings.search_rounds, lambda share: listen("choosing", 0.1 + 0.7 * share))
+            search.set_ratio(hyperparameters)
+            hyperparameters = search.search(
+                hyperparameters, settings.search_rounds, lambda share: on_progress("choosing", 0.1 + 0.7 * share)
+            )
         fit = Fit(base, priors, measured, join)
-        fit.set_ratio(knobs)
-        listen("judging on held-out rows", 0.8)
-        held_out = fit.held_out(knobs, ROBUST_ROUNDS)
+        fit.set_ratio(hyperparameters)
+        on_progress("judging on held-out rows", 0.8)
+        held_out = fit.held_out(hyperparameters, ROBUST_ROUNDS)
         residual = values - held_out.mean_dbm
         shift, ratio = shift_of(residual, settings.skew_db), fit.ratio
         widen = widening(residual - shift, held_out.std_db)
         error = np.abs(residual - shift)
         if np.isfinite(error).any():
             facts["held_out_db"] = float(np.nanmedian(error))
-    listen("fitting all rows", 0.9)
+    on_progress("fitting all rows", 0.9)
     stops = join(measured)
-    field = Field(base, priors, knobs, ratio, stops, ROBUST_ROUNDS)
-    listen("done", 1.0)
+    field = Field(base, priors, hyperparameters, ratio, stops, ROBUST_ROUNDS)
+    on_progress("done", 1.0)
     return RssiHybrid(record.receivers, field, stops, shift, widen, facts)
 
 

@@ -44,7 +44,7 @@ NORMAL_90 = 1.6449
 
 
 @dataclass(frozen=True)
-class Knobs:
+class Hyperparameters:
     """The numbers that a fit may choose.
 
     Attributes:
@@ -63,7 +63,7 @@ class Knobs:
     noise_db: float
     lever_m: float
 
-    def changed(self, name: str, sign: int) -> Knobs:
+    def changed(self, name: str, sign: int) -> Hyperparameters:
         """One number a step up or down; `NOISE` stands for both parts of the noise."""
         if name == "lever_m":
             return replace(self, lever_m=self.lever_m + sign * LEVER_STEP_M)
@@ -109,38 +109,52 @@ class Field:
     """What some stops tell, with given numbers."""
 
     def __init__(
-        self, base: Base, priors: Priors, knobs: Knobs, ratio: FloatArray, stops: Stops, rounds: int = 0
+        self,
+        base: Base,
+        priors: Priors,
+        hyperparameters: Hyperparameters,
+        ratio: FloatArray,
+        stops: Stops,
+        rounds: int = 0,
     ) -> None:
         """Fit.
 
         Args:
             base: what is expected before.
             priors: of the mean's coefficients.
-            knobs: all else.
+            hyperparameters: all else.
             ratio: of each receiver's noise to that of all, [n_rx].
             stops: what was measured; may be none.
             rounds: of reweighting for Student-t noise.
         """
-        self.base, self.priors, self.knobs, self.ratio, self.rounds = base, priors, knobs, ratio, rounds
+        self.base, self.priors, self.hyperparameters, self.ratio, self.rounds = (
+            base,
+            priors,
+            hyperparameters,
+            ratio,
+            rounds,
+        )
         self.headings = stops.places.heading_rad is not None
         parts = []
         for receiver in range(len(base.receivers_m)):
             heard = np.isfinite(stops.value_dbm[receiver])
-            places = stops.places.take(heard).moved(knobs.lever_m)
+            places = stops.places.take(heard).moved(hyperparameters.lever_m)
             expected, columns, sd = base.columns(places, receiver, priors)
-            variance = (knobs.drift_db**2 + knobs.noise_db**2 / stops.count[receiver, heard]) * ratio[receiver] ** 2
+            variance = (
+                hyperparameters.drift_db**2 + hyperparameters.noise_db**2 / stops.count[receiver, heard]
+            ) * ratio[receiver] ** 2
             parts.append(Part(places, columns, stops.value_dbm[receiver, heard] - expected, variance))
-        covariance = knobs.covariance
+        covariance = hyperparameters.covariance
         self._process: PooledProcess = fit_pooled(
             parts, covariance, sd, covariance.point(self.headings), DEGREES, rounds
         )
 
     def predict(self, places: Places, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Mean in dBm, and variance of a single report about it before calibration, [m] each."""
-        moved = places.moved(self.knobs.lever_m)
+        moved = places.moved(self.hyperparameters.lever_m)
         expected, columns, _ = self.base.columns(moved, receiver, self.priors)
         mean, variance = self._process.predict(receiver, moved, columns)
-        noise = (self.knobs.drift_db**2 + self.knobs.noise_db**2) * self.ratio[receiver] ** 2
+        noise = (self.hyperparameters.drift_db**2 + self.hyperparameters.noise_db**2) * self.ratio[receiver] ** 2
         return expected + mean, variance + noise
 
 
@@ -209,12 +223,12 @@ class Fit:
         self.ratio = np.ones(len(base.receivers_m))
         self._folds = [(stopper(measured.take(train)), held_out) for train, held_out in measured.folds()]
 
-    def held_out(self, knobs: Knobs, rounds: int = 0) -> HeldOut:
+    def held_out(self, hyperparameters: Hyperparameters, rounds: int = 0) -> HeldOut:
         """Each row's prediction by the fold that did not have it."""
         mean = np.full(self.measured.value_dbm.shape, np.nan)
         std = mean.copy()
         for stops, out in self._folds:
-            field = Field(self.base, self.priors, knobs, self.ratio, stops, rounds)
+            field = Field(self.base, self.priors, hyperparameters, self.ratio, stops, rounds)
             for receiver in range(len(mean)):
                 heard = out[np.isfinite(self.measured.value_dbm[receiver, out])]
                 if len(heard):
@@ -222,13 +236,13 @@ class Fit:
                     mean[receiver, heard], std[receiver, heard] = value, np.sqrt(variance)
         return HeldOut(mean, std)
 
-    def error_db(self, knobs: Knobs) -> float:
+    def error_db(self, hyperparameters: Hyperparameters) -> float:
         """Mean absolute error on held-out rows; steadier than the median, which is what is scored."""
-        return float(np.nanmean(np.abs(self.held_out(knobs).mean_dbm - self.measured.value_dbm)))
+        return float(np.nanmean(np.abs(self.held_out(hyperparameters).mean_dbm - self.measured.value_dbm)))
 
-    def set_ratio(self, knobs: Knobs) -> None:
+    def set_ratio(self, hyperparameters: Hyperparameters) -> None:
         """Each receiver's noise, from the spread of its held-out residuals."""
-        residual = self.held_out(knobs).mean_dbm - self.measured.value_dbm
+        residual = self.held_out(hyperparameters).mean_dbm - self.measured.value_dbm
         known = np.isfinite(residual).sum(axis=1)
         spread = np.array(
             [np.median(np.abs(own[np.isfinite(own)])) if np.isfinite(own).any() else 1 for own in residual]
@@ -237,30 +251,32 @@ class Fit:
         weight = known / (known + TRUST)
         self.ratio = own**weight
 
-    def search(self, knobs: Knobs, rounds: int, listen: Callable[[float], None]) -> Knobs:
+    def search(
+        self, hyperparameters: Hyperparameters, rounds: int, on_progress: Callable[[float], None]
+    ) -> Hyperparameters:
         """Change one number at a time while that lowers the held-out error by `LEAST_GAIN_DB` at least.
 
         Args:
-            knobs: to begin with.
+            hyperparameters: to begin with.
             rounds: through all numbers.
-            listen: hears the share that is done.
+            on_progress: hears the share that is done.
         """
         names = ["shadow_db", "shadow_m", NOISE]
         if self.measured.places.heading_rad is not None:
             names += ["body_db", "body_m", "lever_m"]
-        best, done = self.error_db(knobs), 0
+        best, done = self.error_db(hyperparameters), 0
         for _ in range(rounds):
             for name in names:
                 for sign in (1, -1):
                     for _ in range(MOST_STEPS):
-                        candidate = knobs.changed(name, sign)
+                        candidate = hyperparameters.changed(name, sign)
                         error = self.error_db(candidate)
                         if error > best - LEAST_GAIN_DB:
                             break
-                        best, knobs = error, candidate
+                        best, hyperparameters = error, candidate
                 done += 1
-                listen(done / (rounds * len(names)))
-        return knobs
+                on_progress(done / (rounds * len(names)))
+        return hyperparameters
 
 
 def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:

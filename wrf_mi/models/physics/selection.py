@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import InputError, Prediction, Receiver, Record
 from ...core.types import IntArray
 
-Listen = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 
 class HybridModel(Protocol):
@@ -63,7 +63,7 @@ class HybridKind:
     """
 
     settings: type
-    fit: Callable[[Record, IntArray, Any, Any, int, Listen], HybridModel]
+    fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], HybridModel]
     load: Callable[[dict[str, NDArray[Any]], Any], HybridModel]
     uses_antennas: bool = True
 
@@ -114,8 +114,10 @@ def _for_spectra(with_scene: bool) -> HybridKind:
         return HybridKind(SpectrumSettings, fit_spectrum, SpectrumHybrid.from_arrays)
     from .measured_spectrum import MeasuredSpectrumHybrid, MeasuredSpectrumSettings, fit_measured_spectrum
 
-    def fit(record: Record, rows: IntArray, scene: Any, settings: Any, seed: int, listen: Listen) -> HybridModel:
-        return fit_measured_spectrum(record, rows, settings, seed, listen)
+    def fit(
+        record: Record, rows: IntArray, scene: Any, settings: Any, seed: int, on_progress: OnProgress
+    ) -> HybridModel:
+        return fit_measured_spectrum(record, rows, settings, seed, on_progress)
 
     return HybridKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumHybrid.from_arrays)
 

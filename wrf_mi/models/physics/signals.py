@@ -148,7 +148,7 @@ def fit_signals(
     elements_m: FloatArray,
     covariances: Covariances,
     seed: int = 0,
-    listen: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> SignalProcess:
     """Align rows and fit the process.
 
@@ -158,7 +158,7 @@ def fit_signals(
         elements_m: [m, 3].
         covariances: the dictionary.
         seed: chooses the rows that shares are fitted to where there are more than `MOST_ROWS`.
-        listen: hears the share that is done.
+        on_progress: hears the share that is done.
     """
     unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
     opposite = mirror_order(elements_m)
@@ -177,7 +177,7 @@ def fit_signals(
             if number < ROUNDS - 1:
                 rows = _realigned(process, opposite)
             done += 1
-            listen(done / rounds)
+            on_progress(done / rounds)
         if best is None or cost < best[0]:
             best = cost, process
     assert best is not None

@@ -35,7 +35,7 @@ from .spectrum_residual import Rest
 Arrays = dict[str, NDArray[Any]]
 FORMAT = 2
 """Version of `SpectrumHybrid.arrays`."""
-AT_ONCE = 256
+CHUNK_SIZE = 256
 """Transmitters that are predicted together: more are no faster each, and all would take three times their spectra."""
 
 
@@ -126,8 +126,8 @@ class SpectrumHybrid:
         mean = np.empty((len(positions), one.height, one.width), np.float32)
         # The same for all transmitters, or for all pixels of one: held once, not for each.
         error = np.empty((len(positions), 1, 1)) if model.error is None else model.error.astype(float)
-        for first in range(0, len(positions), AT_ONCE):
-            own = slice(first, first + AT_ONCE)
+        for first in range(0, len(positions), CHUNK_SIZE):
+            own = slice(first, first + CHUNK_SIZE)
             mean[own] = model.spectra(positions[own])
             if model.error is None:
                 error[own] = mean[own].std(axis=(1, 2), keepdims=True)
@@ -220,7 +220,7 @@ def fit_spectrum(
     scene: Any | None,
     settings: SpectrumSettings = SpectrumSettings(),
     seed: int = 0,
-    listen: Callable[[str, float], None] = lambda what, share: None,
+    on_progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> SpectrumHybrid:
     """Fit the hybrid to spectra.
 
@@ -232,7 +232,7 @@ def fit_spectrum(
         scene: opened ``sionna.rt.Scene`` at the carrier, or None: free space and learned surfaces.
         settings: see there.
         seed: of validation rows and of the rays.
-        listen: hears what is done, and the share of all that is done, 0..1.
+        on_progress: hears what is done, and the share of all that is done, 0..1.
 
     Raises:
         InputError: a record of another task, or without array or carrier.
@@ -247,7 +247,7 @@ def fit_spectrum(
     for index, receiver in enumerate(record.receivers):
 
         def heard(what: str, share: float, index: int = index, name: str = receiver.name) -> None:
-            listen(f"{name}: {what}", (index + share) / len(record.receivers))
+            on_progress(f"{name}: {what}", (index + share) / len(record.receivers))
 
         carrier_hz, tx_antenna = float(record.frequencies_hz[0]), record.tx_antenna
         instrument = Spectrometer(receiver, carrier_hz, height, width, tx_antenna)
@@ -274,7 +274,7 @@ def _fitted(
     rows: IntArray,
     settings: SpectrumSettings,
     how: Chaining,
-    listen: Callable[[str, float], None],
+    on_progress: Callable[[str, float], None],
 ) -> tuple[SpectrumModel, dict[str, Any]]:
     order = np.random.default_rng([how.seed, 3]).permutation(np.sort(rows))
     held = min(max(round(settings.validation * len(rows)), 20), len(rows) // 4)
@@ -289,7 +289,7 @@ def _fitted(
 
     def note(what: str, share: float) -> None:
         losses[what] = float(fit.losses(model, fit.validation).mean())
-        listen(f"{what}: loss of validation rows {losses[what]:.4f}", share)
+        on_progress(f"{what}: loss of validation rows {losses[what]:.4f}", share)
 
     model = fit.constants(model, fit.rows[:SEARCHED_ROWS], rounds=3)
     note("planes and materials", 0.2)

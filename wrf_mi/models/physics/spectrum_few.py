@@ -48,7 +48,7 @@ def fitted_to_few(
     steps: int,
     rest: bool,
     seed: int,
-    listen: Callable[[str, float], None],
+    on_progress: Callable[[str, float], None],
 ) -> tuple[SpectrumModel, dict[str, Any]]:
     """Fit what rows held out choose.
 
@@ -61,7 +61,7 @@ def fitted_to_few(
         steps: of the fit of planes and materials.
         rest: kriging may be used.
         seed: of the groups.
-        listen: hears what is done, and the share of all that is done, 0..1.
+        on_progress: hears what is done, and the share of all that is done, 0..1.
 
     Returns:
         The fitted model and facts: what was chosen, and the error of all choices on rows held out, root mean square.
@@ -75,7 +75,7 @@ def fitted_to_few(
     fit = Fit(model, place, seen, everyone, everyone[:0], offset_sd_m, steps)
     predicted: dict[str, NDArray[np.float32]] = {}
     for number in range(GROUPS):
-        listen("rows held out", number / (GROUPS + 1))
+        on_progress("rows held out", number / (GROUPS + 1))
         own, out = np.flatnonzero(group != number), np.flatnonzero(group == number)
         for name, trial in _trials(fit, model, own, rest) if len(out) else ():
             predicted.setdefault(name, np.empty_like(seen))[out] = trial.spectra(place[out])
@@ -83,7 +83,7 @@ def fitted_to_few(
     # Structural similarity falls nearly linearly with the logarithm, and no row that is hard to predict decides alone.
     score = {name: float(np.log(each.mean(axis=(1, 2)) + LEAST_ERROR).mean()) for name, each in square.items()}
     chosen = min(score, key=lambda name: score[name])
-    listen("all rows", GROUPS / (GROUPS + 1))
+    on_progress("all rows", GROUPS / (GROUPS + 1))
     best = dict(_trials(fit, model, everyone, rest))[chosen]
     facts: dict[str, Any] = {"chosen": chosen}
     facts |= {f"held-out error, {name}": round(float(np.sqrt(each.mean())), 4) for name, each in square.items()}

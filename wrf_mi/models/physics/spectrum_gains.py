@@ -1,6 +1,6 @@
 """Polarised gains of specular paths in NumPy, float64, whole batches of transmitters at once.
 
-The same equations as `wrf_mi.tracing.evaluate_paths`, which computes them with derivatives in Dr.Jit for chains that
+The same equations as `wrf_mi.tracing.field_calculator`, which computes them with derivatives in Dr.Jit for chains that
 are fixed. Here paths come and go with the transmitter, and derivatives by the few constants of the materials are
 differences.
 """

@@ -27,7 +27,7 @@ NEAR_M = 5e-4
 """What lies so close to the beginning of a leg is the surface that it begins at."""
 
 
-PAIRS_AT_ONCE = 1 << 19
+PAIRS_PER_CHUNK = 1 << 19
 """Pairs of transmitter and chain at once: some 100 MB."""
 FEW_PAIRS = 1 << 15
 """Pairs of ray and triangle that are tried one by one: some 5 ms."""
@@ -152,7 +152,7 @@ class ChainTable:
 
     def __call__(self, tx_pos_m: FloatArray) -> Met:
         """Unobstructed paths of transmitters [n, 3] in metres, through at most ``passed`` surfaces."""
-        step = max(1, PAIRS_AT_ONCE // len(self.chain))
+        step = max(1, PAIRS_PER_CHUNK // len(self.chain))
         parts = [self._part(tx_pos_m[i : i + step], i) for i in range(0, len(tx_pos_m), step)]
         return Met(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

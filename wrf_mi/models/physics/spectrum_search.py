@@ -35,7 +35,7 @@ LEAST_SEED = 8.0
 """Gain of a patch that is looked at further."""
 SEEDS, GROWN = 40, 10
 """Patches that are tried in one round, and the best of them that are grown."""
-AT_ONCE = 4
+CHUNK_SIZE = 4
 """Sheets that are taken in one round."""
 SCANNED_ROWS = 600
 """Rows of the scan for patches: enough to rank them."""
@@ -145,7 +145,7 @@ class Search:
             grown.sort(key=lambda one: -one[0])
             taken = 0
             for gain, sheet in grown:
-                if gain < least_gain or taken == AT_ONCE or len(found) == most:
+                if gain < least_gain or taken == CHUNK_SIZE or len(found) == most:
                     break
                 row, added = self.change(sheet)
                 own = before[row] - self._grid.loss(signals[row] + added, self._shapes[row])[0]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Record, Split
-from ..method import Listen, Method
+from ..method import Method, OnProgress
 from .csi_bands import Bands, bands_of, relative_error, training_rows
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, Waves, waves_of
@@ -66,7 +66,9 @@ class PathSettings:
             raise InputError(f"wavefront {self.wavefront!r}: choose auto, spherical, plane or free")
 
 
-def choose(method: Method, record: Record, split: Split, settings: PathSettings, listen: Listen) -> tuple[str, Bands]:
+def choose(
+    method: Method, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress
+) -> tuple[str, Bands]:
     """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
 
     The median over rows and antennas counts: rows alone are few. Where nothing is open, nothing is tried. Without
@@ -99,7 +101,7 @@ def choose(method: Method, record: Record, split: Split, settings: PathSettings,
     uplink, truth = record.uplink[judges].astype(complex), record.observation[0, judges]
     errors = []
     for number, (kind, bands) in enumerate(options):
-        listen(f"choosing a wave model: {kind}", number / len(options))
+        on_progress(f"choosing a wave model: {kind}", number / len(options))
         waves = waves_of(kind, bands, settings.max_distance_m)
         paths = find_paths(waves, uplink, settings.max_paths, settings.between, settings.final)
         errors.append(float(np.median(relative_error(downlink(waves, paths, bands), truth))))

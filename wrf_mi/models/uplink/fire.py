@@ -45,7 +45,7 @@ from .cross_band import bands_arrays, bands_from
 from .csi_bands import Bands, bands_of, relative_error, training_rows, uplink_of
 
 Sample = Literal["antenna", "row", "auto"]
-AT_ONCE = 4096
+CHUNK_SIZE = 4096
 """Samples that are predicted together: bounds the memory."""
 LEAK = 0.1
 """Slope of the rectifier below zero."""
@@ -202,8 +202,8 @@ def predict_samples(
     """Downlink [m, antennas of a sample, subcarriers] of uplink samples with their units."""
     scaled = parts(samples / unit[:, None, None])
     out = np.empty((len(samples), samples.shape[1] * subcarriers), complex)
-    for first in range(0, len(samples), AT_ONCE):
-        some = slice(first, first + AT_ONCE)
+    for first in range(0, len(samples), CHUNK_SIZE):
+        some = slice(first, first + CHUNK_SIZE)
         values = decoder(params, encoder(params, to_tensor(scaled[:, some]))[0]).numpy().T
         half = values.shape[1] // 2
         out[some] = values[:, :half] + 1j * values[:, half:]
@@ -220,7 +220,7 @@ def fit(record: Record, split: Split, settings: FireSettings, seed: int, session
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
     few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
-    unscored = not len(validation) or not settings.patience or not settings.hold_out
+    unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
     if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
         kinds = ("antenna",)
     fits = [(*_fit(record, train, validation, settings, seed, session, kind), kind) for kind in kinds]

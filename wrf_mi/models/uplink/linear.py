@@ -30,14 +30,14 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, Listen, Method
+from ..method import Inputs, Method, OnProgress
 from .csi_bands import finite_uplink, relative_error, training_rows
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """That are tried: from what float64 resolves in normal equations to a map of nearly zero."""
 JUDGES = 5
 """Without validation rows, one training row of so many chooses the penalty."""
-AT_ONCE = 256
+CHUNK_SIZE = 256
 """Rows whose products are added together: bounds the memory beside the data."""
 
 
@@ -114,8 +114,8 @@ class Normal:
         assert record.uplink is not None
         up, down = record.uplink.shape[2], record.observation.shape[3]
         own, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
-        for first in range(0, len(rows), AT_ONCE):
-            some = rows[first : first + AT_ONCE]
+        for first in range(0, len(rows), CHUNK_SIZE):
+            some = rows[first : first + CHUNK_SIZE]
             x, y = record.uplink[some].astype(complex), record.observation[0, some].astype(complex)
             energy = np.square(np.abs(y)).sum(axis=(1, 2))
             # A row without energy has no relative error.
@@ -133,7 +133,7 @@ class Normal:
         return np.asarray(self.vectors @ ((self.vectors.conj().T @ self.right) / damped[:, None]))
 
 
-def choose(record: Record, train: IntArray, judges: IntArray, listen: Listen) -> float:
+def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnProgress) -> float:
     """The penalty of the best median relative error of the rows that judge, from a fit to the others."""
     assert record.uplink is not None
     normal = Normal.of(record, train)
@@ -143,7 +143,7 @@ def choose(record: Record, train: IntArray, judges: IntArray, listen: Listen) ->
     for number, penalty in enumerate(PENALTIES):
         predicted = (uplink @ normal.matrix(penalty)).reshape(len(judges), -1)
         errors.append(float(np.median(relative_error(predicted, truth))))
-        listen("linear: choosing the penalty", (number + 1) / (len(PENALTIES) + 1))
+        on_progress("linear: choosing the penalty", (number + 1) / (len(PENALTIES) + 1))
     return PENALTIES[int(np.argmin(errors))]
 
 

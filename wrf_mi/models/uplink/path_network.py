@@ -34,7 +34,7 @@ BLUR = 1.0
 """Width of a path in the map to be learned, in cells."""
 HELD = 100
 """Most maps that validate."""
-AT_ONCE = 256
+CHUNK_SIZE = 256
 """Maps that are made together: bounds the memory."""
 
 
@@ -58,10 +58,10 @@ class Simulation:
 def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
     """What the network sees of uplinks [n, antennas, f]: [n, distances, cells] in 0..1, logarithmic."""
     out = np.empty((len(h), len(waves.grid), len(waves.cosines)), np.float32)
-    for first in range(0, len(h), AT_ONCE):
-        power = waves.power(h[first : first + AT_ONCE])
+    for first in range(0, len(h), CHUNK_SIZE):
+        power = waves.power(h[first : first + CHUNK_SIZE])
         brightest = np.maximum(power.max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
-        out[first : first + AT_ONCE] = _bright(power / brightest)
+        out[first : first + CHUNK_SIZE] = _bright(power / brightest)
     return out
 
 
@@ -81,8 +81,8 @@ def simulate(
     axes = waves.cosines.shape[1]
     near = max(float(waves.grid[0]), 0.0)
     spherical = isinstance(waves, ArrayWaves) and waves.spherical
-    for first in range(0, simulation.channels, AT_ONCE):
-        n, k = min(AT_ONCE, simulation.channels - first), simulation.paths
+    for first in range(0, simulation.channels, CHUNK_SIZE):
+        n, k = min(CHUNK_SIZE, simulation.channels - first), simulation.paths
         present = np.arange(k) < rng.integers(1, k + 1, (n, 1))
         far = float(waves.grid[-1])
         d = near * (far / near) ** rng.random((n, k)) if spherical else rng.uniform(near, far, (n, k))

@@ -84,7 +84,7 @@ class Tables:
 
 
 @dataclass
-class Followed:
+class EvaluatedPaths:
     """Geometry and gain of q paths.
 
     Attributes:
@@ -101,14 +101,14 @@ class Followed:
     arrival: Vector
 
 
-def follow(
+def evaluate_paths(
     chains: Chains,
     pose: Pose,
     tables: Tables,
     frequency_hz: float,
     rx_antenna: Antenna = ANTENNA,
     tx_antenna: Antenna = ANTENNA,
-) -> Followed:
+) -> EvaluatedPaths:
     """Follow chains to a receiver. Differentiable in pose, sources, planes and materials.
 
     Args:
@@ -151,7 +151,7 @@ def follow(
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
     taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
-    return Followed(
+    return EvaluatedPaths(
         (_dot(taken, real) * loss, _dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
     )
 
