@@ -40,7 +40,7 @@ class Job:
         kind: a key of `KINDS`.
         dataset: name or folder.
         settings: of the fit, ``key=value``.
-        scene: of a hybrid or traced run; "": none.
+        scene: of a physics model or traced run; "": none.
         material: of a bare mesh; "": it is none.
         n_train: training rows; 0: all.
         stop: step after which a fit is stopped, to be gone on with in another process; 0: none.
@@ -134,20 +134,20 @@ def _field(job: Job, work: Path) -> Arrays:
     return files | _predicted(work) | {"score": np.asarray(score)}
 
 
-def _hybrid(job: Job, work: Path) -> Arrays:
+def _physics(job: Job, work: Path) -> Arrays:
     from wrf_mi.runs.api import train
 
     asked: dict[str, Any] = {"material": job.material or None, "n_train": job.n_train or None}
-    train(job.dataset, work, "hybrid", scene=job.scene or None, **asked, settings=job.settings)
+    train(job.dataset, work, "physics", scene=job.scene or None, **asked, settings=job.settings)
     return _of_run(work, ("model.npz", "predictions.npz")) | _predicted(work)
 
 
 def _channels(job: Job, work: Path) -> Arrays:
-    """A hybrid for channels in a CAD room, on a mesh made of a simulated scan."""
+    """A physics model for channels in a CAD room, on a mesh made of a simulated scan."""
     from wrf_mi.models.physics.csi import CsiSettings, fit_csi
     from wrf_mi.synthetic import load_record
 
-    from .hybrid_csi import scanned_scene
+    from .physics_csi import scanned_scene
     from .trace import room_file
 
     record = load_record(job.dataset)
@@ -200,12 +200,12 @@ def _step(job: Job, work: Path) -> Arrays:
 
 KINDS: Mapping[str, Callable[[Job, Path], Arrays]] = {
     "field": _field,
-    "hybrid": _hybrid,
+    "physics": _physics,
     "channels": _channels,
     "traced": _traced,
     "step": _step,
 }
-"""By name. ``field``, ``hybrid`` and ``traced`` make a run and give what its files hold and what it predicts at new
+"""By name. ``field``, ``physics`` and ``traced`` make a run and give what its files hold and what it predicts at new
 positions, ``channels`` a model and what it predicts, ``step`` images and a gradient."""
 
 

@@ -73,7 +73,8 @@ def again(dataset: str) -> list[Row]:
     """Everything that is promised bit for bit.
 
     Args:
-        dataset: spectra that a field and a hybrid are fitted to; other hybrids where their data are on this machine.
+        dataset: spectra that a field and a physics model are fitted to; other physics models where their data are on
+            this machine.
     """
     field = Job("field", dataset, SMALL, deterministic=True)
     whole, repeated, resumed = (alone(job) for job in (field, field, replace(field, stop=STOP)))
@@ -82,14 +83,14 @@ def again(dataset: str) -> list[Row]:
         _bits_row("field, `--deterministic`, stopped and resumed in another process", whole, resumed),
     ]
     jobs = {
-        "hybrid with a mesh": Job("hybrid", LABORATORY, scene=LABORATORY, n_train=ROWS),
-        "hybrid without a mesh": Job("hybrid", dataset, n_train=ROWS),
+        "physics with a mesh": Job("physics", LABORATORY, scene=LABORATORY, n_train=ROWS),
+        "physics without a mesh": Job("physics", dataset, n_train=ROWS),
         "ray tracing": Job("traced", LABORATORY, scene=LABORATORY),
     }
     if locate("flat-ble"):
-        jobs["hybrid of signal strengths"] = Job("hybrid", "flat-ble", n_train=64)
+        jobs["physics of signal strengths"] = Job("physics", "flat-ble", n_train=64)
     if locate("newrf-conference"):
-        jobs["hybrid of channels, its mesh made anew"] = Job("channels", "newrf-conference", n_train=100)
+        jobs["physics of channels, its mesh made anew"] = Job("channels", "newrf-conference", n_train=100)
     most = max(2, os.cpu_count() or 1)
     for name, job in jobs.items():
         found = [alone(replace(job, threads=threads)) for threads in (1, most, most)]

@@ -118,7 +118,7 @@ def _blend(place: Place) -> FittedMethod:
 
 
 def _kriging(place: Place) -> FittedMethod:
-    from .hybrid_room import LENGTH_M, NOISE
+    from .box_room import LENGTH_M, NOISE
 
     rows, record = place.split.all_train, place.record
     fitted = Kriging(LENGTH_M, NOISE).fit(record.tx_pos_m[rows], record.observation[0][rows])
@@ -154,12 +154,12 @@ def _stock(place: Place, gaussians: int) -> FittedMethod:
     return FittedMethod(predict, _megabytes(list(run.field.params.values())), run.metrics["train_seconds"], rgb_variant)
 
 
-def _hybrid(place: Place) -> FittedMethod:
+def _physics(place: Place) -> FittedMethod:
     settings = kind_of(place.record, True).settings()
     key = fit_key(place.record, place.split, scene_files(place.scene), settings, place.seed)
-    folder = place.folder / f"hybrid-{key}"
+    folder = place.folder / f"physics-{key}"
     asked: dict[str, Any] = {"scene": place.scene, "n_train": place.rows, "seed": place.seed}
-    fit_once(folder, lambda: train(place.record, folder, "hybrid", **asked))
+    fit_once(folder, lambda: train(place.record, folder, "physics", **asked))
     run = Run(folder, place.record)
     size = (folder / FITTED).stat().st_size / 1e6
     return FittedMethod(lambda tx_pos_m: run.predict(tx_pos_m).mean, size, run.metrics["train_seconds"])
@@ -192,6 +192,6 @@ METHODS: list[Method] = [
     Method("volprim_rf_basic, WRF-GS+, 270", "stock integrator", partial(_stock, gaussians=270), batches=False),
     *(_tracer_method(10, depth) for depth in (1, 2, 3)),
     *(_tracer_method(rays, 4) for rays in (8, 17)),
-    Method("hybrid", "hybrid", _hybrid),
+    Method("physics", "physics", _physics),
 ]
 """All that is measured; numbers after a field's name are Gaussians, 2^17 rays the tracer's default."""

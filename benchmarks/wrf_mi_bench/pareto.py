@@ -14,7 +14,7 @@ from .methods import METHODS, Place
 from .pareto_front import front, measure_methods, pareto_figure, table
 
 ROWS = 400
-"""Of training: as many as somebody measures in a day, and as the hybrid's aim there is stated for."""
+"""Of training: as many as somebody measures in a day, and as the physics model's aim there is stated for."""
 REFERENCE = "volprim_rf_basic, WRF-GS+, 270"
 PICTURE = Path("docs/images/pareto.png")
 """Written where the command is called in a checkout of the project, and only there."""

@@ -173,8 +173,8 @@ def _gains() -> tuple[Call, Call]:
     return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, options)
 
 
-def _hybrid() -> tuple[Call, Call]:
-    """The hybrid of a room without a measurement evaluates the paths that the tracer finds, in NumPy."""
+def _physics() -> tuple[Call, Call]:
+    """The physics model of a room without a measurement evaluates the paths that the tracer finds, in NumPy."""
     from wrf_mi.models.physics.selection import kind_of
 
     tracer, one = _tracer(), transmitter_path(1)
@@ -208,7 +208,7 @@ PAIRS: list[Pair] = [
     Pair("batch", "16 transmitters at once over one after the other", _batch),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
-    Pair("hybrid", "a hybrid's prediction over the ray tracer's, one transmitter", _hybrid),
+    Pair("physics", "a physics model's prediction over the ray tracer's, one transmitter", _physics),
 ]
 """All that is compared."""
 

@@ -127,8 +127,8 @@ def _tracer(transmitters: int) -> Call:
     return lambda: tracer(tx)
 
 
-def _hybrid(transmitters: int) -> Call:
-    """The hybrid's prediction in a room without training rows: the physics alone."""
+def _physics(transmitters: int) -> Call:
+    """The physics model's prediction in a room without training rows: the physics alone."""
     one = transmitter_path(1)
     image = np.zeros((1, 1, HEIGHT, WIDTH), np.float32)
     instrument = _instrument()
@@ -211,7 +211,7 @@ AXES: list[Axis] = [
     Axis("antennas-paths", "paths", "antennas", ANTENNAS, _antennas_of_paths),
     Axis("antennas-spectrum", "Bartlett spectrum", "antennas", ANTENNAS, _spectrum_of),
     Axis("transmitters-field", "WRF-GS+ of 90 Gaussians", "transmitters", TRANSMITTERS, _field),
-    Axis("transmitters-hybrid", "hybrid", "transmitters", TRANSMITTERS, _hybrid),
+    Axis("transmitters-physics", "physics", "transmitters", TRANSMITTERS, _physics),
     Axis("transmitters-tracer", "ray tracer", "transmitters", TRANSMITTERS, _tracer),
     Axis("triangles-planes", "finding planes, divided walls", "triangles", TRIANGLES, partial(_planes, "walls")),
     Axis("triangles-walls", "one trace, divided walls", "triangles", TRIANGLES, partial(_trace, "walls")),

@@ -38,12 +38,12 @@ from .tables import FOLDER, measure
 
 STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
 TABLE_ROWS = (
-    *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "hybrid", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
+    *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "physics", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
-    *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "hybrid", "wrf-gs", "nerf2")),
+    *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "physics", "wrf-gs", "nerf2")),
     *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "r2f2", "optml", "wrf-gs")),
-    *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "hybrid", "wrf-gs+")),
-    *(f"csi-{OFFICE}-official-{name}" for name in ("hybrid", "wrf-gs")),
+    *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "physics", "wrf-gs+")),
+    *(f"csi-{OFFICE}-official-{name}" for name in ("physics", "wrf-gs")),
 )
 """Rows of the tables that take at most five minutes each, at all training rows and seed 0."""
 CONFIDENCE = 0.95

@@ -120,7 +120,7 @@ def _differences(count: int) -> Row:
 
 
 def _searches(count: int) -> Row:
-    """The loss of the hybrid's searches, NumPy in float64, and its derivative, against central differences."""
+    """The loss of the physics model's searches, NumPy in float64, and its derivative, against central differences."""
     of = Grid.of(30, 60, planar_array(4, 4, 0.16), 920e6)
     worst, cases = Worst(), 0
     for size in (1e-12, 1.0, 1e12):
@@ -139,4 +139,6 @@ def _searches(count: int) -> Row:
         worst.add(np.median(np.array(errors).max(axis=1)), f"signals of {size:g}")
     dark, zero = of.loss(np.zeros((1, 16), complex), of.shapes(np.ones((1, 30, 60), np.float32)))
     worst.add(0.0 if np.isfinite(dark).all() and np.isfinite(zero).all() else np.nan, "no signal")
-    return worst.row(f"loss: derivatives of that of the hybrid's searches against differences, {cases} cases", EXACT)
+    return worst.row(
+        f"loss: derivatives of that of the physics model's searches against differences, {cases} cases", EXACT
+    )

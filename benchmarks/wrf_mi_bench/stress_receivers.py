@@ -45,7 +45,7 @@ MODELS: dict[str, Any] = {
     "RSSI": PowerReceiver(*SIZE, TONES_HZ),
     "CSI": CsiReceiver(*SIZE, TONES_HZ),
 }
-"""Of the hybrid, in Dr.Jit: the ones that are trained through."""
+"""Of the physics model, in Dr.Jit: the ones that are trained through."""
 DOUBLE: Any = dr.float64_array_t(mi.Float)
 
 

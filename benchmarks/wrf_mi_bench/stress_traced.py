@@ -145,7 +145,7 @@ def traced_gradients(count: int = 6) -> list[Row]:
     receiver = Receiver("array", np.array([4.2, 2.9, 0.4]), np.array([0.0, 0.0, 0.0, 1.0]), Antenna(frame="array"))
     options = TraceOptions(max_depth=2, transmission=True, rays=1 << 12)
     traced = trace_paths(scene, tx, receiver, options)
-    return [_solver_gradients(scene, traced), *_hybrid_gradients(scene, traced, receiver, options)]
+    return [_solver_gradients(scene, traced), *_physics_gradients(scene, traced, receiver, options)]
 
 
 Reported = Callable[[Mapping[str, Any]], Any]
@@ -183,8 +183,9 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
     return worst.row(f"derivatives of Sionna RT's fields by {len(values)} constants of materials", TRACED_GRADIENT)
 
 
-def _hybrid_gradients(scene: Any, traced: TraceResult, receiver: Receiver, options: TraceOptions) -> list[Row]:
-    """What the receivers of the hybrid report of its traced side, in float32, by materials, pose, gain and patterns."""
+def _physics_gradients(scene: Any, traced: TraceResult, receiver: Receiver, options: TraceOptions) -> list[Row]:
+    """What the receivers of the physics model report of its traced side, in float32, by materials, pose, gain and
+    patterns."""
     field = TracedField(scene, traced.tx_pos_m, receiver, TracedOptions(options, 2, gain=300.0), traced=traced)
     rng, elements = np.random.default_rng(1), planar_array(3, 3, 0.06)
     values = {name: value.astype(float) for name, value in field.parameters().items()}

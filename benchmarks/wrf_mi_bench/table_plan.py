@@ -58,7 +58,7 @@ SHORT = _set("steps=400", "validate_every=200")
 SPECTRUM: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
-    "hybrid": Entry("hybrid", _model("hybrid"), (), SEEDS),
+    "physics": Entry("physics", _model("physics"), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
     "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
     "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
@@ -72,7 +72,7 @@ FURNISHED = {
     **SPECTRUM,
     "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
     "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
-    "hybrid": Entry("hybrid, knows the bare walls", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "physics": Entry("physics, knows the bare walls", _model("physics", "--scene", NAMED), (), SEEDS),
 }
 UNSEEN = {
     **SPECTRUM,
@@ -88,7 +88,7 @@ RSSI: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
     "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
-    "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "physics": Entry("physics, knows walls and heading", _model("physics", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
         "ray tracing, calibrated, knows walls and heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
@@ -101,7 +101,7 @@ RSSI: Mapping[str, Entry] = {
 POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
-    "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED), (), SEEDS),
+    "physics": Entry("physics, in the scanned room", _model("physics", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
@@ -120,9 +120,9 @@ UPLINK: Mapping[str, Entry] = {
         "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
     ),
 }
-CHEAP = ("hybrid", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
+CHEAP = ("physics", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
 """Measured first: seconds to a minute each."""
-FEW = ("wrf-gs+", "hybrid", "nerf2", "linear", "kriging", "idw", "ray-tracing")
+FEW = ("wrf-gs+", "physics", "nerf2", "linear", "kriging", "idw", "ray-tracing")
 """Measured with fewer rows too."""
 
 
@@ -155,7 +155,13 @@ PARTS = (
     Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
     Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
     Part(
-        "spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="room", once=("wrf-gs+", "wrf-gs", "hybrid")
+        "spectrum",
+        "spectrum",
+        "traced-room",
+        "official",
+        FURNISHED,
+        scene="room",
+        once=("wrf-gs+", "wrf-gs", "physics"),
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),

@@ -38,7 +38,7 @@ from wrf_mi.synthetic.furnished_room import traced_room
 from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, machine, threads
-from .hybrid_csi import SCANNED, scanned_scene
+from .physics_csi import SCANNED, scanned_scene
 from .table_pages import read_rows, write_tables
 from .table_plan import NAMED, Part, Row, available, plan
 

@@ -36,9 +36,9 @@ from wrf_mi.training.trainer import Trainer, peak_memory_mb
 from .bench import BenchFailed
 
 DATA = "rfid-lab"
-TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "hybrid": "hybrid"}
+TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "physics": "physics"}
 ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Of the hybrid and of WRF-GS+, on two cores."""
+"""Of the physics model and of WRF-GS+, on two cores."""
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
 STEPS, ROUNDS = 10, 9
@@ -92,8 +92,8 @@ def fit(model: str) -> dict[str, Any]:
     }
 
 
-fit_wrf_gs_plus, fit_wrf_gs, fit_factorised, fit_hybrid = (partial(fit, model) for model in TITLES)
-FITS = dict(zip(TITLES, ("fit_wrf_gs_plus", "fit_wrf_gs", "fit_factorised", "fit_hybrid"), strict=True))
+fit_wrf_gs_plus, fit_wrf_gs, fit_factorised, fit_physics = (partial(fit, model) for model in TITLES)
+FITS = dict(zip(TITLES, ("fit_wrf_gs_plus", "fit_wrf_gs", "fit_factorised", "fit_physics"), strict=True))
 """By model the function of this module that fits it in a process of its own, whose peak memory is then the fit's."""
 
 
@@ -236,7 +236,7 @@ def main() -> dict[str, Any]:
     trainers = {
         f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)
         for model in TITLES
-        if model != "hybrid"
+        if model != "physics"
         for batch in BATCHES
     }
     steps = {name: some_steps(of) for name, of in trainers.items()}
@@ -268,7 +268,7 @@ def rows(
             f"{one['seconds']:.0f} s, of processors {one['processor_seconds']:.0f} s; {one['peak_memory_mb']:.0f} MB; "
             f"median SSIM {one['ssim']['median']:.3f}"
         )
-        asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "hybrid") else ""
+        asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "physics") else ""
         lines.append(_line(f"{TITLES[model]}, fit to its final accuracy", said, asked))
     for name, one in steps.items():
         title, _, batch = name.rpartition(", ")

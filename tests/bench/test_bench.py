@@ -20,8 +20,8 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = (
     "traced-and-splatted",
-    "hybrid-room",
-    "hybrid-starts",
+    "physics-room",
+    "physics-starts",
     "pareto",
     "scaling",
     "operator",
@@ -40,7 +40,7 @@ ON_PAGE = {
     "determinism": "numerics.md",
     "sentinels": "results.md",
 }
-"""Pages that show a check's table; those of hybrids have their own, and all others are in the README."""
+"""Pages that show a check's table; those of physics models have their own, and all others are in the README."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -103,10 +103,10 @@ def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_readme_shows_the_stored_results() -> None:
     readme = (CHECKOUT / "README.md").read_text()
     trained, checked = read_results(RESULTS)
-    hybrids = [one for one in checked if one["case"].startswith("hybrid-")]
-    others = [one for one in checked if one not in hybrids and one["case"] not in ON_PAGE]
-    page = (CHECKOUT / "docs" / "hybrid_models.md").read_text()
-    assert f"<!-- hybrids -->\n{check_table(hybrids)}\n<!-- /hybrids -->" in page
+    physics = [one for one in checked if one["case"].startswith("physics-")]
+    others = [one for one in checked if one not in physics and one["case"] not in ON_PAGE]
+    page = (CHECKOUT / "docs" / "physics.md").read_text()
+    assert f"<!-- physics -->\n{check_table(physics)}\n<!-- /physics -->" in page
     for one in checked:
         name = one["case"]
         if name in ON_PAGE:

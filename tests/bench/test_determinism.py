@@ -103,7 +103,7 @@ def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> N
         assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("model", ["wrf-gs+", "hybrid", "ray-tracing"])
+@pytest.mark.parametrize("model", ["wrf-gs+", "physics", "ray-tracing"])
 def test_the_command_asks_for_the_cpu_first(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before anything is read: whatever reads a data set may choose the GPU."""
     asked: list[tuple[object, ...]] = []

@@ -48,13 +48,13 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
-@pytest.mark.parametrize("model", ["ray-tracing", "hybrid", "hybrid without a mesh", "mri"])
+@pytest.mark.parametrize("model", ["ray-tracing", "physics", "physics without a mesh", "mri"])
 def test_a_gateway_without_training_rows_is_refused_before_anything_is_done(
     model: str, unheard: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
     asked: list[Any] = ["train", unheard, "--model", model.split()[0], "--out", out]
-    asked += ["--scene", room] if model in ("ray-tracing", "hybrid") else []
+    asked += ["--scene", room] if model in ("ray-tracing", "physics") else []
     message = f"{unheard}, receiver far: received none of {TRAINED} training rows; leave it out or use another split"
     refused(asked, message, capsys)
     assert not out.exists()
@@ -70,7 +70,7 @@ def test_every_split_is_looked_at(unheard: Path, room: Path, tmp_path: Path) -> 
     for start in (
         lambda: train(record, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked"),
         lambda: train(
-            record, tmp_path / "run", "hybrid", split="blocked", on_progress=lambda *said: told.append(said[0])
+            record, tmp_path / "run", "physics", split="blocked", on_progress=lambda *said: told.append(said[0])
         ),
     ):
         with pytest.raises(InputError, match="receiver far: received none of"):

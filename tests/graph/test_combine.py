@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import FREQUENCY_HZ
+from box_room import FREQUENCY_HZ
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device

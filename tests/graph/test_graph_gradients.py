@@ -1,4 +1,5 @@
-"""Gradients of both sides of a hybrid in one graph by every kind of parameter, against differences in float64."""
+"""Gradients of both sides of a physics model in one graph by every kind of parameter, against differences in
+float64."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import CEILING, FREQUENCY_HZ, WALLS, receiver, room, transmitters
+from box_room import CEILING, FREQUENCY_HZ, WALLS, receiver, room, transmitters
 from scipy.spatial.transform import Rotation
 from small_fits import stop_after
 
@@ -190,10 +190,10 @@ def test_a_step_that_breaks_is_not_taken(tmp_path: Path) -> None:
 
 def test_the_documented_training_runs(capsys: pytest.CaptureFixture[str]) -> None:
     """As it stands, but for the number of steps."""
-    page = (Path(__file__).parents[2] / "docs" / "hybrid.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "joint.md").read_text(encoding="utf-8")
     (script,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert script.count('"steps=300"') == 1
-    exec(compile(script.replace('"steps=300"', '"steps=2"'), "docs/hybrid.md", "exec"), {})
+    exec(compile(script.replace('"steps=300"', '"steps=2"'), "docs/joint.md", "exec"), {})
     permittivity, error = (float(line) for line in capsys.readouterr().out.split())
     assert 1 < permittivity < 10
     assert 0 < error < 1

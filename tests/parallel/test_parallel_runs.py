@@ -28,8 +28,8 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 
 PRODUCTS = 1e-5
-"""Share of the largest value by which hybrids and operators may differ: a product of matrices adds in an order that
-depends on how many columns it has. Splatted fields and traces are bit-identical."""
+"""Share of the largest value by which physics models and operators may differ: a product of matrices adds in an order
+that depends on how many columns it has. Splatted fields and traces are bit-identical."""
 POSITIONS = 24
 
 
@@ -139,11 +139,11 @@ def test_paths_drawn_at_random_are_the_same(flat: Path, room: Path, two: Schedul
         assert_same_bits(arrays, stored(parallel / "paths.npz"))
 
 
-def test_hybrids_predict_the_same(flat: Path, two: Scheduler, tmp_path: Path) -> None:
+def test_physics_models_predict_the_same(flat: Path, two: Scheduler, tmp_path: Path) -> None:
     waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
     for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
         folder = tmp_path / name
-        run = train(data, folder / "run", "hybrid", settings=given).folder
+        run = train(data, folder / "run", "physics", settings=given).folder
         places = positions(load(data))
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)

@@ -1,4 +1,4 @@
-"""Runs of the hybrid: what is in their folders, the command, folds, resuming, and what is refused."""
+"""Runs of the physics model: what is in their folders, the command, folds, resuming, and what is refused."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def waves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(waves, tmp_path_factory.mktemp("runs") / "run", "hybrid", settings=QUICK).folder
+    return train(waves, tmp_path_factory.mktemp("runs") / "run", "physics", settings=QUICK).folder
 
 
 @pytest.fixture(scope="module")
 def blocked(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(
-        waves, tmp_path_factory.mktemp("runs") / "blocked", "hybrid", split="blocked", seed=3, settings=QUICK
+        waves, tmp_path_factory.mktemp("runs") / "blocked", "physics", split="blocked", seed=3, settings=QUICK
     ).folder
 
 
 @pytest.fixture(scope="module")
 def strengths(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on signal strengths with headings, without a mesh."""
-    return train(flat_folder, tmp_path_factory.mktemp("runs") / "strengths", "hybrid").folder
+    return train(flat_folder, tmp_path_factory.mktemp("runs") / "strengths", "physics").folder
 
 
 def test_run_folder_holds_the_model_and_what_it_is_sure_of(waves: Path, run: Path) -> None:
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
-    known = {"model": "hybrid", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
+    known = {"model": "physics", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
     known |= {"format": 2, "task": "spectrum", "material": None, "deterministic": False}
     assert known.items() <= config.items()
     assert (config["settings"]["directions"], config["settings"]["lengths"]) == (20, 2)
@@ -71,7 +71,7 @@ def test_run_folder_holds_the_model_and_what_it_is_sure_of(waves: Path, run: Pat
     assert arrays["std"].dtype == np.float32
     assert arrays["std"].min() > 0
     metrics = json.loads((run / "metrics.json").read_text())
-    assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("hybrid", "spectrum", 26, 10)
+    assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("physics", "spectrum", 26, 10)
     assert metrics["ssim"]["median"] == pytest.approx(np.median(ssim(arrays["prediction"], arrays["truth"])))
     assert metrics["ssim"]["median"] > metrics["reference"]["idw4"]["median"]
     inside = inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
@@ -87,10 +87,10 @@ def test_command_trains_as_the_function_does(
     waves: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    status, table, err = call(["train", waves, "--model", "hybrid", "--out", out, *SET], capsys)
+    status, table, err = call(["train", waves, "--model", "physics", "--out", out, *SET], capsys)
     assert status == 0, err
     lines = table.splitlines()
-    assert [line.split()[0] for line in lines[:3]] == ["SSIM", "hybrid", "blend"]
+    assert [line.split()[0] for line in lines[:3]] == ["SSIM", "physics", "blend"]
     assert lines[3].endswith("of the test values lie inside the predicted 90 % intervals")
     assert lines[-1] == f"results: {out}"
     assert "one: element signals of spectra" in err.splitlines()
@@ -208,12 +208,12 @@ def test_resuming_keeps_the_folds_that_were_fitted(
     assert json.loads(out)["ssim"]["median"] == pytest.approx(before.metrics["ssim"]["median"], abs=ROUNDING)
 
 
-def test_comparison_shows_a_hybrid_beside_the_blend(run: Path, blocked: Path, tmp_path: Path) -> None:
+def test_comparison_shows_a_physics_beside_the_blend(run: Path, blocked: Path, tmp_path: Path) -> None:
     page = compare([run, blocked], tmp_path / "page").read_text()
     assert "inside 90 %" in page
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["model"] for row in rows] == ["hybrid", "hybrid", "idw4", "idw4"]
+    assert [row["model"] for row in rows] == ["physics", "physics", "idw4", "idw4"]
     metrics = json.loads((run / "metrics.json").read_text())
     assert float(rows[0]["inside_90"]) == metrics["inside_90"]
     assert rows[2]["inside_90"] == ""
@@ -233,7 +233,7 @@ def test_mesh_alone_predicts_signal_strengths(
 ) -> None:
     out = tmp_path / "run"
     asked = ["--scene", flat_scene, "--n-train", 0, "--set", "max_depth=2", "--set", "spacing_m=0.5"]
-    status, printed, err = call(["train", flat_folder, "--model", "hybrid", "--out", out, "--json", *asked], capsys)
+    status, printed, err = call(["train", flat_folder, "--model", "physics", "--out", out, "--json", *asked], capsys)
     assert status == 0, err
     metrics = json.loads(printed)
     assert (metrics["n_train"], metrics["scene"]) == (0, str(flat_scene))
@@ -255,7 +255,7 @@ def test_mesh_alone_predicts_spectra(tmp_path: Path) -> None:
     found = []
     for name, parts in (("room", ROOM), ("half", {k: v for k, v in ROOM.items() if k in ("floor", "west")})):
         scene = write_xml(tmp_path / name, parts)
-        out = train(folder, tmp_path / f"run-{name}", "hybrid", scene=scene, n_train=0, settings=("rays=4096",)).folder
+        out = train(folder, tmp_path / f"run-{name}", "physics", scene=scene, n_train=0, settings=("rays=4096",)).folder
         assert json.loads((out / "metrics.json").read_text())["n_train"] == 0
         assert evaluate_run(out)["ssim"] == read_run(out).metrics["ssim"]
         found.append(stored(out)["prediction"])
@@ -273,7 +273,7 @@ def test_antennas_are_checked_once_and_as_the_ray_tracer_does(
     scene = write_xml(tmp_path / "hall", {**ROOM, "column": ("itu_concrete", box((4.8, 3.6, 0), (5.3, 4.1, 3)))})
     plain = ("rays=1024", "reflections=1", "surfaces=0", "amplitudes=false", "rest=false", "steps=1")
     folder = write_spectrum_folder(tmp_path / "waves", record)
-    train(folder, tmp_path / "run", "hybrid", scene=scene, split="blocked", settings=plain)
+    train(folder, tmp_path / "run", "physics", scene=scene, split="blocked", settings=plain)
     said = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
     assert [text.partition(" (first: receiver one)")[0] for text in said] == [
         "1 of 1 antennas lie up to 1 cm behind an outer wall",
@@ -287,7 +287,7 @@ def test_antennas_are_checked_once_and_as_the_ray_tracer_does(
     ):
         data = write_spectrum_folder(tmp_path / name, wrong)
         message = rf"{antenna} at \(5.00, 4.00, 1.00\) m is inside the solid 'column'; move one of them"
-        for command in (["train", data, "--model", "hybrid", "--scene", scene], ["trace", scene, data]):
+        for command in (["train", data, "--model", "physics", "--scene", scene], ["trace", scene, data]):
             refused([*command, "--out", tmp_path / "out"], message, capsys)
             assert not (tmp_path / "out").exists()
 
@@ -306,7 +306,7 @@ def test_channels_are_predicted_from_a_mesh(tmp_path: Path) -> None:
         csi += np.exp(-1j * wavenumber * distance) / (2 * wavenumber * distance)
     np.savez(tmp_path / "hall.npz", tx_pos=tx_pos, rx_pos=where, frequency_hz=FREQUENCY_HZ, csi=csi)
     quick = ("rays=8192", "reflections=1", "repair_rounds=2", "visibility_rounds=1", "folds=2")
-    out = train(tmp_path / "hall.npz", tmp_path / "run", "hybrid", scene=scene, settings=quick).folder
+    out = train(tmp_path / "hall.npz", tmp_path / "run", "physics", scene=scene, settings=quick).folder
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cea_db"]["median"] > 20
     assert metrics["cea_db"]["median"] > metrics["reference"]["idw4"]["median"] + 15
@@ -323,7 +323,7 @@ def test_channels_are_predicted_from_a_mesh(tmp_path: Path) -> None:
 def test_calls_that_are_refused(
     waves: Path, run: Path, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train = ["train", waves, "--model", "hybrid", "--out", tmp_path / "out"]
+    train = ["train", waves, "--model", "physics", "--out", tmp_path / "out"]
     for arguments, message in (
         ([*train, "--n-train", 0], "--n-train 0: nothing to predict from; give training rows or a scene"),
         ([*train, "--n-train", 7], "waves: 7 training rows without a mesh; give 8 or more, or a scene"),
@@ -344,10 +344,10 @@ def test_calls_that_are_refused(
             [*train, "--depth", 2],
             "--paths, --depth, --reflections, --rays and --calibrate belong to --model ray-tracing",
         ),
-        ([*train, "--preset", "quick"], "hybrid on .*waves: takes no preset"),
-        (["train", waves, "--model", "hybrid"], "train needs DATASET and --out RUN"),
-        (["train", waves, "--model", "hybrid", "--out", waves], "exists and is not empty; choose another --out"),
-        (["train", "--resume", run, "--model", "hybrid"], "leave data set and settings away"),
+        ([*train, "--preset", "quick"], "physics on .*waves: takes no preset"),
+        (["train", waves, "--model", "physics"], "train needs DATASET and --out RUN"),
+        (["train", waves, "--model", "physics", "--out", waves], "exists and is not empty; choose another --out"),
+        (["train", "--resume", run, "--model", "physics"], "leave data set and settings away"),
         (["train", "--resume", run, "--scene", "x"], "leave data set and settings away"),
         (["train", "--resume", run, "--set", "lengths=2"], "leave data set and settings away"),
         (["train", waves, "--scene", "x", "--out", tmp_path / "out"], "x: no such scene file"),
@@ -391,16 +391,22 @@ def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     heard: list[tuple[str, float]] = []
     record = wave_record(36, 10, receivers=1)
     out = train(
-        record, tmp_path / "run", "hybrid", settings=QUICK, on_progress=lambda *told: heard.append(told[:2])
+        record, tmp_path / "run", "physics", settings=QUICK, on_progress=lambda *told: heard.append(told[:2])
     ).folder
     assert {what for what, _ in heard} == {"one: element signals of spectra", "one: signals", "one: weights"}
     assert stored(out)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
 
 
-def test_settings_of_every_hybrid_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_of_every_physics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = call(["train", "--help-settings"], capsys)
     assert status == 0
-    for line in ("hybrid, spectra with --scene:", "hybrid, spectra without:", "cone_deg=80.0", "shadow_db=", "folds="):
+    for line in (
+        "physics, spectra with --scene:",
+        "physics, spectra without:",
+        "cone_deg=80.0",
+        "shadow_db=",
+        "folds=",
+    ):
         assert line in out
 
 

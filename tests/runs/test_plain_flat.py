@@ -19,7 +19,7 @@ from wrf_mi.runs.prediction_file import write_prediction_file
 from wrf_mi.runs.tx_file import read_inputs
 
 NAMES = list(NAMED_ANCHORS_M)
-MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": (), "hybrid": ()}
+MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": (), "physics": ()}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_models_work_without_headings(
         np.testing.assert_allclose(found["prediction"], before["prediction"], atol=1e-4)
 
 
-@pytest.mark.parametrize("model", ["kriging", "trees", "hybrid"])
+@pytest.mark.parametrize("model", ["kriging", "trees", "physics"])
 def test_models_see_the_height(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -58,11 +58,11 @@ def test_models_see_the_height(
         assert (np.abs(np.diff(found["prediction"], axis=1)) > 1e-3).any()
 
 
-@pytest.mark.parametrize("model", ["mri", "hybrid"])
+@pytest.mark.parametrize("model", ["mri", "physics"])
 def test_predicted_table_holds_what_the_arrays_do(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    turned = model != "hybrid"  # The hybrid was trained without headings, so it refuses them.
+    turned = model != "physics"  # The physics model was trained without headings, so it refuses them.
     columns = ["x", "y", "z", "heading_rad"] if turned else ["x", "y", "z"]
     rows = [["0.1", "2", "0.5", "0.3"], ["3", "1", "1.75", "-1"]]
     text = "\n".join(",".join(row[: len(columns)]) for row in [columns, *rows]) + "\n"
@@ -75,7 +75,7 @@ def test_predicted_table_holds_what_the_arrays_do(
     table = read_csv(tmp_path / "out.CSV")
     with np.load(tmp_path / "out.npz") as found:
         arrays = dict(found)
-    assert ("std" in arrays) == (model == "hybrid")
+    assert ("std" in arrays) == (model == "physics")
     values = {"prediction": "dbm"} | ({"std": "std_db"} if "std" in arrays else {})
     names = [f"{name}_{unit}" for unit in values.values() for name in NAMES]
     assert table.header == [*columns, *names]

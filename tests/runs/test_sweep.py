@@ -29,14 +29,14 @@ VARY = ["--vary", "seed=0,1", "--vary", "loss.ssim_weight=0.1,0.2"]
 
 
 def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) -> None:
-    options = {"dataset": "rfid-lab", "model": "hybrid"}
+    options = {"dataset": "rfid-lab", "model": "physics"}
     plan = plan_sweep(
         tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["holdout_steps_fraction=0"], ["--flag"]
     )
     assert plan.varied == ["split", "steps"]
     names = ["split=official,steps=1", "split=official,steps=2", "split=blocked-2,steps=1", "split=blocked-2,steps=2"]
     assert [run.folder for run in plan.runs] == [tmp_path / name for name in names]
-    command = "train rfid-lab --model hybrid --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
+    command = "train rfid-lab --model physics --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
     assert " ".join(plan.runs[2].arguments) == command
     assert not any(tmp_path.iterdir())
 
@@ -50,7 +50,7 @@ def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) ->
         (["seed=1,2,1"], "a value is given twice"),
         (["seed=1", "seed=2"], "seed is given already"),
         (["steps=1"], "steps is given already"),
-        (["model=hybrid"], "model is given already"),
+        (["model=physics"], "model is given already"),
         (["scene=a/b,a b"], "two runs would be named scene=a-b"),
     ],
 )
@@ -71,8 +71,8 @@ def test_bad_input_is_refused_before_anything_starts(
         (folder, ["split=official,blocked:9"], "blocked"),
         (folder, ["initial.points=nowhere.ply"], "nowhere.ply"),
         (folder, ["scene=a,b"], "carrier frequency unknown"),
-        (folder, ["model=hybrid", "steps=1"], "steps"),
-        (folder, ["model=hybrid", "n-train=0,4"], "nothing to predict from"),
+        (folder, ["model=physics", "steps=1"], "steps"),
+        (folder, ["model=physics", "n-train=0,4"], "nothing to predict from"),
         (
             flat_folder,
             ["model=vae", "seed=0,1"],

@@ -111,7 +111,7 @@ def test_models_that_do_not_serve_a_task_say_so_in_one_line(
     environment, data = installed
     for model, message in (
         ("trees", "holds delay-spread; trees serves rssi, so choose another model: idw, kriging"),
-        ("hybrid", "holds delay-spread; hybrid serves spectrum, rssi and csi, so choose another model: idw, kriging"),
+        ("physics", "holds delay-spread; physics serves spectrum, rssi and csi, so choose another model: idw, kriging"),
         (
             "factorised",
             "holds delay-spread; factorised serves spectrum, rssi and csi, so choose another model: idw, kriging",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, WALLS, WIDTH, receiver, room, transmitters
+from box_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, WALLS, WIDTH, receiver, room, transmitters
 from small_fits import stop_after
 from wrf_mi_scenes.build_laboratory import sheet
 

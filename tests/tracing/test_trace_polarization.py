@@ -168,7 +168,7 @@ def test_a_run_predicts_with_the_antennas_that_it_was_traced_with(
     [
         (["--model", "wrf-gs+", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
         (["--model", "kriging", "--tx-pattern", "dipole"], "antenna options belong to a scene that is traced"),
-        (["--model", "hybrid", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
+        (["--model", "physics", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
     ],
 )
 def test_antenna_options_are_refused_where_nothing_is_traced(
@@ -187,20 +187,20 @@ def test_a_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp
     assert not (tmp_path / "run").exists()
 
 
-def test_the_hybrid_follows_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_the_physics_follows_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
     """Physics alone: its spectra are those of the ray tracer with the same antennas."""
     for name, stated in (("vertical", []), ("crossed", ["--rx-frame", "array"])):
-        asked = ["train", turned_folder, "--model", "hybrid", "--scene", xml, "--n-train", "0", *stated]
+        asked = ["train", turned_folder, "--model", "physics", "--scene", xml, "--n-train", "0", *stated]
         status, _, err = call([*asked, "--set", "reflections=1", "--out", tmp_path / name], capsys)
         assert status == 0, err
     assert median(tmp_path / "vertical") > median(tmp_path / "crossed") + 0.1
 
 
-@pytest.mark.parametrize("model", ["hybrid", "wrf-gs+"])
+@pytest.mark.parametrize("model", ["physics", "wrf-gs+"])
 def test_training_with_a_scene_warns_of_crossed_polarisation(
     xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any, model: str
 ) -> None:
-    quick = {"hybrid": ["--n-train", "0", "--set", "reflections=1"], "wrf-gs+": ["--set", "steps=1"]}[model]
+    quick = {"physics": ["--n-train", "0", "--set", "reflections=1"], "wrf-gs+": ["--set", "steps=1"]}[model]
     asked = ["train", turned_folder, "--model", model, "--scene", xml, *quick]
     for stated, warned in (([], False), (["--rx-frame", "array"], True)):
         status, _, err = call([*asked, *stated, "--out", tmp_path / str(warned)], capsys)

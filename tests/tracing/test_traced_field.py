@@ -1,4 +1,5 @@
-"""The traced side of a hybrid against Sionna RT: gains, lengths, derivatives; what moves and what is searched again."""
+"""The traced side of a physics model against Sionna RT: gains, lengths, derivatives; what moves and what is searched
+again."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import speed_of_light

@@ -314,7 +314,7 @@ def _add_training(sub: Any) -> None:
         "dataset", nargs="?", metavar="DATASET", help="name of a data set (`wrf-mi data list`) or a folder"
     )
     sub.add_argument("--model", choices=list(MODELS), help="default: wrf-gs+; baselines from idw on: docs/baselines.md")
-    text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for hybrid, or alone for ray-tracing"
+    text = "trace SCENE too: together with wrf-gs, wrf-gs+ or factorised, for physics, or alone for ray-tracing"
     sub.add_argument("--scene", metavar="SCENE", help=text)
     text = "of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     sub.add_argument("--receiver", metavar="NAME", help=text)

@@ -81,7 +81,8 @@ def _convert(value: Any, kind: Any, name: str, source: str) -> Any:
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
-    """Settings (`TrainConfig`, or those of a hybrid) with ``key=value`` applied in order; keys dotted, values YAML.
+    """Settings (`TrainConfig`, or those of a physics model) with ``key=value`` applied in order; keys dotted, values
+    YAML.
 
     Raises:
         InputError: no ``=``, an unknown key, or a value of the wrong type.

@@ -1,4 +1,4 @@
-"""The learned side of a hybrid: a field of Gaussians splatted on the directions that a receiver model asks for."""
+"""Gaussians splatted on the directions that a receiver model asks for."""
 
 from __future__ import annotations
 

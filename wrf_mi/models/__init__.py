@@ -17,7 +17,7 @@ _OWN: Mapping[str, Model | Method | str] = {
     "wrf-gs": "wrf_mi.models.gaussian.model:WRF_GS",
     "wrf-gs+": "wrf_mi.models.gaussian.model:WRF_GS_PLUS",
     "factorised": "wrf_mi.models.gaussian.model:FACTORISED",
-    "hybrid": "wrf_mi.models.physics.model:MODEL",
+    "physics": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:METHOD",
     "kriging": "wrf_mi.models.interpolation.kriging_model:METHOD",

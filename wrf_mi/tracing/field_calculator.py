@@ -6,7 +6,7 @@ chain, each direction before a reflection is the mirrored one after it. No point
 divided by a distance to a wall.
 
 Sionna RT's own stages have derivatives too (``loop_mode="evaluated"``), but in float32, at some two hundred kernels a
-step, with materials that live in the scene; `docs/hybrid.md` compares them.
+step, with materials that live in the scene; `docs/joint.md` compares them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The traced side of a hybrid: Sionna RT's paths, whose gains, lengths and directions follow parameters.
+"""The traced side of a physics model: Sionna RT's paths, whose gains, lengths and directions follow parameters.
 
 Which surfaces a wave meets is searched for by `wrf_mi.tracing` and has no derivative; it is kept. What has one, the
 image method and the field along each path, is evaluated anew in each call (`wrf_mi.tracing.field_calculator`) with the

@@ -33,7 +33,7 @@ ROUNDING = 1e-4
 
 
 def test_registry_lists_what_is_there_and_each_entry_is_what_it_says() -> None:
-    assert {"wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", "idw", "kriging"} <= set(MODELS)
+    assert {"wrf-gs", "wrf-gs+", "factorised", "physics", "ray-tracing", "idw", "kriging"} <= set(MODELS)
     for name, model in MODELS.items():
         assert model.name == name
         assert set(model.tasks or ()) <= set(TASKS)

@@ -1,4 +1,4 @@
-"""Kriging of spectra, and the hybrid for spectra without a mesh that joins it with element signals."""
+"""Kriging of spectra, and the physics model for spectra without a mesh that joins it with element signals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_ne
 from wrf_mi.models.physics.measured_spectrum import (
     GAPS,
     LEAST_ROWS,
-    MeasuredSpectrumHybrid,
+    MeasuredSpectrumPhysics,
     MeasuredSpectrumSettings,
     fit_measured_spectrum,
 )
@@ -170,41 +170,41 @@ def heard() -> list[tuple[str, float]]:
 
 
 @pytest.fixture(scope="module")
-def hybrid(record: Record, heard: list[tuple[str, float]]) -> MeasuredSpectrumHybrid:
+def physics(record: Record, heard: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
     assert record.official is not None
     kind = kind_of(record, with_scene=False)
     model = kind.fit(record, record.official[0], None, kind.settings(), 0, lambda *told: heard.append(told))
-    assert isinstance(model, MeasuredSpectrumHybrid)
+    assert isinstance(model, MeasuredSpectrumPhysics)
     return model
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
-def test_hybrid_beats_both_of_its_parts_and_knows_how_far_it_is_off(
-    record: Record, hybrid: MeasuredSpectrumHybrid, receiver: int
+def test_physics_beats_both_of_its_parts_and_knows_how_far_it_is_off(
+    record: Record, physics: MeasuredSpectrumPhysics, receiver: int
 ) -> None:
     assert record.official is not None
     rows, truth = record.official[1], record.observation[receiver, record.official[1]]
     where = record.tx_pos_m[rows]
-    estimate = hybrid.predict(where, receiver, np.zeros(len(rows)))
+    estimate = physics.predict(where, receiver, np.zeros(len(rows)))
     assert estimate.mean.shape == estimate.std.shape == (len(rows), *SIZE)
     assert estimate.mean.min() >= 0
     assert estimate.mean.max() <= 1
     error = np.square(estimate.mean - truth).mean()
     # These waves obey the model, so that signals tell most of what there is to know.
-    assert error < 0.5 * np.square(hybrid.sides[receiver].nearby.predict(where) - truth).mean()
+    assert error < 0.5 * np.square(physics.sides[receiver].nearby.predict(where) - truth).mean()
     assert np.median(ssim(estimate.mean, truth)) > 0.9
-    other = hybrid.predict(where, 1 - receiver).mean
+    other = physics.predict(where, 1 - receiver).mean
     assert error < 0.1 * np.square(other - truth).mean()
     # 20 rows of correlated pixels.
     assert inside_interval(estimate.mean, estimate.std, truth) == pytest.approx(0.9, abs=0.08)
 
 
-def test_deviation_is_that_of_the_grey_values_far_away(record: Record, hybrid: MeasuredSpectrumHybrid) -> None:
+def test_deviation_is_that_of_the_grey_values_far_away(record: Record, physics: MeasuredSpectrumPhysics) -> None:
     assert record.official is not None
     known = record.observation[0, record.official[0]]
-    away = hybrid.predict([[100.0, 100.0, 0.0]])
-    near = hybrid.predict(record.tx_pos_m[record.official[0]])
-    side = hybrid.sides[0]
+    away = physics.predict([[100.0, 100.0, 0.0]])
+    near = physics.predict(record.tx_pos_m[record.official[0]])
+    side = physics.sides[0]
     np.testing.assert_allclose(away.mean[0], side.nearby.predict([[100.0, 100.0, 0.0]])[0], atol=1e-3)
     assert np.sqrt(np.square(away.std).mean()) > 0.7 * known.std(axis=0).mean()
     assert near.std.mean() < 0.2 * away.std.mean()
@@ -212,27 +212,27 @@ def test_deviation_is_that_of_the_grey_values_far_away(record: Record, hybrid: M
 
 
 def test_fit_says_what_it_does_and_what_it_found(
-    hybrid: MeasuredSpectrumHybrid, heard: list[tuple[str, float]]
+    physics: MeasuredSpectrumPhysics, heard: list[tuple[str, float]]
 ) -> None:
     assert heard[0][0] == "one: element signals of spectra"
     assert {what for what, _ in heard} >= {"one: signals", "one: weights", "two: weights"}
     assert all(0 <= share <= 1 for _, share in heard)
     assert heard[-1] == ("two: weights", 1.0)
-    found = hybrid.summary()
+    found = physics.summary()
     assert sum(found["coherent_share"]) == pytest.approx(1, abs=1e-3)
     assert 0 < found["turned_share"] <= 1
 
 
-def test_hybrid_is_stored_and_read(record: Record, hybrid: MeasuredSpectrumHybrid, tmp_path: Path) -> None:
-    np.savez(tmp_path / "hybrid.npz", **hybrid.arrays())
+def test_physics_is_stored_and_read(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
+    np.savez(tmp_path / "hybrid.npz", **physics.arrays())
     with np.load(tmp_path / "hybrid.npz", allow_pickle=False) as stored:
         again = kind_of(record, with_scene=False).load(dict(stored), None)
     assert [r.name for r in again.receivers] == ["one", "two"]
     for receiver in (0, 1):
-        before, after = (model.predict(record.tx_pos_m[:5], receiver) for model in (hybrid, again))
+        before, after = (model.predict(record.tx_pos_m[:5], receiver) for model in (physics, again))
         np.testing.assert_array_equal(after.mean, before.mean)
         np.testing.assert_array_equal(after.std, before.std)
-    assert again.summary() == hybrid.summary()
+    assert again.summary() == physics.summary()
 
 
 def test_weight_of_signals_falls_with_their_ignorance() -> None:
@@ -242,10 +242,10 @@ def test_weight_of_signals_falls_with_their_ignorance() -> None:
     assert weight[3] == 0
 
 
-def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, hybrid: MeasuredSpectrumHybrid) -> None:
+def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, physics: MeasuredSpectrumPhysics) -> None:
     assert record.official is not None
     observed = record.observation[0, record.official[0]]
-    fitted = hybrid.sides[0]
+    fitted = physics.sides[0]
     rows = np.arange(len(observed))  # fewer than would be drawn from
 
     by_gap = []
@@ -258,7 +258,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, hybr
         errors = []
         for posterior, kriged, _ in by_gap:
             weight = posterior.ignorance**2 / (posterior.ignorance**2 + half**2)
-            mixed = kriged + weight[:, None, None] * (hybrid._reports[0](posterior)[0] - kriged)
+            mixed = kriged + weight[:, None, None] * (physics._reports[0](posterior)[0] - kriged)
             errors.append(np.square(mixed - observed).mean())
         return float(np.mean(errors))
 
@@ -267,7 +267,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, hybr
     assert left(fitted.half) <= min(left(half) for half in others)
     inside = []
     for posterior, kriged, deviation in by_gap:
-        mean, std = measured_spectrum._mixed(posterior, hybrid._reports[0], kriged, deviation, fitted)
+        mean, std = measured_spectrum._mixed(posterior, physics._reports[0], kriged, deviation, fitted)
         inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 
@@ -325,7 +325,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("change", "count", "message"),
     [
-        ({"task": "csi"}, 20, "holds csi; this hybrid predicts spectra"),
+        ({"task": "csi"}, 20, "holds csi; this physics model predicts spectra"),
         ({"array_m": None}, 20, "array or frequency is not known; state both in its gateway_info.yml"),
         ({"frequencies_hz": None}, 20, "array or frequency is not known"),
         ({}, LEAST_ROWS - 1, f"7 training rows without a mesh; give {LEAST_ROWS} or more, or a scene"),
@@ -359,6 +359,6 @@ def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) 
 
 
 @pytest.mark.parametrize("where", [[[0.0, 0.0]], [[0.0, np.nan, 0.0]]])
-def test_positions_that_are_none_are_refused(where: list[list[float]], hybrid: MeasuredSpectrumHybrid) -> None:
+def test_positions_that_are_none_are_refused(where: list[list[float]], physics: MeasuredSpectrumPhysics) -> None:
     with pytest.raises(InputError, match="give finite positions"):
-        hybrid.predict(where)
+        physics.predict(where)

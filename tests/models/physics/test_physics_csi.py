@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hybrid_room import sheet
+from box_room import sheet
 from scipy.constants import speed_of_light
 from traced_rooms import write_xml
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.models.physics import csi
-from wrf_mi.models.physics.csi import CsiHybrid, CsiSettings, fit_csi
+from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi
 from wrf_mi.models.physics.csi_decode import decode
 from wrf_mi.models.physics.csi_paths import images_of, seen_from
 from wrf_mi.models.physics.csi_residual import fit_diffuse
@@ -89,7 +89,7 @@ def measured(right: Any, places: np.ndarray) -> Record:
 
 
 @pytest.fixture(scope="module")
-def fitted(wrong: Any, measured: Record) -> CsiHybrid:
+def fitted(wrong: Any, measured: Record) -> CsiPhysics:
     return fit_csi(measured, np.arange(140), wrong, QUICK, seed=1)
 
 
@@ -183,7 +183,7 @@ def test_things_in_the_way_are_learned_from_paths(right: Any) -> None:
     assert wrong_after < 0.6 * wrong_before  # what no other path crosses cannot be known
 
 
-def test_measurements_set_the_planes_right(fitted: CsiHybrid, wrong: Any, measured: Record) -> None:
+def test_measurements_set_the_planes_right(fitted: CsiPhysics, wrong: Any, measured: Record) -> None:
     test = np.arange(140, 200)
     truth = measured.observation[0, test]
     physics = fit_csi(measured, test[:0], wrong, QUICK).predict(measured.tx_pos_m[test], 0)
@@ -195,7 +195,7 @@ def test_measurements_set_the_planes_right(fitted: CsiHybrid, wrong: Any, measur
     assert fitted.model.walls.offset_m[west] == pytest.approx(0, abs=2e-4)
 
 
-def test_errors_are_as_large_as_stated(fitted: CsiHybrid, measured: Record) -> None:
+def test_errors_are_as_large_as_stated(fitted: CsiPhysics, measured: Record) -> None:
     test = np.arange(140, 200)
     estimate = fitted.predict(measured.tx_pos_m[test], 0)
     error = np.abs(estimate.mean - measured.observation[0, test])
@@ -204,7 +204,7 @@ def test_errors_are_as_large_as_stated(fitted: CsiHybrid, measured: Record) -> N
 
 
 def test_many_places_are_predicted_in_parts(
-    fitted: CsiHybrid, measured: Record, monkeypatch: pytest.MonkeyPatch
+    fitted: CsiPhysics, measured: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = fitted.predict(measured.tx_pos_m[:30], 0)
     monkeypatch.setattr(csi, "CHUNK_SIZE", 7)
@@ -213,10 +213,10 @@ def test_many_places_are_predicted_in_parts(
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
 
 
-def test_arrays_hold_all_that_predicts(fitted: CsiHybrid, measured: Record, tmp_path: Path) -> None:
+def test_arrays_hold_all_that_predicts(fitted: CsiPhysics, measured: Record, tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **fitted.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
-        again = CsiHybrid.from_arrays(dict(stored), None)
+        again = CsiPhysics.from_arrays(dict(stored), None)
     for name in ("mean", "std"):
         one, other = (getattr(model.predict(measured.tx_pos_m[:30], 0), name) for model in (fitted, again))
         np.testing.assert_array_equal(one, other)
@@ -265,7 +265,7 @@ def test_several_receivers_and_subcarriers(right: Any, wrong: Any, places: np.nd
         estimate = model.predict(places[test], number)
         assert estimate.mean.shape == estimate.std.shape == (60, 3)
         assert np.median(cea_db(estimate.mean, observed[number, test])) > 40  # as with one of both
-    again = CsiHybrid.from_arrays(model.arrays(), None)
+    again = CsiPhysics.from_arrays(model.arrays(), None)
     np.testing.assert_array_equal(again.predict(places[test], 1).mean, model.predict(places[test], 1).mean)
 
 
@@ -282,10 +282,10 @@ def test_an_unknown_factor_of_the_instrument_is_found(right: Any, measured: Reco
     assert model.model.gain[0] == pytest.approx(factor, rel=1e-3)
 
 
-def test_what_cannot_be_fitted_is_refused(measured: Record, fitted: CsiHybrid) -> None:
+def test_what_cannot_be_fitted_is_refused(measured: Record, fitted: CsiPhysics) -> None:
     with pytest.raises(InputError, match="neither training rows nor a scene"):
         fit_csi(measured, np.zeros(0, np.int64), None)
-    with pytest.raises(InputError, match="holds rssi; this hybrid predicts channels"):
+    with pytest.raises(InputError, match="holds rssi; this physics model predicts channels"):
         fit_csi(replace(measured, task="rssi"), np.arange(5), None)
     with pytest.raises(InputError, match="no receiver 1"):
         fitted.predict(measured.tx_pos_m, 1)

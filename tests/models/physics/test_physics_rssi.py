@@ -1,4 +1,4 @@
-"""The RSSI hybrid: its posterior, its terms, and that it learns what was put into made-up strengths."""
+"""The RSSI physics model: its posterior, its terms, and that it learns what was put into made-up strengths."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.models.physics.gaussian_process import Part, fit_pooled
-from wrf_mi.models.physics.rssi import RssiHybrid, RssiSettings, fit_rssi
+from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
 from wrf_mi.models.physics.rssi_fit import Measured, shift_of, widening
 from wrf_mi.models.physics.rssi_map import PowerMap, trace_map
 from wrf_mi.models.physics.rssi_terms import Covariance, Places, stops_of
@@ -53,7 +53,7 @@ def made(rows: int, noise_db: float, seed: int = 0, body_db: float = 0.0) -> Rec
     )
 
 
-def errors(model: RssiHybrid, record: Record, rows: np.ndarray) -> np.ndarray:
+def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
     assert record.tx_heading_rad is not None
     predicted = [model.predict(record.tx_pos_m[rows], k, record.tx_heading_rad[rows]).mean for k in range(3)]
     return np.array(predicted) - record.observation[:, rows]
@@ -185,7 +185,7 @@ def test_survives_its_arrays() -> None:
     record = made(80, noise_db=2.0)
     record.observation[1, ::3] = np.nan
     model = fit_rssi(record, np.arange(70), None, FAST)
-    again = RssiHybrid.from_arrays(model.arrays(), None)
+    again = RssiPhysics.from_arrays(model.arrays(), None)
     assert record.tx_heading_rad is not None
     for k in range(3):
         ours, theirs = (m.predict(record.tx_pos_m, k, record.tx_heading_rad) for m in (model, again))
@@ -280,7 +280,7 @@ def test_a_wall_is_seen_without_a_measurement(tmp_path) -> None:  # type: ignore
     assert seen > hidden + 5
     std = model.predict(record.tx_pos_m, 0).std
     assert (std > 8).all()
-    again = RssiHybrid.from_arrays(model.arrays())
+    again = RssiPhysics.from_arrays(model.arrays())
     np.testing.assert_array_equal(again.predict(record.tx_pos_m, 0).mean, model.predict(record.tx_pos_m, 0).mean)
 
 

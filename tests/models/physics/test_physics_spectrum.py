@@ -1,4 +1,4 @@
-"""The hybrid for spectra with a mesh: paths of known chains, fits, surfaces that the mesh lacks."""
+"""The physics model for spectra with a mesh: paths of known chains, fits, surfaces that the mesh lacks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.interpolation.kriging import Kriging
 from wrf_mi.models.physics import spectrum, spectrum_rays
-from wrf_mi.models.physics.spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
+from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum
 from wrf_mi.models.physics.spectrum_few import groups
 from wrf_mi.models.physics.spectrum_fit import Constants, fit_constants, fit_maps, map_places, scan_offsets
 from wrf_mi.models.physics.spectrum_loss import Grid
@@ -198,7 +198,7 @@ def test_amplitudes_learn_a_chain_that_is_too_weak(bare: SpectrumModel) -> None:
 
 
 @pytest.fixture(scope="module")
-def fitted(bare: SpectrumModel) -> tuple[Record, SpectrumHybrid]:
+def fitted(bare: SpectrumModel) -> tuple[Record, SpectrumPhysics]:
     offset = np.array([0.02, -0.015, 0.01, 0.0, -0.02, 0.015])
     record = record_of(bare.replaced(constants=replace(bare.constants, offset_m=offset)), places(70, 6))
     settings = SpectrumSettings(surfaces=2, rounds=1, rays=1 << 14, steps=8)
@@ -219,49 +219,49 @@ def keep_scene(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 def test_many_transmitters_are_predicted_in_parts(
-    fitted: tuple[Record, SpectrumHybrid], monkeypatch: pytest.MonkeyPatch
+    fitted: tuple[Record, SpectrumPhysics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sums of some waves in another order; the deviation, the same for all, is held once."""
-    record, hybrid = fitted
-    whole = hybrid.predict(record.tx_pos_m[:20], 0)
+    record, physics = fitted
+    whole = physics.predict(record.tx_pos_m[:20], 0)
     monkeypatch.setattr(spectrum, "CHUNK_SIZE", 7)
-    parts = hybrid.predict(record.tx_pos_m[:20], 0)
+    parts = physics.predict(record.tx_pos_m[:20], 0)
     np.testing.assert_allclose(parts.mean, whole.mean, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(parts.std, whole.std)
     assert parts.std.strides[0] == 0
-    assert hybrid.predict(np.zeros((0, 3)), 0).mean.shape == (0, HEIGHT, WIDTH)
+    assert physics.predict(np.zeros((0, 3)), 0).mean.shape == (0, HEIGHT, WIDTH)
 
 
-def test_a_fit_predicts_new_places_better_than_the_mesh_as_given(fitted: tuple[Record, SpectrumHybrid]) -> None:
-    record, hybrid = fitted
+def test_a_fit_predicts_new_places_better_than_the_mesh_as_given(fitted: tuple[Record, SpectrumPhysics]) -> None:
+    record, physics = fitted
     test = np.arange(50, 70)
     plain = fit_spectrum(record, np.zeros(0, np.int64), SCENES[0], SpectrumSettings(rays=1 << 14))
     errors = [
-        np.abs(m.predict(record.tx_pos_m[test], 0).mean - record.observation[0, test]).mean() for m in (plain, hybrid)
+        np.abs(m.predict(record.tx_pos_m[test], 0).mean - record.observation[0, test]).mean() for m in (plain, physics)
     ]
     assert errors[1] < errors[0] / 2
-    estimate = hybrid.predict(record.tx_pos_m[test], 0)
+    estimate = physics.predict(record.tx_pos_m[test], 0)
     assert estimate.std.shape == estimate.mean.shape == (20, HEIGHT, WIDTH)
-    assert hybrid.summary()["array.chains"] > 10
+    assert physics.summary()["array.chains"] > 10
     assert plain.summary() == {}
 
 
-def test_arrays_hold_all_that_predicts(fitted: tuple[Record, SpectrumHybrid], tmp_path: Path) -> None:
-    record, hybrid = fitted
-    np.savez(tmp_path / "model.npz", **hybrid.arrays())  # type: ignore[arg-type]
+def test_arrays_hold_all_that_predicts(fitted: tuple[Record, SpectrumPhysics], tmp_path: Path) -> None:
+    record, physics = fitted
+    np.savez(tmp_path / "model.npz", **physics.arrays())  # type: ignore[arg-type]
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
-        again = SpectrumHybrid.from_arrays(dict(stored))
+        again = SpectrumPhysics.from_arrays(dict(stored))
     tx = record.tx_pos_m[60:]
-    assert np.array_equal(again.predict(tx, 0).mean, hybrid.predict(tx, 0).mean)
-    assert again.summary() == hybrid.summary()
+    assert np.array_equal(again.predict(tx, 0).mean, physics.predict(tx, 0).mean)
+    assert again.summary() == physics.summary()
     with pytest.raises(InputError, match="format"):
-        SpectrumHybrid.from_arrays({"format": np.array(99)})
+        SpectrumPhysics.from_arrays({"format": np.array(99)})
 
 
 def test_without_a_mesh_there_is_the_direct_path(bare: SpectrumModel) -> None:
     record = record_of(bare, places(10, 7))
-    hybrid = fit_spectrum(record, np.zeros(0, np.int64), None)
-    waves = hybrid.models[0].waves(record.tx_pos_m)
+    physics = fit_spectrum(record, np.zeros(0, np.int64), None)
+    waves = physics.models[0].waves(record.tx_pos_m)
     assert len(waves.met) == 10
     direct = record.tx_pos_m - RECEIVER.position_m
     assert np.allclose(waves.image(np.zeros(0)), direct)
@@ -269,19 +269,19 @@ def test_without_a_mesh_there_is_the_direct_path(bare: SpectrumModel) -> None:
 
 def test_bad_input_is_refused(bare: SpectrumModel) -> None:
     record = record_of(bare, places(3, 8))
-    with pytest.raises(InputError, match="holds rssi; this hybrid predicts spectra"):
+    with pytest.raises(InputError, match="holds rssi; this physics model predicts spectra"):
         fit_spectrum(replace(record, task="rssi"), np.arange(3), None)
     with pytest.raises(InputError, match="array or carrier"):
         fit_spectrum(record.with_array(None), np.arange(3), None)
-    hybrid = fit_spectrum(record, np.zeros(0, np.int64), None)
+    physics = fit_spectrum(record, np.zeros(0, np.int64), None)
     for wrong in ([1.0, 2.0, 3.0], [[np.nan, 0, 0]]):
         with pytest.raises(InputError, match="transmitters"):
-            hybrid.predict(wrong, 0)
+            physics.predict(wrong, 0)
     for unknown in ("sensor10", 1, -1):
         with pytest.raises(InputError, match=f"no receiver .*; give one of {record.receivers[0].name}, or its number"):
-            hybrid.predict(record.tx_pos_m, unknown)
-    named = hybrid.predict(record.tx_pos_m, record.receivers[0].name).mean
-    np.testing.assert_array_equal(named, hybrid.predict(record.tx_pos_m, 0).mean)
+            physics.predict(record.tx_pos_m, unknown)
+    named = physics.predict(record.tx_pos_m, record.receivers[0].name).mean
+    np.testing.assert_array_equal(named, physics.predict(record.tx_pos_m, 0).mean)
     for setting in ({"steps": -1}, {"scale_m": 0.0}, {"validation": 1.0}):
         with pytest.raises(InputError, match="setting"):
             SpectrumSettings(**setting)
@@ -358,18 +358,18 @@ def test_few_rows_predict_no_worse_than_the_mesh_or_kriging_alone(bare: Spectrum
     else:
         record = replace(record_of(bare, tx + np.array([2.4, -1.4, 0.9])), tx_pos_m=tx)
     rows, test, truth = np.arange(12), np.arange(12, 32), record.observation[0, 12:]
-    hybrid = fit_spectrum(record, rows, SCENES[0], FEW)
+    physics = fit_spectrum(record, rows, SCENES[0], FEW)
     mesh = fit_spectrum(record, rows[:0], SCENES[0], FEW)
     kriged = Kriging().fit(tx[rows], record.observation[0, rows]).predict(tx[test])
-    estimate = hybrid.predict(tx[test], 0)
+    estimate = physics.predict(tx[test], 0)
     found, alone = mean_error(estimate.mean, truth), mean_error(mesh.predict(tx[test], 0).mean, truth)
     best = min(alone, mean_error(kriged, truth))
     assert found < (0.9 if right else 1.1) * best
-    chosen = hybrid.summary()["array.chosen"]
+    chosen = physics.summary()["array.chosen"]
     assert chosen != "kriging of spectra" if right else chosen.startswith("kriging")
     # The stated deviation is that of rows held out.
     assert 0.5 * found < np.sqrt(np.square(estimate.std).mean()) < 2 * found
-    again = SpectrumHybrid.from_arrays(hybrid.arrays())
+    again = SpectrumPhysics.from_arrays(physics.arrays())
     assert np.array_equal(again.predict(tx[test], 0).mean, estimate.mean)
 
 
@@ -382,8 +382,8 @@ def test_rows_that_cannot_judge_are_left_out_and_the_log_says_so(
     mesh = fit_spectrum(record, np.zeros(0, np.int64), SCENES[0], FEW).predict(tx, 0).mean
     assert not caplog.records
     for rows in (np.arange(3), np.arange(3, 23)):
-        hybrid = fit_spectrum(record, rows, SCENES[0], FEW)
-        assert np.array_equal(hybrid.predict(tx, 0).mean, mesh)
+        physics = fit_spectrum(record, rows, SCENES[0], FEW)
+        assert np.array_equal(physics.predict(tx, 0).mean, mesh)
         assert f"array: {len(rows)} training rows at fewer than 4 places" in caplog.messages[-1]
         assert caplog.messages[-1].endswith("the room is traced as given")
 

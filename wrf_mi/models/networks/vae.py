@@ -11,7 +11,7 @@ has not released it. Chosen here:
 - Gaussian likelihood of stated deviation. Its pixels are far from independent, so that the Kullback-Leibler term is
   weighted against the mean, not the sum, over pixels (Higgins et al. 2017, beta-VAE).
 - Predictions decode z = 0, the prior's mean. A decoder that is trained only on z from the encoder leaves to z what the
-  position could tell; Sohn et al.'s hybrid objective, taken here, also trains it on z from the prior.
+  position could tell; Sohn et al.'s physics objective, taken here, also trains it on z from the prior.
 - Positions pass through the coordinates and their positional encoding.
 """
 

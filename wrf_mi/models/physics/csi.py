@@ -46,8 +46,8 @@ CLEAR_M = 0.05
 """Rays search from so far off a wall that the antenna is mounted on."""
 
 
-class CsiHybrid:
-    """A fitted CSI hybrid; made by `fit_csi`.
+class CsiPhysics:
+    """A fitted CSI physics model; made by `fit_csi`.
 
     Attributes:
         task: ``"csi"``.
@@ -125,7 +125,7 @@ class CsiHybrid:
         return {name: np.asarray(value) for name, value in {**arrays, **scan, **fitted, **rest}.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> CsiHybrid:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> CsiPhysics:
         """What `arrays` returned; the scene is not needed."""
         receivers = stored_receivers(arrays)
         scan = Walls(*(arrays[f"scan.{name}"] for name in Walls.__dataclass_fields__))
@@ -173,8 +173,8 @@ def fit_csi(
     settings: CsiSettings = DEFAULTS,
     seed: int = 0,
     on_progress: OnProgress = lambda what, share: None,
-) -> CsiHybrid:
-    """Fit a CSI hybrid.
+) -> CsiPhysics:
+    """Fit a CSI physics model.
 
     Args:
         record: of complex channels.
@@ -187,9 +187,9 @@ def fit_csi(
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.
     """
-    require(record, "csi", why="this hybrid predicts channels")
+    require(record, "csi", why="this physics model predicts channels")
     if record.frequencies_hz is None:
-        raise InputError(f"{record.name}: frequencies unknown, which the hybrid needs; state them in the data")
+        raise InputError(f"{record.name}: frequencies unknown, which the physics model needs; state them in the data")
     rows = np.asarray(rows, np.int64)
     if not len(rows) and scene is None:
         raise InputError(f"{record.name}: neither training rows nor a scene; give one of them")
@@ -217,7 +217,7 @@ def fit_csi(
         fit_diffuse(measured.position_m[own], left[own], k)
         for own in (measured.source == index for index in range(len(record.receivers)))
     )
-    return CsiHybrid(record.receivers, model, visibility, rest, sharpness, covariance, facts)
+    return CsiPhysics(record.receivers, model, visibility, rest, sharpness, covariance, facts)
 
 
 def _measured(record: Record, rows: IntArray) -> Rows:

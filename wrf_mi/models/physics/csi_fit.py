@@ -1,4 +1,4 @@
-"""The fit of a CSI hybrid: paths, planes and visibility in turn."""
+"""The fit of a CSI physics model: paths, planes and visibility in turn."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHARPNESS = (1.0, 2.0, 4.0, 16.0)
 
 @dataclass(frozen=True)
 class CsiSettings:
-    """How a CSI hybrid is fitted.
+    """How a CSI physics model is fitted.
 
     Attributes:
         reflections: of a path at most.

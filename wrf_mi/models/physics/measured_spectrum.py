@@ -1,4 +1,4 @@
-"""A hybrid for spectra of a place without a mesh: what the array's physics tells, without any planes.
+"""A physics model for spectra of a place without a mesh: what the array's physics tells, without any planes.
 
 Two estimates of one spectrum, and how far to trust each:
 
@@ -56,7 +56,7 @@ Image = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class MeasuredSpectrumSettings:
-    """Settings of the hybrid for spectra without a mesh.
+    """Settings of the physics model for spectra without a mesh.
 
     Attributes:
         cone_deg: waves leave the transmitter at most so far from the line of sight.
@@ -106,7 +106,7 @@ class Side:
     spread: float
 
 
-class MeasuredSpectrumHybrid:
+class MeasuredSpectrumPhysics:
     """Spectra predicted from measured ones and the array's physics; see the module.
 
     Args:
@@ -188,8 +188,8 @@ class MeasuredSpectrumHybrid:
         return stored
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]], scene: Any | None = None) -> MeasuredSpectrumHybrid:
-        """A hybrid as `arrays` gave it; ``scene`` is not used."""
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]], scene: Any | None = None) -> MeasuredSpectrumPhysics:
+        """A physics model as `arrays` gave it; ``scene`` is not used."""
         receivers = stored_receivers(arrays)
 
         def below(prefix: str) -> dict[str, NDArray[Any]]:
@@ -211,8 +211,8 @@ def fit_measured_spectrum(
     settings: MeasuredSpectrumSettings = MeasuredSpectrumSettings(),
     seed: int = 0,
     on_progress: OnProgress = lambda what, share: None,
-) -> MeasuredSpectrumHybrid:
-    """Fit the hybrid to training rows.
+) -> MeasuredSpectrumPhysics:
+    """Fit the physics model to training rows.
 
     Args:
         record: of spectra, with the array and the carrier's frequency stated.
@@ -224,7 +224,7 @@ def fit_measured_spectrum(
     Raises:
         InputError: no spectra, no array, or too few rows.
     """
-    require(record, "spectrum", why="this hybrid predicts spectra")
+    require(record, "spectrum", why="this physics model predicts spectra")
     if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: its array or frequency is not known; state both in its gateway_info.yml")
     if len(rows) < LEAST_ROWS:
@@ -234,7 +234,7 @@ def fit_measured_spectrum(
     sides = tuple(
         _fit_side(record, r, rows, settings, frequency_hz, seed, on_progress) for r in range(len(record.receivers))
     )
-    return MeasuredSpectrumHybrid(record.receivers, sides, frequency_hz, (height, width))
+    return MeasuredSpectrumPhysics(record.receivers, sides, frequency_hz, (height, width))
 
 
 def _fit_side(

@@ -1,4 +1,4 @@
-"""The model ``hybrid``: planes, materials and kriging, of the data's task, with or without a scene."""
+"""The model ``physics``: planes, materials and kriging, of the data's task, with or without a scene."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from ...tracing.polarization import check_polarization
 from ...tracing.solve import Prepared
 from ..method import Inputs
 from ..model import Arrays, Fitted, Model, Problem, Session
-from .selection import KINDS, HybridModel, check_antennas
+from .selection import KINDS, PhysicsModel, check_antennas
 
 logger = logging.getLogger(__name__)
 
-NAME = "hybrid"
+NAME = "physics"
 
 
-class FittedHybrid(Fitted):
-    """A fitted hybrid.
+class FittedPhysics(Fitted):
+    """A fitted physics.
 
     Attributes:
-        own: the model, see `wrf_mi.models.physics.selection.HybridModel`.
+        own: the model, see `wrf_mi.models.physics.selection.PhysicsModel`.
     """
 
-    def __init__(self, own: HybridModel) -> None:
+    def __init__(self, own: PhysicsModel) -> None:
         self.own, self.receivers, self.uses_heading = own, own.receivers, own.uses_heading
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -57,7 +57,7 @@ def _check(problem: Problem, splits: Sequence[Split]) -> None:
     if KINDS[record.task](True).uses_antennas:
         check_polarization(scene, places, record.receivers, record.tx_antenna)
     elif any(one != ANTENNA for one in (record.tx_antenna, *(receiver.antenna for receiver in record.receivers))):
-        logger.warning("%s: the hybrid for channels takes all antennas to be isotropic", record.name)
+        logger.warning("%s: the physics model for channels takes all antennas to be isotropic", record.name)
 
 
 @cache
@@ -67,12 +67,12 @@ def _of(task: str, with_scene: bool) -> Model:
     def fit(problem: Problem, split: Split, session: Session) -> Fitted:
         rows, scene = problem.rows(split), problem.opened_scene
         own = kind.fit(problem.record, rows, scene, problem.settings, problem.seed, session.report)
-        return FittedHybrid(own)
+        return FittedPhysics(own)
 
     def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        return FittedHybrid(kind.load(arrays, problem.opened_scene))
+        return FittedPhysics(kind.load(arrays, problem.opened_scene))
 
-    ends = fit, load, "docs/hybrid.md"
+    ends = fit, load, "docs/joint.md"
     kept: dict[str, Any] = {"scene": "optional", "uses_antennas": kind.uses_antennas, "scene_alone": True}
     return Model(NAME, tuple(KINDS), kind.settings, *ends, **kept, headings=True, check=_check)
 

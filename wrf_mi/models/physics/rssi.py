@@ -40,7 +40,7 @@ CHUNK_SIZE = 1024
 
 @dataclass(frozen=True)
 class RssiSettings:
-    """How an RSSI hybrid is fitted.
+    """How an RSSI physics model is fitted.
 
     Attributes:
         transmit_dbm: power sent, gains of both antennas included, before anything is measured.
@@ -138,8 +138,8 @@ class RssiSettings:
         )
 
 
-class RssiHybrid:
-    """A fitted RSSI hybrid; made by `fit_rssi`.
+class RssiPhysics:
+    """A fitted RSSI physics model; made by `fit_rssi`.
 
     Attributes:
         task: ``"rssi"``.
@@ -233,7 +233,7 @@ class RssiHybrid:
         return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> RssiHybrid:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> RssiPhysics:
         """What `arrays` returned; the scene is not needed: its map is in them."""
         receivers = stored_receivers(arrays)
         traced = None
@@ -273,8 +273,8 @@ def fit_rssi(
     settings: RssiSettings = RssiSettings(),
     seed: int = 0,
     on_progress: OnProgress = lambda what, share: None,
-) -> RssiHybrid:
-    """Fit an RSSI hybrid.
+) -> RssiPhysics:
+    """Fit an RSSI physics model.
 
     Args:
         record: of signal strengths; its rows should be in the order of time, see
@@ -288,9 +288,11 @@ def fit_rssi(
     Raises:
         InputError: a record of another task or without its frequency, or neither rows nor a scene.
     """
-    require(record, "rssi", why="this hybrid predicts signal strengths")
+    require(record, "rssi", why="this physics model predicts signal strengths")
     if record.frequencies_hz is None:
-        raise InputError(f"{record.name}: carrier frequency unknown, which the hybrid needs; state it in the data")
+        raise InputError(
+            f"{record.name}: carrier frequency unknown, which the physics model needs; state it in the data"
+        )
     rows = np.unique(np.asarray(rows, np.int64))
     values = np.asarray(record.observation[:, rows], float)
     heard = np.isfinite(values).any(axis=0)
@@ -337,7 +339,7 @@ def fit_rssi(
     stops = join(measured)
     field = Field(base, priors, hyperparameters, ratio, stops, ROBUST_ROUNDS)
     on_progress("done", 1.0)
-    return RssiHybrid(record.receivers, field, stops, shift, widen, facts)
+    return RssiPhysics(record.receivers, field, stops, shift, widen, facts)
 
 
-__all__ = ["RssiHybrid", "RssiSettings", "fit_rssi"]
+__all__ = ["RssiPhysics", "RssiSettings", "fit_rssi"]

@@ -1,4 +1,4 @@
-"""Fit of an RSSI hybrid: which folds judge, what they choose, how far predictions are off."""
+"""Fit of an RSSI physics model: which folds judge, what they choose, how far predictions are off."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which hybrid serves which data: by what is measured, and by whether there is a mesh."""
+"""Which physics serves which data: by what is measured, and by whether there is a mesh."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ...core.types import IntArray
 OnProgress = Callable[[str, float], None]
 
 
-class HybridModel(Protocol):
-    """A fitted hybrid."""
+class PhysicsModel(Protocol):
+    """A fitted physics."""
 
     @property
     def task(self) -> str:
@@ -52,24 +52,24 @@ class HybridModel(Protocol):
 
 
 @dataclass(frozen=True)
-class HybridKind:
-    """One of the hybrids.
+class PhysicsKind:
+    """One of the physics models.
 
     Attributes:
         settings: dataclass of its settings.
         fit: ``fit(record, rows, scene, settings, seed, listen)``; ``scene`` as opened by Sionna RT, or None.
-        load: ``load(arrays, scene)``, from `HybridModel.arrays`.
+        load: ``load(arrays, scene)``, from `PhysicsModel.arrays`.
         uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
     """
 
     settings: type
-    fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], HybridModel]
-    load: Callable[[dict[str, NDArray[Any]], Any], HybridModel]
+    fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], PhysicsModel]
+    load: Callable[[dict[str, NDArray[Any]], Any], PhysicsModel]
     uses_antennas: bool = True
 
 
-def kind_of(record: Record, with_scene: bool) -> HybridKind:
-    """The hybrid for a record.
+def kind_of(record: Record, with_scene: bool) -> PhysicsKind:
+    """The physics model for a record.
 
     Args:
         record: measurements.
@@ -79,7 +79,7 @@ def kind_of(record: Record, with_scene: bool) -> HybridKind:
         InputError: a task that none serves, or channels of receivers with several antennas.
     """
     if record.task not in KINDS:
-        raise InputError(f"{record.name}: holds {record.task}; no hybrid predicts that")
+        raise InputError(f"{record.name}: holds {record.task}; no physics model predicts that")
     check_antennas(record)
     return KINDS[record.task](with_scene)
 
@@ -92,35 +92,35 @@ def check_antennas(record: Record) -> None:
     """
     if record.task == "csi" and record.observation.ndim != 3:
         antennas = record.observation.shape[2]
-        raise InputError(f"{record.name}: channels of {antennas} antennas; the hybrid serves receivers with one")
+        raise InputError(f"{record.name}: channels of {antennas} antennas; the physics model serves receivers with one")
 
 
-def _for_rssi(with_scene: bool) -> HybridKind:
-    from .rssi import RssiHybrid, RssiSettings, fit_rssi
+def _for_rssi(with_scene: bool) -> PhysicsKind:
+    from .rssi import RssiPhysics, RssiSettings, fit_rssi
 
-    return HybridKind(RssiSettings, fit_rssi, RssiHybrid.from_arrays)
-
-
-def _for_csi(with_scene: bool) -> HybridKind:
-    from .csi import CsiHybrid, CsiSettings, fit_csi
-
-    return HybridKind(CsiSettings, fit_csi, CsiHybrid.from_arrays, uses_antennas=False)
+    return PhysicsKind(RssiSettings, fit_rssi, RssiPhysics.from_arrays)
 
 
-def _for_spectra(with_scene: bool) -> HybridKind:
+def _for_csi(with_scene: bool) -> PhysicsKind:
+    from .csi import CsiPhysics, CsiSettings, fit_csi
+
+    return PhysicsKind(CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
+
+
+def _for_spectra(with_scene: bool) -> PhysicsKind:
     if with_scene:
-        from .spectrum import SpectrumHybrid, SpectrumSettings, fit_spectrum
+        from .spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum
 
-        return HybridKind(SpectrumSettings, fit_spectrum, SpectrumHybrid.from_arrays)
-    from .measured_spectrum import MeasuredSpectrumHybrid, MeasuredSpectrumSettings, fit_measured_spectrum
+        return PhysicsKind(SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
+    from .measured_spectrum import MeasuredSpectrumPhysics, MeasuredSpectrumSettings, fit_measured_spectrum
 
     def fit(
         record: Record, rows: IntArray, scene: Any, settings: Any, seed: int, on_progress: OnProgress
-    ) -> HybridModel:
+    ) -> PhysicsModel:
         return fit_measured_spectrum(record, rows, settings, seed, on_progress)
 
-    return HybridKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumHybrid.from_arrays)
+    return PhysicsKind(MeasuredSpectrumSettings, fit, MeasuredSpectrumPhysics.from_arrays)
 
 
-KINDS: Mapping[str, Callable[[bool], HybridKind]] = {"spectrum": _for_spectra, "rssi": _for_rssi, "csi": _for_csi}
-"""The hybrid with or without a scene, by task."""
+KINDS: Mapping[str, Callable[[bool], PhysicsKind]] = {"spectrum": _for_spectra, "rssi": _for_rssi, "csi": _for_csi}
+"""The physics model with or without a scene, by task."""

@@ -1,4 +1,4 @@
-"""The hybrid for spatial spectra: a traced room of which the rest is learned.
+"""The physics model for spatial spectra: a traced room of which the rest is learned.
 
 Element signals are a coherent sum of specular paths: those of the given mesh, with displaced planes and fitted
 materials (`wrf_mi.models.physics.spectrum_fit`); those of surfaces that the mesh lacks
@@ -34,14 +34,14 @@ from .spectrum_residual import Rest
 
 Arrays = dict[str, NDArray[Any]]
 FORMAT = 2
-"""Version of `SpectrumHybrid.arrays`."""
+"""Version of `SpectrumPhysics.arrays`."""
 CHUNK_SIZE = 256
 """Transmitters that are predicted together: more are no faster each, and all would take three times their spectra."""
 
 
 @dataclass(frozen=True)
 class SpectrumSettings:
-    """Settings of the hybrid for spectra.
+    """Settings of the physics model for spectra.
 
     Attributes:
         reflections: of a path by the mesh at most.
@@ -89,7 +89,7 @@ class SpectrumSettings:
             raise InputError(f"setting validation: {self.validation}; choose more than 0 and less than 1")
 
 
-class SpectrumHybrid:
+class SpectrumPhysics:
     """Predicts spectra at any position of a transmitter.
 
     Args:
@@ -169,13 +169,13 @@ class SpectrumHybrid:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> Self:
-        """The hybrid of what `arrays` gave; ``scene`` is not needed.
+        """The physics model of what `arrays` gave; ``scene`` is not needed.
 
         Raises:
             InputError: arrays of another version.
         """
         if int(arrays.get("format", np.array(-1))) != FORMAT:
-            raise InputError(f"hybrid for spectra: format {arrays.get('format')}, not {FORMAT}; fit it again")
+            raise InputError(f"physics for spectra: format {arrays.get('format')}, not {FORMAT}; fit it again")
         models = []
         for index in range(int(arrays["receivers"])):
             own = {key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{index}/")}
@@ -221,8 +221,8 @@ def fit_spectrum(
     settings: SpectrumSettings = SpectrumSettings(),
     seed: int = 0,
     on_progress: Callable[[str, float], None] = lambda what, share: None,
-) -> SpectrumHybrid:
-    """Fit the hybrid to spectra.
+) -> SpectrumPhysics:
+    """Fit the physics model to spectra.
 
     Args:
         record: of spectra, with array and carrier.
@@ -237,7 +237,7 @@ def fit_spectrum(
     Raises:
         InputError: a record of another task, or without array or carrier.
     """
-    require(record, "spectrum", why="this hybrid predicts spectra")
+    require(record, "spectrum", why="this physics model predicts spectra")
     if any(one.array_m is None for one in record.receivers) or record.frequencies_hz is None:
         raise InputError(f"{record.name}: array or carrier unknown; state array and frequency_hz in gateway_info.yml")
     rows = np.asarray(rows, np.int64)
@@ -264,7 +264,7 @@ def fit_spectrum(
                 model, own = _fitted(model, record.tx_pos_m, spectra, usable, settings, how, heard)
             facts |= {f"{receiver.name}.{key}": value for key, value in own.items()}
         models.append(model)
-    return SpectrumHybrid(tuple(models), facts)
+    return SpectrumPhysics(tuple(models), facts)
 
 
 def _fitted(

@@ -1,9 +1,10 @@
-"""The hybrid for spectra where training rows are few: which of its parts predict is decided by rows held out.
+"""The physics model for spectra where training rows are few: which of its parts predict is decided by rows held out.
 
 A few rows tell planes and materials of the given mesh, for which there are priors, but neither further surfaces nor
-amplitudes, and none can be spared as validation rows. So all that the hybrid may become is fitted anew without each of
-some groups of rows: the room as given, the room with fitted planes and materials, kriging of the spectra, and mixes of
-the last two. What predicts the rows held out best is fitted to all rows. Rows at one place are held out together.
+amplitudes, and none can be spared as validation rows. So all that the physics model may become is fitted anew without
+each of some groups of rows: the room as given, the room with fitted planes and materials, kriging of the spectra, and
+mixes of the last two. What predicts the rows held out best is fitted to all rows. Rows at one place are held out
+together.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def groups(place_m: FloatArray, wavelength_m: float, seed: int) -> IntArray:
 
 
 def _trials(fit: Fit, model: SpectrumModel, rows: IntArray, rest: bool) -> Iterator[tuple[str, SpectrumModel]]:
-    """All that the hybrid may become, fitted to some rows, by name."""
+    """All that the physics model may become, fitted to some rows, by name."""
     yield AS_GIVEN, model
     room = fit.constants(model, rows, SCANS)
     yield "room with fitted planes and materials", room
