@@ -1,4 +1,4 @@
-"""Antennas of traced arrays: turned frames, cross-polarised links and what is said of them, the command's options."""
+"""Antennas of traced arrays: turned frames, warnings of cross-polarised links, the command's options."""
 
 from __future__ import annotations
 
@@ -74,16 +74,16 @@ def median(run: Path) -> float:
 
 
 def test_turning_the_frame_about_its_normal_rolls_the_spectrum(scene: Any) -> None:
-    """A square array sees the same sky from another azimuth: antennas that are vertical in the world stay so."""
+    """A square array sees the same sky from another azimuth if its antennas stay vertical in the world."""
     tx, turned = places(4), 90 // 3
     spectra = [spectra_of(scene, array(degrees, Antenna()), tx) for degrees in (0, 90)]
     np.testing.assert_allclose(np.roll(spectra[0], -turned, axis=-1), spectra[1], atol=1e-4)
-    own = [spectra_of(scene, array(degrees, Antenna(frame="array")), tx) for degrees in (0, 90)]
-    np.testing.assert_allclose(own[0], spectra[0], atol=1e-4)  # the array's y axis is up
-    assert np.abs(np.roll(own[0], -turned, axis=-1) - own[1]).max() > 0.1
+    framed = [spectra_of(scene, array(degrees, Antenna(frame="array")), tx) for degrees in (0, 90)]
+    np.testing.assert_allclose(framed[0], spectra[0], atol=1e-4)  # the array's y axis is up
+    assert np.abs(np.roll(framed[0], -turned, axis=-1) - framed[1]).max() > 0.1
 
 
-def test_a_turned_array_is_traced_as_it_measured(
+def test_spectra_of_a_turned_array_are_traced(
     xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert median(train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS).folder) > 0.99
@@ -125,7 +125,7 @@ def test_only_cross_polarised_receivers_are_found(scene: Any) -> None:
     assert found["gateway2"] > GAIN_DB
 
 
-def test_receivers_with_different_antennas_are_each_traced_with_their_own(scene: Any) -> None:
+def test_each_receiver_is_traced_with_its_antenna(scene: Any) -> None:
     antennas = [Antenna(), Antenna("dipole", "H"), Antenna("tr38901", "V", "array"), Antenna("hw_dipole")]
     receivers = [replace(array(20, a), name=f"gateway{i}") for i, a in enumerate(antennas)]
     tx = places(3)
@@ -135,8 +135,8 @@ def test_receivers_with_different_antennas_are_each_traced_with_their_own(scene:
         np.testing.assert_allclose(together.gain[together.rx == index], alone.gain, rtol=1e-5, atol=1e-9)
 
 
-def test_transmitters_antenna_is_traced(scene: Any) -> None:
-    """Along a horizontal line of sight a horizontal transmitter reaches a horizontal antenna alone."""
+def test_transmitters_are_traced_with_their_antenna(scene: Any) -> None:
+    """Along a horizontal line of sight a horizontal transmitter reaches a horizontal antenna only."""
     tx = np.array([[2.0, 2.4, 1.1]])
     direct = TraceOptions(max_depth=0)
     gains = {
@@ -152,9 +152,7 @@ def test_transmitters_antenna_is_traced(scene: Any) -> None:
     assert max(gains["H", "V"], gains["V", "H"]) < 1e-5 * gains["V", "V"]
 
 
-def test_a_run_predicts_with_the_antennas_that_it_was_traced_with(
-    scene: Any, xml: Path, turned_folder: Path, tmp_path: Path
-) -> None:
+def test_run_predicts_with_its_antennas(scene: Any, xml: Path, turned_folder: Path, tmp_path: Path) -> None:
 
     antennas = AntennaOptions(rx_pattern="tr38901", rx_frame="array", rx_polarization="H", tx_pattern="dipole")
     out = train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas).folder
@@ -180,14 +178,14 @@ def test_antenna_options_are_refused_where_nothing_is_traced(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
+def test_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
     antennas = AntennaOptions(rx_pattern="tr38901")
     with pytest.raises(InputError, match="state frame array"):
         train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas)
     assert not (tmp_path / "run").exists()
 
 
-def test_the_physics_follows_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_physics_has_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
     """Physics alone: its spectra are those of the ray tracer with the same antennas."""
     for name, stated in (("vertical", []), ("crossed", ["--rx-frame", "array"])):
         asked = ["train", turned_folder, "--model", "physics", "--scene", xml, "--n-train", "0", *stated]

@@ -43,7 +43,7 @@ def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
     """
     float_type = type(direction[0])
     count, paths = coefficients.shape[1], dr.width(direction[0])
-    vector_type = dr.float64_array_t(mi.Vector3f) if float_type == dr.float64_array_t(mi.Float) else mi.Vector3f
+    vector_type: Any = dr.float64_array_t(mi.Vector3f) if float_type == dr.float64_array_t(mi.Float) else mi.Vector3f
     harmonics = dr.sh_eval(vector_type(*direction), int(np.sqrt(count + 1)) - 1)[1:]
     tensor_type: Any = dr.tensor_t(float_type)
     # A matrix product: the reverse pass of a sum would have a kernel for each coefficient.

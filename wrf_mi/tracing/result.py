@@ -81,7 +81,7 @@ class TraceResult:
         Raises:
             InputError: the scene lacks an object, or has another one by that name.
         """
-        paths, first = self.paths, np.zeros(len(self.paths.object_names), np.int64)
+        paths, first = self.paths, np.zeros(len(self.paths.object_names) + 1, np.int64)
         for index, name in enumerate(paths.object_names):
             met = paths.objects == index
             if not met.any():

@@ -37,7 +37,7 @@ def open_scene(
             materials (``mat-itu_*``), or a mesh (``.stl``, ``.ply``, ``.obj``, ``.glb``).
         frequency_hz: carrier frequency; below a material's range see `set_frequency`.
         thickness_m: slab thickness of materials by name, metres, in place of the scene's.
-        material: material of a mesh: a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect`` (a conductor).
+        material: radio material of a mesh, a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect``.
 
     Returns:
         A ``sionna.rt.Scene``.
