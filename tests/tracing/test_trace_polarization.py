@@ -14,18 +14,24 @@ from calling import call
 from scipy.spatial.transform import Rotation
 from traced_rooms import SHOEBOX, write_xml
 
-from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record
+from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.core.settings import with_settings
+from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
 from wrf_mi.tracing.polarization import GAIN_DB, cross_polarized
+from wrf_mi.training.config import TrainConfig
+from wrf_mi.training.trainer import Trainer
 
 HZ = 920e6
 OPTIONS = TraceOptions(max_depth=1, rays=1 << 12)
 ARRAY_M = planar_array(4, 4, 0.16)
 STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # boresight -x, the array's y axis up
+
+
+WARNING = "try --rx-polarization H or --rx-frame world"
 
 
 @pytest.fixture(scope="module")
@@ -185,22 +191,24 @@ def test_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_p
     assert not (tmp_path / "run").exists()
 
 
-def test_physics_has_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_physics_has_the_stated_antennas_and_warns_of_crossed_ones(
+    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any
+) -> None:
     """Physics alone: its spectra are those of the ray tracer with the same antennas."""
     for name, stated in (("vertical", []), ("crossed", ["--rx-frame", "array"])):
         asked = ["train", turned_folder, "--model", "physics", "--scene", xml, "--n-train", "0", *stated]
         status, _, err = call([*asked, "--set", "reflections=1", "--out", tmp_path / name], capsys)
         assert status == 0, err
+        assert (WARNING in caplog.text) is (name == "crossed")
     assert median(tmp_path / "vertical") > median(tmp_path / "crossed") + 0.1
 
 
-@pytest.mark.parametrize("model", ["physics", "wrf-gs+"])
-def test_training_with_a_scene_warns_of_crossed_polarisation(
-    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any, model: str
+def test_joint_training_warns_of_crossed_polarisation(
+    scene: Any, turned_folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    quick = {"physics": ["--n-train", "0", "--set", "reflections=1"], "wrf-gs+": ["--set", "steps=1"]}[model]
-    asked = ["train", turned_folder, "--model", model, "--scene", xml, *quick]
-    for stated, warned in (([], False), (["--rx-frame", "array"], True)):
-        status, _, err = call([*asked, *stated, "--out", tmp_path / str(warned)], capsys)
-        assert status == 0, err
-        assert ("try --rx-polarization H or --rx-frame world" in caplog.text) is warned
+    rows = np.arange(4)
+    split = Split("all", 0, rows, rows[:0], rows[:0])
+    config = with_settings(TrainConfig(), ["model=wrf-gs+", "traced.depth=1", "traced.rays=4096"])
+    for options, warned in ((AntennaOptions(), False), (AntennaOptions(rx_frame="array"), True)):
+        Trainer(options.of(load(turned_folder)), split, config, scene=scene)
+        assert (WARNING in caplog.text) is warned
