@@ -16,9 +16,8 @@ ComplexArray = NDArray[np.complex128]
 
 WAVES_PER_CHUNK = 1 << 20
 """Pairs of path and antenna in one chunk: 16 MiB for each complex array."""
-POINT_SOURCES_BEHIND = (0, 1, 4)
-"""Kinds of interaction (`wrf_mi.core.Paths`) after which a spherical wave stays spherical: none, reflection,
-transmission."""
+SPECULAR_KINDS = (0, 1, 4)
+"""Kinds of interaction (`wrf_mi.core.Paths`) that keep a wave spherical: none, reflection, transmission."""
 
 
 def element_signals(
@@ -113,8 +112,8 @@ def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
         unfinished &= kind != 0
         radius[unfinished] += np.linalg.norm(there - here, axis=1)[unfinished]
         here = np.where(unfinished[:, None], there, here)
-        unfinished &= np.isin(kind, POINT_SOURCES_BEHIND)
-    scattered = (~np.isin(paths.interactions, POINT_SOURCES_BEHIND)).any(axis=1)
+        unfinished &= np.isin(kind, SPECULAR_KINDS)
+    scattered = (~np.isin(paths.interactions, SPECULAR_KINDS)).any(axis=1)
     return np.where(scattered, radius, paths.length_m)
 
 

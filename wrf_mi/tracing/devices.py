@@ -22,7 +22,7 @@ SOLID_M = 0.5
 """Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
 room of 3 x 3 x 2.5 m 0.94 m."""
 NEAREST_M = 0.01
-"""Shortest segment of a path: Sionna RT drops paths with a shorter one."""
+"""Shortest segment of a path that Sionna RT keeps."""
 INSIDE_M = 1e-4
 """Distance before a wall from which an antenna is traced that lies behind the wall on which it is mounted."""
 ON_M = 1e-6

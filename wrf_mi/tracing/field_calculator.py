@@ -232,7 +232,7 @@ def _any_across(direction: Vector) -> Vector:
 
 
 def _unit_or(vector: Vector, other: Vector) -> Vector:
-    """The vector normalised, or another one where it vanishes."""
+    """Normalised vector, or ``other`` where it vanishes."""
     square = _dot(vector, vector)
     usable: Any = square > ALONG
     scale = dr.rsqrt(dr.select(usable, square, 1))

@@ -1,4 +1,4 @@
-"""Specular paths from one source to many targets: possible chains, tested by Sionna RT, made exact in float64."""
+"""Specular paths from a source to many targets: possible chains, tested by Sionna RT, made exact in float64."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def shoot(
 ) -> IntArray:
     """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
-    Rays leave on a Fibonacci lattice turned at random. Where waves also go straight on (``depth`` is more than
+    Rays leave on a randomly rotated Fibonacci lattice. Where waves are also transmitted (``depth`` is more than
     ``reflections``), the rays are shot once for each choice of the hits that reflect.
 
     Args:
@@ -117,7 +117,7 @@ def _shoot(
     lookup = np.zeros(int(surfaces.shape_ids.max()) + 1, np.uint32)
     lookup[surfaces.shape_ids] = surfaces.first_face[:-1]
     first, plane = to_uint(lookup), on_device(surfaces.plane, mi.Int32)
-    # As data, not as code: one kernel serves every pattern.
+    # As data, not as code: the same kernel serves every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
     planes: list[Any] = []
@@ -189,16 +189,16 @@ def possible(
             part = members[start : start + step]
             lane = dr.arange(mi.UInt32, len(part) * count)
             row: Any = lane // count
-            place: Any = dr.gather(mi.Point3f, targets, lane - row * count)
+            point: Any = dr.gather(mi.Point3f, targets, lane - row * count)
             valid: Any = dr.full(mi.Bool, True, len(part) * count)
             for level in reversed(range(reflections)):
                 plane = dr.gather(mi.UInt32, to_uint(chains.plane[part, level]), row)
                 image: Any = dr.gather(mi.Point3f, to_vectors(chains.image[part, level], mi.Point3f), row)
                 n, d, u, v, low, high = (dr.gather(type(values), values, plane) for values in planes)
-                here, there = dr.dot(n, place) - d, dr.dot(n, image) - d
+                here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
                 valid &= here * there < 0
-                place += (image - place) * (here / (here - there))
-                along = mi.Point2f(dr.dot(u, place), dr.dot(v, place))
+                point += (image - point) * (here / (here - there))
+                along = mi.Point2f(dr.dot(u, point), dr.dot(v, point))
                 valid &= dr.all(along >= low) & dr.all(along <= high)
             kept = np.asarray(dr.compress(valid), np.int64)
             yield part[kept // count], kept % count
@@ -229,7 +229,7 @@ def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: in
     crossings: Any = dr.zeros(mi.UInt32, len(start_m))
     for _ in range(most + 1):
         hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
-        # From the start, not from the ray's own origin, which is moved off the last surface by up to a millimetre.
+        # From the start: the ray's origin is moved off the last surface by up to a millimetre.
         active &= hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
         crossings += dr.select(active, mi.UInt32(1), mi.UInt32(0))
         ray = hit.spawn_ray(direction)

@@ -140,7 +140,7 @@ def trace_paths(
 
     Raises:
         ValueError: positions of another shape or not finite.
-        InputError: no transmitter or no receiver, or one inside a solid object.
+        InputError: no transmitter or no receiver, or an antenna inside a solid object.
     """
     positions = np.atleast_2d(np.asarray(tx_pos_m, float))
     if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
