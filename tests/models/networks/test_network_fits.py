@@ -1,4 +1,4 @@
-"""Fits of VAE, DCGAN and NeRF2: that they learn, keep what they learned, and refuse what they cannot learn from.
+"""Fits of VAE, DCGAN and NeRF2: learning, stored weights, and refused data.
 
 Sanity figures of the real data, which correct versions reach: 8 spectra are fitted to a structural similarity of 0.9,
 and held-out spectra are predicted better than by the mean training spectrum (0.673 on the authors' rows of rfid-lab).
@@ -128,7 +128,7 @@ def test_rows_outside_the_split_are_not_seen(name: str, two_gateways: Record):
 
 
 @pytest.mark.parametrize("name", list(SMALL))
-def test_what_cannot_be_learned_from_is_refused(name: str, one_gateway: Record):
+def test_rows_without_positions_or_observations_are_refused(name: str, one_gateway: Record):
     method, settings = SMALL[name]
     nowhere = replace(one_gateway, tx_pos_m=np.full_like(one_gateway.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="no position in row 0"):
@@ -149,11 +149,11 @@ def test_what_cannot_be_learned_from_is_refused(name: str, one_gateway: Record):
         lambda: DcganSettings(l1=-1.0),
         lambda: Nerf2Settings(samples=0),
         lambda: Nerf2Settings(near_m=2.0, far_m=1.0),
-        lambda: Networks(layers=0),
-        lambda: Networks(scale_m=0.0),
+        lambda: Nerf2Settings(networks=Networks(layers=0)),
+        lambda: Nerf2Settings(networks=Networks(scale_m=0.0)),
     ],
 )
-def test_settings_of_no_network_are_refused(make: Callable[[], Any]):
+def test_settings_out_of_range_are_refused(make: Callable[[], Any]):
     with pytest.raises(InputError, match="choose"):
         make()
 
@@ -246,7 +246,7 @@ def test_channels_by_position_keep_their_shape():
     assert nerf2.fit(one, split, settings, 0, FitSession()).predict(inputs_of(one, split.test), 0).shape == (12, 6)
 
 
-def test_networks_of_their_own_for_each_receiver(two_gateways: Record):
+def test_networks_of_each_receiver_are_stored_and_loaded(two_gateways: Record):
     settings = replace(SMALL["nerf2"][1], steps=5, shared=False)
     fitted = nerf2.fit(two_gateways, first_rows(two_gateways, 8), settings, 0, FitSession())
     arrays = fitted.arrays()
@@ -288,7 +288,7 @@ def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
 
 @needs("flat-ble")
 @pytest.mark.slow
-def test_measured_signal_strengths_are_as_near_as_those_of_a_log_distance_fit():
+def test_measured_signal_strengths_beat_a_log_distance_fit():
     record = load("flat-ble")
     split = make_splits(record, "official")[0]
     fitted = nerf2.fit(record, split, Nerf2Settings(), 0, FitSession())

@@ -1,11 +1,11 @@
-"""A field of NeRF2 for a record's receivers: where its rays are, what they bring, what it is fitted to.
+"""A field of NeRF2 for a record's receivers: rays, reports of the instrument, and loss.
 
 Source: see `wrf_mi.models.networks.nerf2`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
-from ...core import InputError, Receiver, Record
+from ...core import InputError, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
 from ...tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
-from ...training.loop_config import COUNT, AdamConfig
+from ...training.loop_config import COUNT, POSITIVE, AdamConfig, at_least
 from ..method import Inputs
-from .coordinates import Coordinates
-from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
-from .tensors import columns
+from .coordinates import Coordinates, feature_count
+from .layers import columns
+from .nerf2_march import Nerf2Network, Networks, Rays, Seen, constant_parts, look, march
 from .training import NetworkSettings, network_adam, opaque_rows
 
 DB_UNIT = 10.0
-"""Decibels that make one unit of the loss of signal strengths."""
+"""Unit of the loss of signal strengths, dB."""
 POINTS_PER_CHUNK = 1 << 15
 """Points whose attenuation is evaluated together in predictions."""
 PAIRS_PER_CHUNK = 1 << 18
@@ -38,20 +38,21 @@ PAIRS_PER_CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Nerf2Settings(NetworkSettings):
-    """Settings of NeRF2, beside those of the loop.
+    """Settings of NeRF2 and of the training loop.
 
     Attributes:
         batch: spectra of a step, at most.
         networks: sizes of the networks.
         rays: pixels of a spectrum in a step.
         sphere_rays: rays over the full sphere, for signal strengths and channels.
-        sphere_batch: transmitters of a step, at most, for these two; with an uplink, antennas of transmitters.
+        sphere_batch: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of
+            transmitters.
         samples: points along a ray.
-        near_m: distance at which rays start.
-        far_m: distance at which they end; 0: that of the farthest training transmitter, or where positions are
-            not known `FAR_M`.
-        tx_octaves: of the encoding of transmitter positions.
-        shared: one pair of networks for all receivers, or else one for each.
+        near_m: distance from the receiver at which rays start, metres.
+        far_m: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions
+            are not known.
+        tx_octaves: octaves of the encoding of transmitter positions.
+        shared: whether all receivers share a pair of networks.
     """
 
     steps: int = 5000
@@ -68,14 +69,14 @@ class Nerf2Settings(NetworkSettings):
     tx_octaves: int = 4
     shared: bool = True
 
-    ranges = NetworkSettings.ranges | dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples"), COUNT)
+    ranges = NetworkSettings.ranges | {
+        **dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples", "networks.layers"), COUNT),
+        "networks.width": at_least(2),
+        "networks.scale_m": POSITIVE,
+    }
 
     def __post_init__(self) -> None:
-        """Refuse what is no march.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Refuse settings out of range."""
         super().__post_init__()
         if self.far_m and self.far_m <= self.near_m:
             raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
@@ -87,12 +88,13 @@ class Frame:
 
     Attributes:
         coordinates: frame of positions.
-        far_m: where rays end.
-        scales: channels of each receiver are in units of it [n_rx].
-        outputs: what rays bring.
-        task: of the record.
-        directions: of rays in the world [n_rx, rays, 3].
-        origins: of rays [n_rx, 3].
+        far_m: distance at which rays end, metres.
+        scales: unit of each receiver's channels [n_rx].
+        outputs: complex numbers that a ray brings.
+        task: task of the record.
+        condition: features of a transmitter.
+        directions: directions of rays in the world [n_rx, rays, 3].
+        origins: starting points of rays [n_rx, 3], metres.
         groups: indices of the receivers that share networks.
     """
 
@@ -101,22 +103,10 @@ class Frame:
     scales: FloatArray
     outputs: Outputs
     task: Task
+    condition: int
     directions: NDArray[np.float64]
     origins: NDArray[np.float64]
     groups: tuple[tuple[int, ...], ...]
-
-
-def world_directions(record: Record, receivers: Sequence[Receiver], sphere_rays: int) -> FloatArray:
-    """Unit vectors of each receiver's rays in the world's frame, [n_rx, rays, 3].
-
-    Those of the pixels for spectra (`wrf_mi.core.angles`), else ``sphere_rays`` over the full sphere.
-    """
-    if task_of(record).image:
-        height, width = record.observation.shape[-2:]
-        own = pixel_directions(height, width).reshape(-1, 3)
-    else:
-        own = fibonacci_sphere(sphere_rays)
-    return np.stack([own @ receiver.to_world.T for receiver in receivers])
 
 
 def frame_of(
@@ -124,39 +114,37 @@ def frame_of(
 ) -> Frame:
     """The frame for a record's receivers.
 
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
+
     Raises:
         InputError: a receiver without a pose that is needed.
     """
-    everyone = tuple(range(len(record.receivers)))
-    outputs = outputs_of(record)
+    everyone, outputs, task = tuple(range(len(record.receivers))), outputs_of(record), task_of(record)
     receivers = placed_receivers(record, outputs.by_uplink)
+    if task.image:
+        rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
+    else:
+        rays = fibonacci_sphere(settings.sphere_rays)
     return Frame(
         coordinates,
         far_m,
         scales,
         outputs,
-        task_of(record),
-        world_directions(record, receivers, settings.sphere_rays),
+        task,
+        feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1],
+        np.stack([rays @ receiver.to_world.T for receiver in receivers]),
         np.stack([receiver.position_m for receiver in receivers]),
         (everyone,) if settings.shared else tuple((r,) for r in everyone),
     )
 
 
 def device_data(frame: Frame, settings: Nerf2Settings) -> dict[str, Any]:
-    """What every evaluation needs, on the device: rays of all receivers, and the parts of `Rays` that all share."""
-    c = frame.coordinates
-    parts = constant_parts(
-        frame.origins[0],
-        c.centre_m,
-        float(np.abs(frame.origins - c.centre_m).max()) + frame.far_m,
-        settings.near_m,
-        frame.far_m,
-        settings.samples,
-        frame.outputs.frequencies_hz,
-    )
+    """Constants of every evaluation on the device: rays of all receivers, and the parts of `Rays` that all share."""
+    origins = frame.origins - frame.coordinates.centre_m
+    extent_m, frequencies_hz = float(np.abs(origins).max()) + frame.far_m, frame.outputs.frequencies_hz
+    parts = constant_parts(extent_m, settings.near_m, frame.far_m, settings.samples, frequencies_hz)
+    parts = {**parts, "origin": origins.T, "direction": frame.directions.reshape(-1, 3).T}
     data = {name: to_tensor(values) for name, values in parts.items()}
-    data["origin"] = to_tensor((frame.origins - c.centre_m).T)
-    data["direction"] = to_tensor(frame.directions.reshape(-1, 3).T)
     dr.make_opaque(data)
     return data
 
@@ -167,44 +155,45 @@ def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> 
     return Rays(columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver), **shared)
 
 
-def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
-    """What the instrument reports, from the rays' flat parts [outputs * batch * rays]; a tensor.
+def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
+    """Report of the instrument, from the rays' flat parts [outputs * batch * rays]; a tensor.
 
     Greys [batch, rays]; powers in dBm [batch, 1]; channels' real parts, then imaginary ones, [batch, 2 outputs].
     """
     outputs, batch, rays = shape
     re, im = parts
-    tensor = type(params["offset"])
+    tensor = type(offset)
     if task.image:
         return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
     # Of equal solid angle; the root keeps incoherent sums at one size for any number of rays.
     re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
     if task.in_decibel:
-        offset = dr.gather(type(re), params["offset"].array, rx)
-        power = offset + float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
+        power = dr.gather(type(re), offset.array, rx) + float(10 / np.log(10)) * dr.log(
+            re * re + im * im + SQUARED_MAGNITUDE_EPS
+        )
         return tensor(power, (batch, 1))
     both = tensor(dr.concat([re, im]), (2 * outputs, batch))
     return dr.moveaxis(both, 0, 1)
 
 
 def step_loss(
-    params: Mapping[str, Any], data: Mapping[str, Any], given: Mapping[str, Any], frame: Frame, s: Nerf2Settings
+    network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], frame: Frame, s: Nerf2Settings
 ) -> Any:
     """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
 
     Args:
-        params: weights.
-        data: of `device_data`, with ``condition`` [features, n] and ``truth`` [n_rx * n, values].
+        network: both networks.
+        data: `device_data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
         given: ``rows``, ``rays`` and ``receiver``, indices.
-        frame: of the field.
+        frame: frame of the field.
         s: settings.
     """
     tensor, rays = type(data["direction"]), dr.width(given["rays"])
-    seen = look(s.networks, params, rays_of(data, given["receiver"], given["rays"], frame.directions.shape[1]))
+    seen = look(network, rays_of(data, given["receiver"], given["rays"], frame.directions.shape[1]))
     condition = columns(data["condition"], given["rows"])
     batch = condition.shape[1]
-    parts = march(params, seen, condition, s.samples)
-    predicted = report(params, parts, frame.task, (frame.outputs.count, batch, rays), given["receiver"])
+    parts = march(network, seen, condition, s.samples)
+    predicted = report(network.offset, parts, frame.task, (frame.outputs.count, batch, rays), given["receiver"])
     values = data["truth"].shape[1]
     asked = predicted.shape[1]
     slot = dr.arange(type(given["rows"]), batch * asked)
@@ -218,52 +207,62 @@ def step_loss(
 
 
 class Field:
-    """A field that predicts: networks with their rays, and what its points were found to be.
+    """Evaluation of a field, in two steps that are recorded once for all receivers and weights.
 
     Args:
-        settings: of NeRF2.
-        frame: of the field.
+        settings: settings of NeRF2.
+        frame: frame of the field.
+
+    Attributes:
+        data: `device_data`.
+        network: networks whose weights are to be replaced.
     """
 
     def __init__(self, settings: Nerf2Settings, frame: Frame) -> None:
         self.settings, self.frame = settings, frame
         self.data = device_data(frame, settings)
-        s, count = settings, frame.directions.shape[1]
+        self.network = self.initial(np.random.default_rng(0))
+        network, s = self.network, settings
 
         @Recorded
-        def looked(params: dict[str, Any], data: dict[str, Any], receiver: Any, picked: Any) -> Any:
+        def looked(params: dict[str, Any], rays: Rays) -> Any:
             with dr.suspend_grad():
-                return look(s.networks, params, rays_of(data, receiver, picked, count))
+                return look(network.with_state(params), rays)
 
         @Recorded
         def marched(params: dict[str, Any], seen: Seen, condition: Any, receiver: Any) -> Any:
             with dr.suspend_grad():
-                batch, rays = condition.shape[1], seen.own.shape[1] // s.samples
-                parts = march(params, seen, condition, s.samples)
-                return report(params, parts, frame.task, (frame.outputs.count, batch, rays), receiver)
+                batch, rays = condition.shape[1], seen.first.shape[1] // s.samples
+                parts = march(network.with_state(params), seen, condition, s.samples)
+                return report(params["offset"], parts, frame.task, (frame.outputs.count, batch, rays), receiver)
 
         self._looked, self._marched = looked, marched
 
-    def look(self, params: Mapping[str, Any], receiver: int, rays: IntArray | None = None) -> list[Seen]:
-        """What the points of a receiver's rays, all by default, are: in parts for spectra, else in one."""
-        everything = np.arange(self.frame.directions.shape[1]) if rays is None else rays
-        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
-        count = -(-len(everything) // most) if self.frame.task.image else 1
-        index = dr.opaque(mi.UInt32, receiver)
-        return [
-            self._looked(dict(params), self.data, index, opaque_rows(part))
-            for part in np.array_split(everything, count)
-        ]
+    def initial(self, rng: np.random.Generator) -> Nerf2Network:
+        """Networks with random weights."""
+        frame = self.frame
+        return Nerf2Network(self.settings.networks, frame.condition, frame.outputs.count, len(frame.origins), rng)
 
-    def march(self, params: Mapping[str, Any], seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
-        """What the instrument reports for conditions [features, m]: [m, values]."""
+    def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
+        """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
+        count, index = self.frame.directions.shape[1], dr.opaque(mi.UInt32, receiver)
+        everything = np.arange(count) if rays is None else rays
+        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
+        chunks = np.array_split(everything, -(-len(everything) // most) if self.frame.task.image else 1)
+        parts = [rays_of(self.data, index, opaque_rows(chunk), count) for chunk in chunks]
+        # Shapes of results are recorded for the shapes of tensors, and not of arrays.
+        dr.eval(parts)
+        return [self._looked(network.state(), part) for part in parts]
+
+    def march(self, network: Nerf2Network, seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
+        """Reports of the instrument for conditions [features, m]: [m, values]."""
         m, index = condition.shape[1], dr.opaque(mi.UInt32, receiver)
         blocks = []
-        at_once = max(1, PAIRS_PER_CHUNK // max(part.own.shape[1] for part in seen))
-        for first in range(0, m, at_once):
-            chosen = columns(condition, opaque_rows(np.arange(first, min(m, first + at_once))))
+        at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in seen))
+        for start in range(0, m, at_once):
+            chosen = columns(condition, opaque_rows(np.arange(start, min(m, start + at_once))))
             dr.eval(chosen)
-            reports = [self._marched(dict(params), part, chosen, index).numpy() for part in seen]
+            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in seen]
             blocks.append(np.concatenate(reports, axis=1))
         return np.concatenate(blocks)
 
@@ -271,7 +270,7 @@ class Field:
 def condition_of(
     frame: Frame, settings: Nerf2Settings, inputs: Inputs, receiver: int
 ) -> tuple[Any, NDArray[Any] | float]:
-    """What the radiance network knows of transmitters [features, m], and what channels are multiplied by.
+    """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
 
     Raises:
         InputError: no uplink, where one is needed.
