@@ -20,7 +20,7 @@ _OWN: Mapping[str, Model | Method | str] = {
     "physics": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:METHOD",
-    "kriging": "wrf_mi.models.interpolation.kriging_model:METHOD",
+    "kriging": "wrf_mi.models.interpolation.kriging:METHOD",
     "trees": "wrf_mi.models.interpolation.trees:METHOD",
     "mri": "wrf_mi.models.interpolation.mri:METHOD",
     "vae": "wrf_mi.models.networks.vae:METHOD",
