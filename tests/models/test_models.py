@@ -101,7 +101,7 @@ def test_registered_model_is_trained_resumed_evaluated_asked_and_compared(
     one = open_run(out).predict(record.tx_pos_m[:1], "anchor1")
     nearest = np.argsort(np.linalg.norm(record.tx_pos_m[:24] - record.tx_pos_m[0], axis=1))[:2]
     assert one.mean == pytest.approx([record.observation[0, nearest].mean()])
-    with pytest.raises(InputError, match="does not know how the transmitter is turned; leave heading_rad away"):
+    with pytest.raises(InputError, match="does not know how the transmitter is turned; omit heading_rad"):
         run.predict(record.tx_pos_m[:1], 0, [0.5])
     other = train(flat_folder, tmp_path / "blocked", "nearest", split="blocked")
     compare([out, other.folder], tmp_path / "page")

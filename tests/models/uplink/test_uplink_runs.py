@@ -161,7 +161,7 @@ def test_inputs_of_uplinks_that_are_refused(
         ({"uplink": broken}, "row 2: uplink is not finite; correct or remove the row"),
         ({"uplink": good, "tx_pos": np.zeros((3, 3))}, "2 rows of uplink and 3 positions"),
         ({"uplink": good[:0]}, "no positions"),
-        ({"uplink": good, "tx_pos": np.zeros((2, 3))}, "which has no uplink; leave uplink away"),
+        ({"uplink": good, "tx_pos": np.zeros((2, 3))}, "which has no uplink; omit uplink"),
     ):
         np.savez(tmp_path / "in.npz", **arrays)
         refused(["predict", run, "--input", tmp_path / "in.npz", "--out", tmp_path / "out.npz"], message, capsys)

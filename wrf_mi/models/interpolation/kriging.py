@@ -331,7 +331,7 @@ def _trend(name: str, receiver: Receiver) -> Trend:
 
 def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitSingle:
     if s.heading_length is not None and record.tx_heading_rad is None:
-        raise InputError(f"{record.name}: has no headings for kriging's heading_length; leave the setting away")
+        raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
     how = cast(Literal["gls", "ols"], s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls"))
     if name not in (CONSTANT, LOG_DISTANCE):
