@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Record, Split
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
+from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..training.session import FitSession
 
+Settings = TypeVar("Settings")
 OnProgress = Callable[[str, float], None]
 """Progress callback: stage, and fraction of it that is done, 0 to 1."""
 PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
@@ -91,3 +95,53 @@ class Method:
     source: str
     needs_uplink: bool = False
     several_carriers: bool = False
+
+
+def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
+    """Rows that a receiver received: those that train at first, and those that choose settings.
+
+    Without the former, the latter train.
+
+    Raises:
+        InputError: fewer than two rows.
+    """
+    received = np.isfinite(record.observation[receiver]).reshape(len(record), -1).all(axis=1)
+    train, validation = (rows[received[rows]] for rows in (split.train, split.validation))
+    count = len(train) + len(validation)
+    if count < 2:
+        who = record.receivers[receiver].name
+        raise InputError(f"{record.name}: receiver {who} received {count} training row; {name} needs two at least")
+    return (train, validation) if len(train) else (validation, train)
+
+
+def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
+    """Positions of the transmitter in some rows [n, 3], metres.
+
+    Raises:
+        InputError: unknown positions.
+    """
+    unknown = rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)]
+    if len(unknown):
+        text = f"no position in row {unknown[0]}: positions are not known, from which {name} predicts"
+        raise InputError(f"{record.name} has {text}; choose another model")
+    return record.tx_pos_m[rows]
+
+
+def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays with a prefix before their names."""
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
+
+
+def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def settings_array(settings: Any) -> NDArray[Any]:
+    """Settings as an array of a run file."""
+    return np.asarray(json.dumps(asdict(settings)))
+
+
+def stored_settings(kind: type[Settings], arrays: Mapping[str, NDArray[Any]], name: str) -> Settings:
+    """Settings of a run file, from `settings_array`."""
+    return settings_from(kind, json.loads(str(arrays["settings"])), name)

@@ -31,7 +31,7 @@ from ...training.reach import Reach
 from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
-from ..method import Inputs
+from ..method import Inputs, keyed, under
 from ..model import Arrays, Fitted, Model, Problem, Session
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
@@ -61,8 +61,7 @@ class FittedField(Fitted):
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
         alone = config.model == PATHS_ALONE
         self.field = None if alone else make_field(config, self.form.components, self.form.features)
-        params = {key.removeprefix(PARAM): values for key, values in arrays.items() if key.startswith(PARAM)}
-        self.params: Params = params or unpack_params(arrays)
+        self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
         self.uses_heading = self.form.headings
 
     @cached_property
@@ -136,7 +135,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     if not trainer.run(on_progress, lambda: write_checkpoint(folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
     arrays: Arrays = {
-        **{f"{PARAM}{name}": values for name, values in trainer.state.mean_params().items()},
+        **keyed(PARAM, trainer.state.mean_params()),
         **trainer.graph.form.arrays(),
         "tx_antenna": np.asarray(astuple(record.tx_antenna)),
         **receiver_arrays(trainer.graph.receivers),

@@ -14,7 +14,7 @@ from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, Method
+from ..method import Inputs, Method, keyed, known_positions, under
 
 HEADING, CARRIERS = "heading", "carriers_hz"
 """Keys of the arrays: whether headings are used, and the carriers where there are several."""
@@ -100,9 +100,12 @@ class ByReceiver:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of all models, use of headings, and carriers."""
-        arrays = {f"{r}/{key}": value for r, model in enumerate(self.models) for key, value in model.arrays().items()}
-        carriers = {} if self.carriers_hz is None else {CARRIERS: self.carriers_hz}
-        return {HEADING: np.asarray(self.heading), **carriers, **arrays}
+        arrays = {HEADING: np.asarray(self.heading)}
+        if self.carriers_hz is not None:
+            arrays[CARRIERS] = self.carriers_hz
+        for number, model in enumerate(self.models):
+            arrays |= keyed(f"{number}/", model.arrays())
+        return arrays
 
 
 def method_by_receiver(
@@ -128,9 +131,7 @@ def method_by_receiver(
 
     def fit(record: Record, split: Split, settings: Any, seed: int, session: FitSession) -> ByReceiver:
         rows, stated = split.all_train, record.carriers_hz
-        if not np.isfinite(record.tx_pos_m[rows]).all():
-            text = f"positions are not known, from which {name} predicts; choose another model"
-            raise InputError(f"{record.name}: {text}")
+        known_positions(record, rows, name)
         fit_single = fitter(record, split, settings, seed)
         headings = record.tx_heading_rad if heading(record, settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
@@ -149,11 +150,9 @@ def method_by_receiver(
         return ByReceiver(name, models, headings is not None, carriers)
 
     def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
-        models, carriers = [], arrays.get(CARRIERS)
-        for number, receiver in enumerate(record.receivers * (1 if carriers is None else len(carriers))):
-            prefix = f"{number}/"
-            kept = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-            models.append(load_single(receiver, kept))
+        carriers = arrays.get(CARRIERS)
+        receivers = record.receivers * (1 if carriers is None else len(carriers))
+        models = [load_single(receiver, under(f"{number}/", arrays)) for number, receiver in enumerate(receivers)]
         return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
 
     return Method(name, tasks, settings, fit, load, source, several_carriers=True)

@@ -30,22 +30,22 @@ from ...core import Record, Split
 from ...core.types import IntArray
 from ...tasks.conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
-from ..method import Inputs, Method, inputs_of
+from ..method import (
+    Inputs,
+    Method,
+    inputs_of,
+    keyed,
+    known_positions,
+    received_rows,
+    settings_array,
+    stored_settings,
+    under,
+)
 from .coordinates import Coordinates
 from .layers import columns
 from .nerf2_field import Field, Nerf2Settings, condition_of, frame_of, step_loss
 from .nerf2_march import Nerf2Network, Seen
-from .training import (
-    Network,
-    keyed,
-    opaque_rows,
-    positions,
-    settings_array,
-    stored_settings,
-    train_network,
-    under,
-    usable_rows,
-)
+from .training import Network, opaque_rows, train_network
 
 SCORED_RAYS = 512
 """Pixels of each validation spectrum by which steps are chosen."""
@@ -103,7 +103,7 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, sessio
     """
     known = split.all_train
     outputs = outputs_of(record)
-    where = record.tx_pos_m[known] if outputs.by_uplink else positions(record, "nerf2")[known]
+    where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
     known_rx = np.stack([receiver.position_m for receiver in record.receivers])
     rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
     if np.isfinite(where).all() and np.isfinite(known_rx).all():
@@ -123,7 +123,9 @@ def _fit_group(
     s, frame, outputs = field.settings, field.frame, field.frame.outputs
     known = split.all_train
     # From here on rows count within the training rows.
-    rows = {r: tuple(np.searchsorted(known, part) for part in usable_rows(record, split, r, "nerf2")) for r in members}
+    rows = {
+        r: tuple(np.searchsorted(known, part) for part in received_rows(record, split, r, "nerf2")) for r in members
+    }
     rng = np.random.default_rng([seed, *members])
     condition, _ = condition_of(frame, s, inputs_of(record, known), members[0])
     truth = np.concatenate([truth_of(record, outputs, r, known, frame.scales) for r in range(len(record.receivers))])
@@ -176,11 +178,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
     return FittedNerf2(field, networks, record.observation.shape[2:])
 
 
-METHOD = Method(
-    "nerf2",
-    ("spectrum", "rssi", "csi"),
-    Nerf2Settings,
-    fit,
-    load,
-    "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code",
-)
+SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
+METHOD = Method("nerf2", ("spectrum", "rssi", "csi"), Nerf2Settings, fit, load, SOURCE)

@@ -16,9 +16,9 @@ from ...core import Record, Split
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
-from ..method import Inputs, Method
+from ..method import Inputs, Method, keyed, known_positions, received_rows, settings_array, stored_settings, under
 from .coordinates import Coordinates
-from .training import Network, keyed, positions, settings_array, stored_settings, train_network, under, usable_rows
+from .training import Network, train_network
 
 SPECTRUM = TASKS["spectrum"]
 
@@ -127,10 +127,10 @@ class FittedNetworks:
 def _fit(
     kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, session: FitSession
 ) -> FittedNetworks:
-    coordinates = Coordinates.of(positions(record, kind.name)[split.all_train])
+    coordinates = Coordinates.of(known_positions(record, split.all_train, kind.name))
     generators = []
     for r, receiver in enumerate(record.receivers):
-        train, validation = usable_rows(record, split, r, kind.name)
+        train, validation = received_rows(record, split, r, kind.name)
         known = np.concatenate([train, validation])
         where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
         rows = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))

@@ -7,20 +7,16 @@ rate that falls to zero, for a share of the steps that led there.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, TypeVar
+from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
-from numpy.typing import NDArray
 
 from ...backend.recorded import Recorded
-from ...core import InputError, Record, Split
-from ...core.settings import settings_from
 from ...core.types import IntArray
 from ...training.adam import NonFiniteReport, Params, guarded_step, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
@@ -29,9 +25,9 @@ from ...training.loop_config import POSITIVE, AdamConfig, LoopConfig
 from ...training.schedule import plan
 from ...training.session import FitSession
 from ...training.state import FitState
+from ..method import keyed, under
 from .layers import Module
 
-Settings = TypeVar("Settings")
 HOLD_OUT = 0.8
 """Share of the steps with a constant rate and validation rows kept out of training."""
 FINISHED = "finished/"
@@ -124,14 +120,14 @@ class NetworkTrainer(TrainingLoop):
             factor: Any,
             decay: Any,
             number: Any,
-            trouble: NonFiniteReport,
+            report: NonFiniteReport,
         ) -> tuple[Params, NonFiniteReport, Any]:
             params = rated_params(adam, rates, factor)
             loss = loss_of(module.with_state(params), data, given)
-            mean, trouble, _ = guarded_step(adam, params, loss, mean, decay, number, trouble)
+            mean, report, _ = guarded_step(adam, params, loss, mean, decay, number, report)
             loss = dr.detach(loss)
-            dr.eval(adam, mean, trouble, loss)
-            return mean, trouble, loss
+            dr.eval(adam, mean, report, loss)
+            return mean, report, loss
 
         self._step = Recorded(step)
 
@@ -204,56 +200,6 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     return network.module.on_device(weights), score
 
 
-def usable_rows(record: Record, split: Split, receiver: int, what: str) -> tuple[IntArray, IntArray]:
-    """Rows that a receiver received: those that train at first, and those that choose the number of steps.
-
-    Raises:
-        InputError: fewer than two rows.
-    """
-    seen = np.isfinite(record.observation[receiver]).reshape(len(record), -1).all(axis=1)
-    train, validation = (rows[seen[rows]] for rows in (split.train, split.validation))
-    if len(train) == 0:
-        train, validation = validation, train
-    name = record.receivers[receiver].name
-    if len(train) == 0:
-        raise InputError(f"{what}: receiver {name} received no training row of {record.name}; use another split")
-    if len(train) + len(validation) == 1:
-        raise InputError(f"{what}: receiver {name} has one training row of {record.name}; nothing varies, use more")
-    return train, validation
-
-
-def positions(record: Record, what: str) -> NDArray[np.float64]:
-    """Positions of the transmitter [n, 3], metres.
-
-    Raises:
-        InputError: unknown positions.
-    """
-    if not np.isfinite(record.tx_pos_m).all():
-        row = int(np.flatnonzero(~np.isfinite(record.tx_pos_m).all(axis=1))[0])
-        raise InputError(f"{what}: {record.name} has no position in row {row}; choose a method that needs none")
-    return record.tx_pos_m
-
-
 def opaque_rows(rows: IntArray) -> Any:
     """Indices as an evaluated Dr.Jit array."""
     return mi.UInt32(np.asarray(rows).tolist())
-
-
-def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Arrays with a prefix before their names."""
-    return {f"{prefix}{name}": values for name, values in arrays.items()}
-
-
-def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
-    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
-
-
-def settings_array(settings: Any) -> NDArray[Any]:
-    """Settings as an array of a run file."""
-    return np.asarray(json.dumps(asdict(settings)))
-
-
-def stored_settings(kind: type[Settings], arrays: Mapping[str, NDArray[Any]], name: str) -> Settings:
-    """Settings of a run file, from `settings_array`."""
-    return settings_from(kind, json.loads(str(arrays["settings"])), name)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..method import Inputs
+from ..method import Inputs, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -98,9 +98,7 @@ def principal(elements_m: FloatArray) -> FloatArray:
 
 
 def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Received rows that train at first, and received rows that choose settings.
-
-    Without the former, the latter train.
+    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.method.received_rows`.
 
     Raises:
         InputError: several receivers, no axis of antennas, or fewer than two rows.
@@ -111,12 +109,7 @@ def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntAr
             f"{record.name}: channel coefficients {list(shape)}; {name} needs one receiver with the antennas "
             "that the uplink has, [1, rows, antennas, subcarriers]"
         )
-    received = np.isfinite(record.observation[0]).all(axis=(1, 2))
-    train, validation = split.train[received[split.train]], split.validation[received[split.validation]]
-    count = len(train) + len(validation)
-    if count < 2:
-        raise InputError(f"{record.name}: {count} training row; {name} needs two at least")
-    return (train, validation) if len(train) else (validation, train)
+    return received_rows(record, split, 0, name)
 
 
 def uplink_of(inputs: Inputs) -> NDArray[np.complex128]:

@@ -30,18 +30,9 @@ from ...core import Record, Split
 from ...core.types import IntArray
 from ...training.loop_config import COUNT, POSITIVE
 from ...training.session import FitSession
-from ..method import Inputs, Method
+from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
 from ..networks.layers import Linear, Mlp, Module, columns
-from ..networks.training import (
-    Network,
-    NetworkSettings,
-    keyed,
-    opaque_rows,
-    settings_array,
-    stored_settings,
-    train_network,
-    under,
-)
+from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
 from .csi_bands import Bands, bands_of, known_rows, relative_error, uplink_of
 
@@ -193,11 +184,7 @@ def predict_samples(
 
 
 def fit(record: Record, split: Split, settings: FireSettings, seed: int, session: FitSession) -> FittedFire:
-    """Fit a network, or two of which the better is kept.
-
-    Raises:
-        InputError: several receivers, no axis of antennas, or one training row.
-    """
+    """Fit a network, or two of which the better is kept."""
     train, validation = known_rows(METHOD.name, record, split)
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
@@ -269,12 +256,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
     return FittedFire(str(arrays["sample"]), fire, bands, settings)
 
 
-METHOD = Method(
-    name="fire",
-    tasks=("csi",),
-    settings=FireSettings,
-    fit=fit,
-    load=load,
-    source="Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)",
-    needs_uplink=True,
-)
+SOURCE = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
+METHOD = Method("fire", ("csi",), FireSettings, fit, load, SOURCE, needs_uplink=True)

@@ -132,11 +132,7 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
 
 
 def fit(record: Record, split: Split, settings: LinearSettings, seed: int, session: FitSession) -> LinearMap:
-    """Choose the penalty, then fit the map to all training rows.
-
-    Raises:
-        InputError: several receivers, no axis of antennas, one training row, or downlinks without energy.
-    """
+    """Choose the penalty, then fit the map to all training rows."""
     train, validation = known_rows(METHOD.name, record, split)
     known = np.concatenate([train, validation])
     if not len(validation):
@@ -153,12 +149,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> LinearMap:
     return LinearMap(np.asarray(arrays["matrix"], complex), int(arrays["antennas"]), float(arrays["penalty"]))
 
 
-METHOD = Method(
-    name="linear",
-    tasks=("csi",),
-    settings=LinearSettings,
-    fit=fit,
-    load=load,
-    source="Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12",
-    needs_uplink=True,
-)
+SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
+METHOD = Method("linear", ("csi",), LinearSettings, fit, load, SOURCE, needs_uplink=True)

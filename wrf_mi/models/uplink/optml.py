@@ -26,8 +26,8 @@ from ...core import Record, Split
 from ...core.angles import FloatArray
 from ...training.loop_config import COUNT, AdamConfig, at_least
 from ...training.session import FitSession
-from ..method import Inputs, Method
-from ..networks.training import NetworkSettings, keyed, network_adam, settings_array, stored_settings, under
+from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
+from ..networks.training import NetworkSettings, network_adam
 from .cross_band import PathSettings, choose
 from .csi_bands import Bands, uplink_of
 from .path_network import PathFinder, PathMap, Simulation, fit_paths
@@ -128,11 +128,7 @@ def prune(
 
 
 def fit(record: Record, split: Split, settings: OptMLSettings, seed: int, session: FitSession) -> OptML:
-    """Choose the wave model on validation rows, then learn from simulated channels.
-
-    Raises:
-        InputError: several receivers, no axis of antennas, one training row, or bands that do not fit the data.
-    """
+    """Choose the wave model on validation rows, then learn from simulated channels."""
     kind, bands = choose(METHOD.name, record, split, settings, session.report)
     waves = waves_of(kind, bands, settings.max_distance_m)
     network = fit_paths(waves, bands, settings.simulation, settings.width, settings, seed, session)
@@ -147,12 +143,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
     return OptML(kind, bands, settings, network)
 
 
-METHOD = Method(
-    name="optml",
-    tasks=("csi",),
-    settings=OptMLSettings,
-    fit=fit,
-    load=load,
-    source="Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)",
-    needs_uplink=True,
-)
+SOURCE = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
+METHOD = Method("optml", ("csi",), OptMLSettings, fit, load, SOURCE, needs_uplink=True)

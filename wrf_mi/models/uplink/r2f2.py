@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from ...core import Record, Split
 from ...training.session import FitSession
-from ..method import Inputs, Method
-from ..networks.training import keyed, under
+from ..method import Inputs, Method, keyed, under
 from .cross_band import PathSettings, choose
 from .csi_bands import Bands, uplink_of
 from .uplink_paths import find_paths
@@ -66,11 +65,7 @@ class R2F2:
 
 
 def fit(record: Record, split: Split, settings: R2F2Settings, seed: int, session: FitSession) -> R2F2:
-    """Choose the wave model and, where frequencies are unknown, the bands.
-
-    Raises:
-        InputError: several receivers, no axis of antennas, one training row, or bands that do not fit the data.
-    """
+    """Choose the wave model and, where frequencies are unknown, the bands."""
     return R2F2(*choose(METHOD.name, record, split, settings, session.report), settings)
 
 
@@ -80,12 +75,5 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> R2F2:
     return R2F2(*Bands.load(arrays), R2F2Settings(**settings))
 
 
-METHOD = Method(
-    name="r2f2",
-    tasks=("csi",),
-    settings=R2F2Settings,
-    fit=fit,
-    load=load,
-    source="Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)",
-    needs_uplink=True,
-)
+SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
+METHOD = Method("r2f2", ("csi",), R2F2Settings, fit, load, SOURCE, needs_uplink=True)
