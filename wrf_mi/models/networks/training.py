@@ -113,18 +113,11 @@ class NetworkTrainer(TrainingLoop):
         rates, module = {name: special.get(name, rate) for name in self.state.adam}, self.network.module
 
         def step(
-            adam: Adam,
-            mean: Params,
-            data: Any,
-            given: Any,
-            factor: Any,
-            decay: Any,
-            number: Any,
-            report: NonFiniteReport,
+            adam: Adam, mean: Params, data: Any, given: Any, factor: Any, decay: Any, t: Any, report: NonFiniteReport
         ) -> tuple[Params, NonFiniteReport, Any]:
             params = rated_params(adam, rates, factor)
             loss = loss_of(module.with_state(params), data, given)
-            mean, report, _ = guarded_step(adam, params, loss, mean, decay, number, report)
+            mean, report, _ = guarded_step(adam, params, loss, mean, decay, t, report)
             loss = dr.detach(loss)
             dr.eval(adam, mean, report, loss)
             return mean, report, loss
