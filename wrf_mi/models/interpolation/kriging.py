@@ -103,8 +103,8 @@ class KrigedMean:
             had = "no headings" if self.circle is None else "headings"
             raise InputError(f"kriging: fitted with {had}; predict with the same")
         turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
-        asked = _coordinates(positions_m, turned, self.lengths)
-        return correlation(asked, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
+        requested = _coordinates(positions_m, turned, self.lengths)
+        return correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
         """Observations [m, ...], see `Kriging.predict`."""
@@ -170,7 +170,7 @@ class Kriging:
         self.likelihood_rows, self.seed = likelihood_rows, seed
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
-        """Choose what is to be chosen and factor the covariance of the rows that were observed.
+        """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
 
         Args:
             tx_pos: shape [n, 3], metres.
@@ -204,7 +204,7 @@ class Kriging:
         rows = self._lengths, self._positions, self._circle
         self.mean = KrigedMean(self.kernel, *rows, coefficients, weights, like, self.trend)
         quadratic = (field.conj() * weights).real.sum(axis=0)
-        # The trend's own degrees of freedom leave the residual too small by their share.
+        # The trend's degrees of freedom make the residual too small by their share.
         self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
         return self
 

@@ -19,7 +19,7 @@ relu = nn.ReLU()
 
 
 class Module:
-    """A network or a part of one: every array among its attributes is a weight.
+    """A network or a part of a network: every array among its attributes is a weight.
 
     Weights have dotted paths of attribute names: ``q.out.bias`` is the bias of the layer ``out`` of the module ``q``.
     Modules of a list ``norm`` are ``norm0``, ``norm1``, ...; those of a list ``layers`` are ``0``, ``1``, ... A

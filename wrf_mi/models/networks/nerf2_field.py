@@ -195,11 +195,11 @@ def step_loss(
     parts = march(network, seen, condition, s.samples)
     predicted = report(network.offset, parts, frame.task, (frame.outputs.count, batch, rays), given["receiver"])
     values = data["truth"].shape[1]
-    asked = predicted.shape[1]
-    slot = dr.arange(type(given["rows"]), batch * asked)
-    row = dr.gather(type(slot), given["rows"], slot // asked) + given["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), given["rays"], slot % asked) if frame.task.image else slot % asked
-    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, asked))
+    reported = predicted.shape[1]
+    slot = dr.arange(type(given["rows"]), batch * reported)
+    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
+    column = dr.gather(type(slot), given["rays"], slot % reported) if frame.task.image else slot % reported
+    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
     error = predicted - truth
     if frame.task.in_decibel:
         error = error * (1 / DB_UNIT)

@@ -51,7 +51,7 @@ class NetworkSettings(LoopConfig):
 
 @dataclass(frozen=True)
 class Network:
-    """A network and what it is trained with.
+    """A network with its loss, data and score.
 
     Attributes:
         name: name for progress and checkpoint.
@@ -127,7 +127,7 @@ class NetworkTrainer(TrainingLoop):
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the next step of the schedule; returns the loss."""
         state, schedule, t = self.state, self.schedule, self.state.step
-        # A generator of its own for each step: a resumed training draws what an uninterrupted one would.
+        # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
         state.mean, trouble, loss = self._step(
             state.adam,
@@ -148,7 +148,7 @@ class NetworkTrainer(TrainingLoop):
 
 
 def train_network(network: Network, config: LoopConfig, seed: Sequence[int], session: FitSession) -> tuple[Any, float]:
-    """Train a network, from its checkpoint in the session's folder if there is one.
+    """Train a network, from its checkpoint in the session's folder if it exists.
 
     Networks of one fit differ in their names and share that file, in which finished ones stay.
 

@@ -118,7 +118,7 @@ def uplink_of(inputs: Inputs) -> NDArray[np.complex128]:
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
-    """Squared error over energy of coefficients, summed over the last axis: what CEA is the logarithm of."""
+    """Squared error over energy of coefficients, summed over the last axis: CEA in linear units."""
     power = np.square(np.abs(truth)).sum(axis=-1)
     error = np.square(np.abs(prediction - truth)).sum(axis=-1)
     return np.asarray(error / np.maximum(power, np.finfo(np.float32).tiny))

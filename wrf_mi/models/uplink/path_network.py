@@ -89,9 +89,9 @@ def simulate(
         level[:, 0] = 0
         gains = 10 ** (level / 20) * np.exp(2j * np.pi * rng.random((n, k))) * present
         h = np.empty((n, bands.antennas, len(bands.uplink_hz)), complex)
+        gains = gains[..., None]
         if not isinstance(waves, ArrayWaves):
-            fading = rng.standard_normal((n, k, bands.antennas, 2)) @ np.array([1, 1j]) / np.sqrt(2)
-            gains = gains[..., None] * fading
+            gains = gains * (rng.standard_normal((n, k, bands.antennas, 2)) @ np.array([1, 1j]) / np.sqrt(2))
         for row in range(n):
             h[row] = waves.evaluate(theta[row : row + 1], gains[row : row + 1], bands.uplink_hz)[0]
         ratio = rng.uniform(*simulation.noise_db, (n, 1, 1))

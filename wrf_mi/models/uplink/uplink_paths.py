@@ -45,7 +45,7 @@ class Paths:
     Attributes:
         theta: parameters [n, k, p], see `Waves`.
         present: whether a row has each of the k paths, [n, k].
-        gains: complex gains [n, k] or [n, k, antennas].
+        gains: complex gains [n, k, antennas], or [n, k, 1] for all antennas.
     """
 
     theta: FloatArray

@@ -13,8 +13,9 @@ pseudo-inverses and nonlinear least squares problems whose variables separate", 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +42,9 @@ class Solved:
     """Best gains for some paths.
 
     Attributes:
-        gains: [n, paths] or [n, paths, antennas].
+        gains: complex gains [n, paths, antennas], or [n, paths, 1] for all antennas.
         residual: uplink minus the paths [n, antennas, f].
-        atoms: coefficients of the paths at unit gain.
+        atoms: `Waves.unit` of the paths, 0 for absent ones.
         gram: products of the atoms [n, paths, paths].
     """
 
@@ -58,7 +59,7 @@ class Solved:
         return np.asarray(np.square(np.abs(self.residual)).sum(axis=(1, 2)))
 
 
-class Waves(Protocol):
+class Waves(ABC):
     """A wave model; parameters of paths are [n, paths, p], present paths marked in [n, paths].
 
     Attributes:
@@ -73,18 +74,34 @@ class Waves(Protocol):
     cosines: FloatArray
     lattice: NDArray[np.int64]
 
+    @abstractmethod
     def power(self, residual: Complex) -> FloatArray:
         """Power of a residual in each cell of the grid, [n, distances, cells]: a matched filter."""
 
+    @abstractmethod
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, f] or, with one gain for all antennas, antennas * f."""
+
     def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
         """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
+        atoms = self.unit(theta) * present[..., None]
+        count = atoms.shape[2]
+        left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
+        gram, diagonal = left @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
+        # The atoms of absent paths are zero: 1 on the diagonal keeps the matrix regular and their gains zero.
+        gram[:, diagonal, diagonal] += ~present
+        gains = _solve(gram, left @ right, ridge, count)
+        return Solved(gains, h - (gains.transpose(0, 2, 1) @ atoms).reshape(h.shape), atoms, gram)
 
+    @abstractmethod
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
         """Normal matrix [n, m, m] and right side [n, m] of a Gauss-Newton step of all m = paths * p parameters."""
 
+    @abstractmethod
     def limit(self, theta: FloatArray) -> FloatArray:
         """Parameters limited to the domain of the model."""
 
+    @abstractmethod
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
         """Coefficients [n, antennas, frequencies]."""
 
@@ -128,14 +145,7 @@ def _turn(angle: FloatArray) -> Complex:
     return turned
 
 
-def _mark_absent(gram: Complex, present: Mask) -> Complex:
-    """Gram matrix with 1 on the diagonal of absent paths, which keeps it regular and their gains zero."""
-    diagonal = np.arange(gram.shape[-1])
-    gram[:, diagonal, diagonal] += ~present
-    return gram
-
-
-class FreeWaves:
+class FreeWaves(Waves):
     """Paths with a delay that all antennas share and a gain for each antenna."""
 
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
@@ -150,12 +160,9 @@ class FreeWaves:
         """Power of a residual in each cell of the grid, [n, distances, cells]."""
         return np.asarray(np.square(np.abs(residual @ self.steering.conj().T)).sum(axis=1)[:, :, None])
 
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """Gains that fit an uplink [n, antennas, f] best."""
-        atoms = np.exp(theta * self.slope) * present[..., None]
-        gram = _mark_absent(atoms.conj() @ atoms.transpose(0, 2, 1), present)
-        gains = _solve(gram, atoms.conj() @ h.transpose(0, 2, 1), ridge, len(self.slope))
-        return Solved(gains, h - gains.transpose(0, 2, 1) @ atoms, atoms, gram)
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, f]."""
+        return np.asarray(np.exp(theta * self.slope))
 
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right side of a Gauss-Newton step."""
@@ -177,7 +184,7 @@ class FreeWaves:
         return np.asarray(gains.transpose(0, 2, 1) @ np.exp(theta * slope))
 
 
-class ArrayWaves:
+class ArrayWaves(Waves):
     """Paths with a gain, a distance and a direction, at an array of known elements."""
 
     def __init__(self, bands: Bands, max_distance_m: float, spherical: bool) -> None:
@@ -277,16 +284,9 @@ class ArrayWaves:
             power[:, index] = np.square(np.abs(combined[:, :, index] @ steering))
         return power
 
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """Gains that fit an uplink [n, antennas, f] best."""
-        n, paths = present.shape
-        atoms = self.atoms(theta, self.frequencies).reshape(n, paths, -1) * present[..., None]
-        flat = h.reshape(n, -1, 1)
-        left = atoms.conj()
-        gram = _mark_absent(left @ atoms.transpose(0, 2, 1), present)
-        gains = _solve(gram, left @ flat, ridge, flat.shape[1])[..., 0]
-        residual = h - (gains[:, None] @ atoms).reshape(h.shape)
-        return Solved(gains, residual, atoms, gram)
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, antennas * f]."""
+        return self.atoms(theta, self.frequencies).reshape(*theta.shape[:2], -1)
 
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right side of a Gauss-Newton step."""
@@ -294,7 +294,7 @@ class ArrayWaves:
         antennas, subcarriers = solved.residual.shape[1:]
         constant, factor = self._slopes(theta)
         slopes = constant[..., None] + 1j * factor[..., None] * self.frequencies
-        moved = (solved.atoms * solved.gains[..., None]).reshape(n, k, 1, antennas, subcarriers)
+        moved = (solved.atoms * solved.gains).reshape(n, k, 1, antennas, subcarriers)
         tilt = (moved * slopes).reshape(n, k * p, -1)
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
         # Only the real part of the products is needed: half the work.
@@ -314,4 +314,4 @@ class ArrayWaves:
 
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
         """Coefficients [n, antennas, frequencies]."""
-        return np.asarray(np.einsum("nk,nkaf->naf", gains, self.atoms(theta, frequencies_hz)))
+        return np.asarray(np.einsum("nk,nkaf->naf", gains[..., 0], self.atoms(theta, frequencies_hz)))
