@@ -1,4 +1,4 @@
-"""The registry of models: one from outside the package, by registration and by an installed entry point."""
+"""Registry of models: a model from outside the package, by registration and by an installed entry point."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_runs_of_version_0_1_are_refused_by_every_command(
         assert call(["train", "--help"], capsys)[0] == 0
 
 
-def test_registry_imports_an_entry_when_it_is_asked_for() -> None:
+def test_registry_imports_entries_on_access() -> None:
     registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
     assert list(registry) == ["json"]
     assert registry["json"] is json.loads

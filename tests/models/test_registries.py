@@ -100,7 +100,7 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
     assert compare([out], tmp_path / "page")
 
 
-def test_receiver_of_another_task_or_none_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
+def test_receiver_of_another_task_or_unknown_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="receiver model pixel does not report rssi; choose from power, attenuated"):
         train(flat_folder, tmp_path / "run", receiver="pixel")
     with pytest.raises(InputError, match="receiver model 'horn': unknown; choose from power, attenuated"):
@@ -136,7 +136,7 @@ def test_receivers_and_benchmarks_of_installed_packages_are_found(
     assert "attenuation" in (tmp_path / "results" / "README.md").read_text()
 
 
-def test_a_registered_benchmark_is_one_of_the_checks() -> None:
+def test_registered_benchmark_is_listed() -> None:
     bench.register("own", Check("own", "json:dumps"))
     try:
         assert "own" in CHECKS

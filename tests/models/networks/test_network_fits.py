@@ -89,7 +89,7 @@ def first_rows(record: Record, count: int) -> Split:
 
 
 @pytest.mark.parametrize("name", list(SMALL))
-def test_eight_spectra_are_fitted_and_kept(name: str):
+def test_eight_spectra_are_fitted_and_stored(name: str):
     method, settings = SMALL[name]
     record = array_spectra()
     fitted = method.fit(record, first_rows(record, 8), settings, 0, FitSession())
@@ -107,7 +107,7 @@ def test_eight_spectra_are_fitted_and_kept(name: str):
 
 
 @pytest.mark.parametrize("name", list(SMALL))
-def test_rows_outside_the_split_are_not_seen(name: str, two_gateways: Record):
+def test_fits_do_not_depend_on_held_out_rows(name: str, two_gateways: Record):
     """Other spectra in held-out rows, and a row that one receiver did not receive, change nothing and break nothing."""
     method, settings = SMALL[name]
     settings = replace(settings, steps=4)

@@ -32,7 +32,7 @@ DIFFERENCE = 1e-6
 """Step of central differences in float64: their error is about its square plus 1e-16 / 1e-6."""
 
 GRADIENT_TOLERANCE = 1e-7
-"""Ten times that error, for slopes around one."""
+"""Ten times that error, for derivatives around one."""
 
 
 def doubles(values: np.ndarray) -> Any:
@@ -58,7 +58,7 @@ def assert_gradients(function: Callable[[list[Any]], Any], arrays: list[np.ndarr
 
 
 def weighted(x: Any, weights: np.ndarray) -> Any:
-    """A scalar whose derivative by each element differs."""
+    """A scalar with a different derivative by each element."""
     return dr.sum(x.array * doubles(weights).array)
 
 
@@ -142,7 +142,7 @@ def test_columns_by_index(picked: list[int]):
     np.testing.assert_array_equal(columns(doubles(x), mi.UInt32(picked)).numpy(), x[:, picked])
 
 
-def test_coordinates_are_centred_and_kept():
+def test_coordinates_are_centred_and_stored():
     frame = Coordinates.of([[0, 0, 1], [2, 0, 1]])
     again = Coordinates.load(frame.arrays())
     features = again.features([[2, 0, 1]], octaves=1, scale_m=2.0).numpy()[:, 0]
@@ -259,7 +259,7 @@ VAE = VaeSettings(latent=2, width=5, last=5, octaves=0, noise=0.5, beta=0.3, pri
 @pytest.mark.gradcheck
 def test_gradients_of_the_evidence_bound():
     rng = np.random.default_rng(8)
-    vae = Vae(VAE, 4, 6, rng)
+    vae = Vae(VAE, 4, (2, 3), rng)
     weights = {path: rng.standard_normal(weight.shape) for path, weight in vae.state().items()}
     sizes = {"cells": 4, "where": 3, "pixels": 6}
     data = {name: doubles(rng.uniform(size=(size, 3))) for name, size in sizes.items()}
@@ -279,7 +279,7 @@ def test_divergence_is_that_of_normal_distributions():
 
 
 def test_paths_of_weights_are_those_of_attributes_and_lists():
-    vae = Vae(VAE, 4, 6, np.random.default_rng(0))
+    vae = Vae(VAE, 4, (2, 3), np.random.default_rng(0))
     state = vae.state()
     assert list(state)[:4] == ["q.0.image", "q.0.position", "q.0.bias", "q.1.hidden"]
     assert {"p.0.latent", "p.1.hidden", "p.out.bias"} <= set(state)
@@ -290,12 +290,12 @@ def test_paths_of_weights_are_those_of_attributes_and_lists():
     assert (other.p.layers[0].latent == vae.p.layers[0].latent + 1).all()
 
 
-def test_cells_are_means_over_blocks():
+def test_pooled_spectra_are_means_over_blocks():
     image = np.arange(24.0).reshape(1, 4, 6)
     np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
 
 
-def test_softplus_at_both_ends():
+def test_softplus_does_not_overflow():
     x = np.array([-800.0, -1, 0, 2, 800])
     np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
 
@@ -320,7 +320,7 @@ def trainer_of(goal: list[float], draw: Any, score: Any = None, *settings: str) 
     return NetworkTrainer(network, with_settings(NetworkSettings(), own), (0,))
 
 
-def test_a_step_that_is_not_finite_changes_nothing_and_is_named():
+def test_a_non_finite_step_keeps_the_weights_and_is_reported():
 
     def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
         return dr.opaque(mi.Float, np.nan if trainer.state.step == 99 else 0.0)
@@ -336,7 +336,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named():
 
 
 def test_training_goes_on_from_the_best_validation_score_with_all_rows():
-    """The validation score is best after a quarter; what is drawn from all rows comes last and pulls elsewhere."""
+    """The validation score is best after a quarter of the steps; the last steps use all rows."""
     drawn = []
 
     def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:

@@ -122,7 +122,7 @@ def test_without_validation_rows_every_fifth_training_row_chooses() -> None:
     assert np.isfinite(two.matrix).all()
 
 
-def test_rows_that_were_not_received_are_left_out() -> None:
+def test_rows_with_nan_are_ignored() -> None:
     record, _ = linear_record(noise=0.3)
     lost = record.observation.copy()
     lost[0, 2] = np.nan
@@ -131,7 +131,7 @@ def test_rows_that_were_not_received_are_left_out() -> None:
     np.testing.assert_array_equal(found, fit(record, fewer).matrix)
 
 
-def test_an_antenna_without_signal_is_predicted_as_silent() -> None:
+def test_uplink_of_zeros_at_an_antenna_gives_a_downlink_of_zeros() -> None:
     record, _ = linear_record()
     uplink = np.ones((2, ANTENNAS, UP), np.complex64)
     uplink[1, 2] = 0

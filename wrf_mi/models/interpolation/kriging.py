@@ -248,15 +248,21 @@ class Kriging:
 
     def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
         """Lengths and noise: as given, or of the greatest likelihood."""
-        given = [self.length_m, *([] if self._circle is None else [self.heading_length]), self.noise]
-        limits = np.log([LENGTH_M, *([] if self._circle is None else [HEADING_LENGTH]), NOISE])
+        rows = np.arange(len(field))
+        if len(rows) > self.likelihood_rows:
+            rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
+        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
+        # Given value or None, limits, and first value of the search.
+        table = [
+            (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
+            (self.heading_length, HEADING_LENGTH, 1.0),
+            (self.noise, NOISE, 0.1),
+        ]
+        given, limits, first = zip(*(table if self._circle is not None else [table[0], table[2]]), strict=True)
         free = np.array([value is None for value in given])
         value = np.array([0.0 if v is None else v for v in given])
         if not free.any():
             return value[:-1], float(value[-1])
-        rows = np.arange(len(field))
-        if len(rows) > self.likelihood_rows:
-            rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
         root = component_root(field[rows])
         if not root.any():
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
@@ -270,23 +276,17 @@ class Kriging:
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
 
-        start = self._start(rows)[free]
+        start = np.log(first)[free]
         simplex = np.concatenate([start[None], start + np.eye(len(start))])
         best = minimize(
             objective,
             start,
             method="Nelder-Mead",
-            bounds=limits[free],
+            bounds=np.log(limits)[free],
             options={"initial_simplex": simplex, "maxfev": LIKELIHOOD_EVALUATIONS, "xatol": 0.01, "fatol": 0.01},
         )
         value[free] = np.exp(best.x)
         return value[:-1], float(value[-1])
-
-    def _start(self, rows: NDArray[np.intp]) -> FloatArray:
-        """Logarithms to begin from: a tenth of the extent, a chord of one, a tenth of the variance."""
-        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
-        length = np.clip(extent / 10, *LENGTH_M)
-        return np.log([length, *([] if self._circle is None else [1.0]), 0.1])
 
 
 def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: FloatArray) -> FloatArray:

@@ -174,11 +174,6 @@ def duel_loss(dcgan: Dcgan, data: Any, given: Any, s: DcganSettings) -> Any:
     return (right + fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
 
 
-def generator(s: DcganSettings, shape: tuple[int, int]) -> Generator:
-    """A generator of spectra [height, width] whose weights are to be replaced."""
-    return Generator(s, shape, np.random.default_rng(0))
-
-
 def network(rows: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> Network:
     """Generator and discriminator of a receiver, to be trained together."""
     data = {"where": rows.where, "truth": to_float(rows.spectra)}
@@ -200,7 +195,7 @@ KIND = SpectrumNetwork(
     "dcgan",
     DcganSettings,
     network,
-    generator,
+    Generator,
     "g",
     CHUNK_SIZE,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",

@@ -165,13 +165,11 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
     tensor = type(offset)
     if task.image:
         return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
-    # Of equal solid angle; the root keeps incoherent sums at one size for any number of rays.
+    # Rays have equal solid angles; the root makes the size of incoherent sums independent of the number of rays.
     re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
     if task.in_decibel:
-        power = dr.gather(type(re), offset.array, rx) + float(10 / np.log(10)) * dr.log(
-            re * re + im * im + SQUARED_MAGNITUDE_EPS
-        )
-        return tensor(power, (batch, 1))
+        decibels = float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
+        return tensor(dr.gather(type(re), offset.array, rx) + decibels, (batch, 1))
     both = tensor(dr.concat([re, im]), (2 * outputs, batch))
     return dr.moveaxis(both, 0, 1)
 

@@ -67,8 +67,8 @@ class SpectrumNetwork:
         name: name of the method.
         settings: class of its settings, which have ``octaves`` and ``scale_m``.
         network: training of a network, from a receiver's rows, settings and a generator of random numbers.
-        make: generator of spectra from settings and a spectrum's height and width; its method ``spectra`` makes greys
-            [m * height * width], a flat array, from features of positions [features, m].
+        make: generator of spectra from settings, a spectrum's height and width, and random numbers; its method
+            ``spectra`` makes greys [m * height * width], a flat array, from features of positions [features, m].
         generator: attribute of the trained network that is such a generator; no other part is stored.
         at_once: spectra that are predicted together, which bounds the memory.
         source: publication.
@@ -77,7 +77,7 @@ class SpectrumNetwork:
     name: str
     settings: type
     network: Callable[[ReceiverRows, Any, np.random.Generator], Network]
-    make: Callable[[Any, tuple[int, int]], Any]
+    make: Callable[[Any, tuple[int, int], np.random.Generator], Any]
     generator: str
     at_once: int
     source: str
@@ -143,6 +143,6 @@ def _fit(
 def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record) -> FittedNetworks:
     settings: Any = stored_settings(kind.settings, arrays, kind.name)
     height, width = (int(side) for side in arrays["shape"])
-    made = kind.make(settings, (height, width))
+    made = kind.make(settings, (height, width), np.random.default_rng(0))
     generators = [made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(record.receivers))]
     return FittedNetworks(kind, settings, Coordinates.load(under("frame/", arrays)), generators, (height, width))

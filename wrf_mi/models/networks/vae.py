@@ -84,9 +84,9 @@ def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
 class Decoder(Mlp):
     """Mean of p(spectrum | z, position), [pixels, batch], in 0..1."""
 
-    def __init__(self, s: VaeSettings, pixels: int, rng: np.random.Generator) -> None:
+    def __init__(self, s: VaeSettings, shape: tuple[int, int], rng: np.random.Generator) -> None:
         first = Linear({"latent": s.latent, "position": feature_count(s.octaves)}, s.width, rng)
-        super().__init__([first, Linear(s.width, s.last, rng)], Linear(s.last, pixels, rng, gain=1.0))
+        super().__init__([first, Linear(s.width, s.last, rng)], Linear(s.last, shape[0] * shape[1], rng, gain=1.0))
         self.size = s.latent
 
     def spectra(self, where: Any) -> Any:
@@ -98,10 +98,10 @@ class Decoder(Mlp):
 class Vae(Module):
     """Encoder ``q`` and decoder ``p``."""
 
-    def __init__(self, s: VaeSettings, cells: int, pixels: int, rng: np.random.Generator) -> None:
+    def __init__(self, s: VaeSettings, cells: int, shape: tuple[int, int], rng: np.random.Generator) -> None:
         first = Linear({"image": cells, "position": feature_count(s.octaves)}, s.width, rng)
         self.q = Mlp([first, Linear(s.width, s.width, rng)], Linear(s.width, 2 * s.latent, rng, gain=0.1))
-        self.p = Decoder(s, pixels, rng)
+        self.p = Decoder(s, shape, rng)
 
 
 def normal_divergence(mean: Any, log_variance: Any) -> Any:
@@ -132,17 +132,12 @@ def elbo_loss(vae: Vae, data: Any, given: Any, s: VaeSettings) -> Any:
     return (likelihood + (s.beta / batch) * divergence).array
 
 
-def decoder(s: VaeSettings, shape: tuple[int, int]) -> Decoder:
-    """A decoder of spectra [height, width] whose weights are to be replaced."""
-    return Decoder(s, shape[0] * shape[1], np.random.default_rng(0))
-
-
 def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
     """Encoder and decoder of a receiver, to be trained."""
     cells, flat = pooled(rows.spectra, s.pool), rows.spectra.reshape(len(rows.spectra), -1)
     data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
     dr.make_opaque(data)
-    vae = Vae(s, cells.shape[1], flat.shape[1], rng)
+    vae = Vae(s, cells.shape[1], rows.shape, rng)
     # The decoder starts at the mean spectrum of the rows that it may learn from.
     mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
     assert vae.p.out is not None
@@ -159,7 +154,7 @@ KIND = SpectrumNetwork(
     "vae",
     VaeSettings,
     network,
-    decoder,
+    Decoder,
     "p",
     CHUNK_SIZE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
