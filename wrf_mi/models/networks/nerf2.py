@@ -43,7 +43,7 @@ from ..method import (
 )
 from .coordinates import Coordinates
 from .layers import columns
-from .nerf2_field import Field, Nerf2Settings, condition_of, frame_of, step_loss
+from .nerf2_field import Field, Nerf2Settings, step_loss
 from .nerf2_march import Nerf2Network, Seen
 from .training import Network, opaque_rows, train_network
 
@@ -72,23 +72,23 @@ class FittedNerf2:
         Raises:
             InputError: fitted to uplink channels, and there are none.
         """
-        field, frame = self._field, self._field.frame
-        network = next(n for n, members in zip(self._networks, frame.groups, strict=True) if receiver in members)
+        field = self._field
+        network = next(n for n, members in zip(self._networks, field.groups, strict=True) if receiver in members)
         if self._seen is None or self._seen[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
             self._seen = receiver, field.look(network, receiver)
-        condition, divisor = condition_of(frame, field.settings, inputs, receiver)
+        condition, divisor = field.condition_of(inputs, receiver)
         values, shape = field.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
-        return channels_from(values, divisor, shape) if frame.task.is_complex else values.reshape(shape)
+        return channels_from(values, divisor, shape) if field.task.is_complex else values.reshape(shape)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
-        frame = self._field.frame
+        field = self._field
         arrays = {
-            "settings": settings_array(self._field.settings),
-            "far_m": np.asarray(frame.far_m),
-            "scales": frame.scales,
-            **keyed("frame/", frame.coordinates.arrays()),
+            "settings": settings_array(field.settings),
+            "far_m": np.asarray(field.far_m),
+            "scales": field.scales,
+            **keyed("frame/", field.coordinates.arrays()),
         }
         for g, network in enumerate(self._networks):
             arrays |= keyed(f"group{g}/", network.arrays())
@@ -111,31 +111,30 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, sessio
     else:
         where, farthest = rx, FAR_M
     scales = channel_scales(record, known)
-    frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    field = Field(settings, frame)
-    networks = [_fit_group(record, split, field, seed, session, members) for members in frame.groups]
+    field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
+    networks = [_fit_group(record, split, field, seed, session, members) for members in field.groups]
     return FittedNerf2(field, networks, record.observation.shape[2:])
 
 
 def _fit_group(
     record: Record, split: Split, field: Field, seed: int, session: FitSession, members: tuple[int, ...]
 ) -> Nerf2Network:
-    s, frame, outputs = field.settings, field.frame, field.frame.outputs
+    s, outputs = field.settings, field.outputs
     known = split.all_train
     # From here on rows count within the training rows.
     rows = {
         r: tuple(np.searchsorted(known, part) for part in received_rows(record, split, r, "nerf2")) for r in members
     }
     rng = np.random.default_rng([seed, *members])
-    condition, _ = condition_of(frame, s, inputs_of(record, known), members[0])
-    truth = np.concatenate([truth_of(record, outputs, r, known, frame.scales) for r in range(len(record.receivers))])
+    condition, _ = field.condition_of(inputs_of(record, known), members[0])
+    truth = np.concatenate([truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))])
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
     initial = field.initial(rng)
-    if frame.task.in_decibel:
+    if field.task.in_decibel:
         for r in members:
             initial.offset[r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
-    n_rays, spectrum = frame.directions.shape[1], frame.task.image
+    n_rays, spectrum = field.n_rays, field.task.image
     config = s if spectrum else replace(s, batch=s.sphere_batch)
     all_rays = opaque_rows(np.arange(n_rays))
 
@@ -144,7 +143,7 @@ def _fit_group(
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
     def loss(network: Nerf2Network, data: Any, given: Any) -> Any:
-        return step_loss(network, data, given, frame, s)
+        return step_loss(network, data, given, field)
 
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
@@ -173,8 +172,8 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
     """The fields that `FittedNerf2.arrays` described."""
     settings = stored_settings(Nerf2Settings, arrays, "nerf2")
     coordinates = Coordinates.load(under("frame/", arrays))
-    field = Field(settings, frame_of(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"]))
-    networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.frame.groups))]
+    field = Field(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+    networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
     return FittedNerf2(field, networks, record.observation.shape[2:])
 
 

@@ -5,8 +5,9 @@ Source: see `wrf_mi.models.networks.nerf2`.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -20,7 +21,7 @@ from ...core import InputError, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
-from ...tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
+from ...tasks.conditions import known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import COUNT, POSITIVE, AdamConfig, at_least
 from ..method import Inputs
 from .coordinates import Coordinates, feature_count
@@ -58,8 +59,8 @@ class Nerf2Settings(NetworkSettings):
     steps: int = 5000
     batch: int = 16
     validate_every: int = 500
-    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    networks: Networks = field(default_factory=Networks)
+    optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
+    networks: Networks = dataclasses.field(default_factory=Networks)
     rays: int = 256
     sphere_rays: int = 64
     sphere_batch: int = 128
@@ -80,73 +81,6 @@ class Nerf2Settings(NetworkSettings):
         super().__post_init__()
         if self.far_m and self.far_m <= self.near_m:
             raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
-
-
-@dataclass(frozen=True)
-class Frame:
-    """All of a fitted field but its weights.
-
-    Attributes:
-        coordinates: frame of positions.
-        far_m: distance at which rays end, metres.
-        scales: unit of each receiver's channels [n_rx].
-        outputs: complex numbers that a ray brings.
-        task: task of the record.
-        condition: features of a transmitter.
-        directions: directions of rays in the world [n_rx, rays, 3].
-        origins: starting points of rays [n_rx, 3], metres.
-        groups: indices of the receivers that share networks.
-    """
-
-    coordinates: Coordinates
-    far_m: float
-    scales: FloatArray
-    outputs: Outputs
-    task: Task
-    condition: int
-    directions: NDArray[np.float64]
-    origins: NDArray[np.float64]
-    groups: tuple[tuple[int, ...], ...]
-
-
-def frame_of(
-    record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
-) -> Frame:
-    """The frame for a record's receivers.
-
-    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
-
-    Raises:
-        InputError: a receiver without a pose that is needed.
-    """
-    everyone, outputs, task = tuple(range(len(record.receivers))), outputs_of(record), task_of(record)
-    receivers = placed_receivers(record, outputs.by_uplink)
-    if task.image:
-        rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
-    else:
-        rays = fibonacci_sphere(settings.sphere_rays)
-    return Frame(
-        coordinates,
-        far_m,
-        scales,
-        outputs,
-        task,
-        feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1],
-        np.stack([rays @ receiver.to_world.T for receiver in receivers]),
-        np.stack([receiver.position_m for receiver in receivers]),
-        (everyone,) if settings.shared else tuple((r,) for r in everyone),
-    )
-
-
-def device_data(frame: Frame, settings: Nerf2Settings) -> dict[str, Any]:
-    """Constants of every evaluation on the device: rays of all receivers, and the parts of `Rays` that all share."""
-    origins = frame.origins - frame.coordinates.centre_m
-    extent_m, frequencies_hz = float(np.abs(origins).max()) + frame.far_m, frame.outputs.frequencies_hz
-    parts = constant_parts(extent_m, settings.near_m, frame.far_m, settings.samples, frequencies_hz)
-    parts = {**parts, "origin": origins.T, "direction": frame.directions.reshape(-1, 3).T}
-    data = {name: to_tensor(values) for name, values in parts.items()}
-    dr.make_opaque(data)
-    return data
 
 
 def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> Rays:
@@ -174,51 +108,53 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
     return dr.moveaxis(both, 0, 1)
 
 
-def step_loss(
-    network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], frame: Frame, s: Nerf2Settings
-) -> Any:
-    """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
-
-    Args:
-        network: both networks.
-        data: `device_data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
-        given: ``rows``, ``rays`` and ``receiver``, indices.
-        frame: frame of the field.
-        s: settings.
-    """
-    tensor, rays = type(data["direction"]), dr.width(given["rays"])
-    seen = look(network, rays_of(data, given["receiver"], given["rays"], frame.directions.shape[1]))
-    condition = columns(data["condition"], given["rows"])
-    batch = condition.shape[1]
-    parts = march(network, seen, condition, s.samples)
-    predicted = report(network.offset, parts, frame.task, (frame.outputs.count, batch, rays), given["receiver"])
-    values = data["truth"].shape[1]
-    reported = predicted.shape[1]
-    slot = dr.arange(type(given["rows"]), batch * reported)
-    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), given["rays"], slot % reported) if frame.task.image else slot % reported
-    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
-    error = predicted - truth
-    if frame.task.in_decibel:
-        error = error * (1 / DB_UNIT)
-    return dr.mean(error * error, axis=None).array
-
-
 class Field:
-    """Evaluation of a field, in two steps that are recorded once for all receivers and weights.
+    """All of a fitted field but its weights, and its evaluation in two steps that are recorded once.
+
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
 
     Args:
+        record: data with the receivers.
         settings: settings of NeRF2.
-        frame: frame of the field.
+        coordinates: frame of positions.
+        far_m: distance at which rays end, metres.
+        scales: unit of each receiver's channels [n_rx].
 
     Attributes:
-        data: `device_data`.
+        outputs: complex numbers that a ray brings.
+        task: task of the record.
+        n_rays: rays of a receiver.
+        groups: indices of the receivers that share networks.
+        data: constants of every evaluation on the device: rays of all receivers, and the shared parts of `Rays`.
         network: networks whose weights are to be replaced.
+
+    Raises:
+        InputError: a receiver without a pose that is needed.
     """
 
-    def __init__(self, settings: Nerf2Settings, frame: Frame) -> None:
-        self.settings, self.frame = settings, frame
-        self.data = device_data(frame, settings)
+    def __init__(
+        self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
+    ) -> None:
+        self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
+        self.outputs, self.task = outputs_of(record), task_of(record)
+        receivers = placed_receivers(record, self.outputs.by_uplink)
+        everyone = tuple(range(len(receivers)))
+        self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
+        if self.task.image:
+            rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
+        else:
+            rays = fibonacci_sphere(settings.sphere_rays)
+        self.n_rays = len(rays)
+        self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
+        origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
+        extent_m, frequencies_hz = float(np.abs(origins).max()) + far_m, self.outputs.frequencies_hz
+        parts = {
+            **constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz),
+            "origin": origins.T,
+            "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
+        }
+        self.data = {name: to_tensor(values) for name, values in parts.items()}
+        dr.make_opaque(self.data)
         self.network = self.initial(np.random.default_rng(0))
         network, s = self.network, settings
 
@@ -232,22 +168,22 @@ class Field:
             with dr.suspend_grad():
                 batch, rays = condition.shape[1], seen.first.shape[1] // s.samples
                 parts = march(network.with_state(params), seen, condition, s.samples)
-                return report(params["offset"], parts, frame.task, (frame.outputs.count, batch, rays), receiver)
+                return report(params["offset"], parts, self.task, (self.outputs.count, batch, rays), receiver)
 
         self._looked, self._marched = looked, marched
 
     def initial(self, rng: np.random.Generator) -> Nerf2Network:
         """Networks with random weights."""
-        frame = self.frame
-        return Nerf2Network(self.settings.networks, frame.condition, frame.outputs.count, len(frame.origins), rng)
+        receivers = sum(len(members) for members in self.groups)
+        return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
     def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
         """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
-        count, index = self.frame.directions.shape[1], dr.opaque(mi.UInt32, receiver)
-        everything = np.arange(count) if rays is None else rays
+        index = dr.opaque(mi.UInt32, receiver)
+        everything = np.arange(self.n_rays) if rays is None else rays
         most = max(1, POINTS_PER_CHUNK // self.settings.samples)
-        chunks = np.array_split(everything, -(-len(everything) // most) if self.frame.task.image else 1)
-        parts = [rays_of(self.data, index, opaque_rows(chunk), count) for chunk in chunks]
+        chunks = np.array_split(everything, -(-len(everything) // most) if self.task.image else 1)
+        parts = [rays_of(self.data, index, opaque_rows(chunk), self.n_rays) for chunk in chunks]
         # Shapes of results are recorded for the shapes of tensors, and not of arrays.
         dr.eval(parts)
         return [self._looked(network.state(), part) for part in parts]
@@ -264,17 +200,42 @@ class Field:
             blocks.append(np.concatenate(reports, axis=1))
         return np.concatenate(blocks)
 
+    def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
+        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
 
-def condition_of(
-    frame: Frame, settings: Nerf2Settings, inputs: Inputs, receiver: int
-) -> tuple[Any, NDArray[Any] | float]:
-    """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
+        Raises:
+            InputError: no uplink, where one is needed.
+        """
+        if self.outputs.by_uplink:
+            features, divisor = normalised_uplink(known_uplink(inputs.uplink))
+            return to_tensor(features.T), divisor
+        s = self.settings
+        where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
+        return where, float(self.scales[receiver])
 
-    Raises:
-        InputError: no uplink, where one is needed.
+
+def step_loss(network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], field: Field) -> Any:
+    """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
+
+    Args:
+        network: both networks.
+        data: `Field.data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
+        given: ``rows``, ``rays`` and ``receiver``, indices.
+        field: field to be trained.
     """
-    if frame.outputs.by_uplink:
-        features, divisor = normalised_uplink(known_uplink(inputs.uplink))
-        return to_tensor(features.T), divisor
-    where = frame.coordinates.features(inputs.tx_pos_m, settings.tx_octaves, settings.networks.scale_m)
-    return where, float(frame.scales[receiver])
+    tensor, rays = type(data["direction"]), dr.width(given["rays"])
+    seen = look(network, rays_of(data, given["receiver"], given["rays"], field.n_rays))
+    condition = columns(data["condition"], given["rows"])
+    batch = condition.shape[1]
+    parts = march(network, seen, condition, field.settings.samples)
+    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), given["receiver"])
+    values = data["truth"].shape[1]
+    reported = predicted.shape[1]
+    slot = dr.arange(type(given["rows"]), batch * reported)
+    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
+    column = dr.gather(type(slot), given["rays"], slot % reported) if field.task.image else slot % reported
+    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
+    error = predicted - truth
+    if field.task.in_decibel:
+        error = error * (1 / DB_UNIT)
+    return dr.mean(error * error, axis=None).array
