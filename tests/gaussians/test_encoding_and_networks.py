@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.gaussians import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.encoding import encode, encoded_size, telling_scale
+from wrf_mi.gaussians.encoding import encode, encoded_size, unambiguous_scale
 from wrf_mi.gaussians.network import dense, dense_of_pairs, init_layer, linear, relu
 
 FLOAT64_TOLERANCE = 1e-9
@@ -65,14 +65,14 @@ def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float
     axis=st.integers(0, 2),
     octaves=st.integers(1, 10),
 )
-def test_telling_scale_leaves_no_two_positions_alike(
+def test_unambiguous_scale_leaves_no_two_positions_alike(
     extent_m: np.ndarray, origin_m: np.ndarray, axis: int, octaves: int
 ) -> None:
     """Two of a room's positions a multiple of two metres apart are one at 1 m a unit, whatever the octaves."""
     ends = origin_m + np.stack([np.zeros(3), extent_m])
     twins = np.stack([ends[0], ends[0]])
     twins[1, axis] += 2.0 * np.floor(extent_m[axis] / 2.0)
-    scale = telling_scale(ends, 1.0)
+    scale = unambiguous_scale(ends, 1.0)
     alike = np.ptp(encode(doubles(twins.T), octaves, 1.0).numpy(), axis=1).max()
     assert alike < FLOAT64_TOLERANCE
     told = np.ptp(encode(doubles(twins.T), octaves, scale).numpy(), axis=1).max()
@@ -144,8 +144,8 @@ def test_linear_and_relu() -> None:
     x = np.random.default_rng(7).standard_normal((9, 6))
     out = linear(params, "layer", doubles(x)).numpy()
     np.testing.assert_allclose(out, weights["layer.hidden"] @ x + weights["layer.bias"], rtol=PRODUCT_TOLERANCE)
-    np.testing.assert_array_equal(relu(doubles(out)).numpy(), np.maximum(out, 0))
     np.testing.assert_array_equal(dense(params, "layer", doubles(x)).numpy(), np.maximum(out, 0))
+    np.testing.assert_array_equal(relu(doubles(out)).numpy(), np.maximum(out, 0))
 
 
 @pytest.mark.gradcheck

@@ -11,7 +11,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing.traced_field import TracedPaths
 
 # isort: split
@@ -25,7 +25,7 @@ from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import magnitude, power, scaled
-from wrf_mi.graph.learned import hemisphere_pair
+from wrf_mi.graph.evaluations import hemisphere_pair
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
 

@@ -21,7 +21,7 @@ import mitsuba as mi
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing import TraceOptions
 
 Float64 = dr.float64_array_t(mi.Float)

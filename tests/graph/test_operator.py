@@ -23,7 +23,7 @@ from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights, weigh
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, sector_of
 from wrf_mi.receivers import Array, Pattern, bartlett_spectrum, minmax_scale
 

@@ -49,7 +49,7 @@ def rendered(blending: str, seed: int, power: float, monkeypatch: pytest.MonkeyP
     entries = []
 
     def counting(footprints: Any, signal: Any, lists: Any, *more: Any) -> Any:
-        entries.append(int(lists.start[dr.width(lists.start) - 1]))
+        entries.append(int(dr.sum(lists.end - lists.begin)[0]))
         return blend(footprints, signal, lists, *more)
 
     blend = integrator.blend_rays

@@ -11,9 +11,9 @@ import pytest
 from plugin_fields import FIELDS, plain, weights_of
 from wrf_mi_plugins import emitter as emitter_plugin
 from wrf_mi_plugins import medium as plugin
+from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 
 from wrf_mi.backend.device import to_tensor
-from wrf_mi.gaussians.optical_depth import attenuators, optical_depth
 
 emitter_plugin.register()
 plugin.register()

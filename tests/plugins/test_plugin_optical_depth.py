@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import minimize
+from wrf_mi_plugins.extinction_cells import MARGIN, TIGHT, largest_extinction, make_cells, to_device
+from wrf_mi_plugins.optical_depth import CENTRE_LINE, LEAST_PASSED, attenuators, extinction, on_host, optical_depth
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import rotation_matrix
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.extinction_cells import MARGIN, TIGHT, largest_extinction, make_cells, to_device
 from wrf_mi.gaussians.footprint_constants import CUTOFF
-from wrf_mi.gaussians.optical_depth import CENTRE_LINE, LEAST_PASSED, attenuators, extinction, on_host, optical_depth
 
 Float64 = dr.float64_array_t(mi.Float)
 
