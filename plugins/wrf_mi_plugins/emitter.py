@@ -37,11 +37,6 @@ class GaussianEmitter(mi.Emitter):
                                                                 ``rotation`` with discontinuities
     ================ ============ ==== ======== =============== =====================================================
 
-    .. code-block:: python
-
-        "transmitter": {"type": "wrf_gaussian_emitter", "run": "runs/first", "tx_position": [0.5, 1.0, 0.8]},
-        "gaussians": {"type": "wrf_gaussians", "emitter": {"type": "ref", "id": "transmitter"}},
-
     Stock integrators carry power, not phase. For them each Gaussian radiates |a S|^2 along each ray, with its signal S
     and a = opacity times G under alpha blending, a = G under product blending, where G is its largest value along the
     ray. In a shape with a ``null`` BSDF, the default, these powers add up along a ray. Only rays that hit a Gaussian

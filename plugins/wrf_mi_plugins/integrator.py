@@ -94,16 +94,6 @@ class TracedField(ADIntegrator):
                                                     share of the power are left out; 0: none
     ======================= ======= ===== ========= ================================================== ==============
 
-    .. code-block:: python
-
-        scene = mi.load_dict({
-            "type": "scene",
-            "integrator": {"type": "wrf_traced", "frequency_hz": 920e6},
-            "sensor": {"type": "wrf_perception_plane", "film": {"type": "hdrfilm", "width": 360, "height": 90}},
-            "gaussians": gaussian_shape(gaussians),
-        })
-        image = mi.render(scene)
-
     With ``opaque_power`` p no pixel's field changes by more than sqrt(p) M, M the largest abs(signal) (alpha blending)
     or the sum of all (product blending), nor a derivative by a signal by more than sqrt(p) (`wrf_mi_plugins.hidden`).
 

@@ -58,12 +58,6 @@ class GaussianMedium(mi.Medium):
 
     (*) with discontinuities: the edge at three standard deviations.
 
-    .. code-block:: python
-
-        "air": {"type": "wrf_gaussian_medium", "emitter": {"type": "ref", "id": "transmitter"}},
-        "stencil": {"type": "sphere", "radius": 50.0, "bsdf": {"type": "null"},
-                    "interior": {"type": "ref", "id": "air"}},
-
     The stencil may be any closed shape around the Gaussians, of any size. A sensor inside needs the medium as well.
     Opacity becomes extinction so that 1 - alpha = exp(-optical depth) along every line through the centre, see
     `wrf_mi_plugins.optical_depth`; for that the extinction depends on the ray's direction. Nothing is scattered.

@@ -44,15 +44,6 @@ class PerceptionPlane(mi.Sensor):
 
     The pose of a receiver from its position and quaternion is `receiver_to_world`.
 
-    .. code-block:: python
-
-        "sensor": {
-            "type": "wrf_perception_plane",
-            "to_world": receiver_to_world(position_m, orientation_xyzw),
-            "film": {"type": "hdrfilm", "width": 360, "height": 90, "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": 1},
-        }
-
     Raises:
         InputError: an unknown ``coverage``, or a ``to_world`` that is not a rotation and a translation.
     """

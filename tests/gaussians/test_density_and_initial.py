@@ -12,12 +12,13 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import logit
 from scipy.stats import kstest
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
-from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, logit, reset_opacity
+from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, reset_opacity
 from wrf_mi.scene.points import read_points
 from wrf_mi.training.state import FitState
 

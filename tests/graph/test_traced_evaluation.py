@@ -121,8 +121,7 @@ def test_traced_gradient_of_every_parameter_is_that_of_the_sum_along_rays(model:
             gaussians = field.gaussians(params, to_tensor(row[:, None]))
             footprints = ray_footprints(gaussians, pose)
             lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
-            own = gaussians.opacity, gaussians.attenuation
-            re, im = blend_rays(footprints, gaussians.signal, lists, bundles, *own)
+            re, im = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending)
             greys.append(dr.sqrt(re * re + im * im + 1e-8))
         return dr.concat(greys)
 

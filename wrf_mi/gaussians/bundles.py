@@ -6,14 +6,13 @@ A lane of a vector register owns a few rays of a bundle, and each record of a Ga
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.device import on_device
+from .tiles import LANE_ROWS, TILE_COLUMNS, TILE_ROWS, tiling
 
 
 @dataclass
@@ -54,29 +53,11 @@ class RayLists:
     end: Any
 
 
-TILES = ((10, 8, 5), (1, 1, 1))
+TILES = ((TILE_ROWS, TILE_COLUMNS, LANE_ROWS), (1, 1, 1))
 """Rows and columns of pixels in a bundle, and rows in a lane: the first with bundles narrow enough is taken."""
 
 WIDEST_RAD = np.radians(15.0)
 """Largest margin of a bundle. Its list holds all Gaussians within the margin, most of them in vain in a wide one."""
-
-
-@lru_cache(maxsize=32)
-def _tiling(height: int, width: int, tile: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Rays of each bundle [bundles, rays], of each lane [rows, lanes] (clamped to the image), and which are in it."""
-    rows, columns, group = tile
-    down, across = -(-height // rows), -(-width // columns)
-    row = np.arange(down * rows).reshape(down, 1, rows, 1)
-    column = np.arange(across * columns).reshape(1, across, 1, columns)
-    inside = ((row < height) & (column < width)).reshape(-1)
-    number = np.minimum(row, height - 1) * width + np.minimum(column, width - 1)
-    number = np.broadcast_to(number, (down, across, rows, columns)).astype(np.uint32)
-    inside = np.broadcast_to((row < height) & (column < width), number.shape)
-    by_lane = [
-        a.reshape(down * across, rows // group, group, columns).transpose(2, 0, 1, 3).reshape(group, -1)
-        for a in (number, inside)
-    ]
-    return number.reshape(down * across, rows * columns), by_lane[0], by_lane[1]
 
 
 def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
@@ -90,7 +71,7 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
     float_type: Any = type(direction[0])
     index_type, mask_type = dr.uint32_array_t(float_type), dr.mask_t(float_type)
     for tile in TILES:
-        members, lanes, inside = _tiling(height, width, tile)
+        members, lanes, inside = tiling(height, width, tile)
         size = members.shape[1]
         index = on_device(members, index_type)
         rays = [dr.gather(float_type, c, index) for c in direction]

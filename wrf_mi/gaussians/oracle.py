@@ -75,12 +75,12 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
         receiver: pose of the receiver.
 
     Returns:
-        The projection; its order leaves out Gaussians nearer than ``NEAR_M``.
+        The projection; its order omits Gaussians nearer than ``NEAR_M``.
     """
     mean = np.asarray(mean_m, float)
     to_world = receiver.to_world
     centre = (mean - receiver.position_m) @ to_world  # each row R^T (mu - x_rx)
-    # Of the offset as it is: turned into the receiver's frame, equal depths differ in the last digit.
+    # In the world frame: after rotation equal depths differ in the last digit.
     depth = np.linalg.norm(mean - receiver.position_m, axis=-1)
     near = depth < NEAR_M
     direction = np.where(near[:, None], [1.0, 0.0, 0.0], centre / np.where(near, 1.0, depth)[:, None])
@@ -148,13 +148,8 @@ def blend_alpha(footprints: ArrayLike, signal: ArrayLike, opacity: ArrayLike) ->
 
     Source: WRF-GS+, complex-valued alpha blending.
     """
-    g = np.asarray(footprints, float)
-    received, passed = np.zeros(g.shape[1:], complex), np.ones(g.shape[1:])
-    for g_i, s_i, o_i in zip(g, np.asarray(signal), np.asarray(opacity), strict=True):
-        alpha = o_i * g_i
-        received += s_i * alpha * passed
-        passed *= 1 - alpha
-    return received
+    o = np.asarray(opacity)
+    return blend_product(footprints, o * np.asarray(signal), 1 - o)
 
 
 def render(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -63,7 +63,7 @@ class Gaussians:
         return self.batch > 1 and dr.width(self.scale[0]) == self.count
 
     def spread(self) -> Gaussians:
-        """These Gaussians with all arrays [batch * n]."""
+        """The Gaussians with all arrays [batch * n]."""
         return self.mapped(lambda a: dr.tile(a, self.batch)) if self.shared else self
 
     def mapped(self, function: Callable[[Any], Any], **changes: Any) -> Gaussians:
@@ -81,6 +81,20 @@ def each(function: Callable[..., Any], *values: Any) -> Any:
 def rows(tensor: dr.ArrayBase) -> list[dr.ArrayBase]:
     """The rows of a tensor [k, n] as ``k`` flat arrays [n]. Differentiable."""
     return [tensor[i, :].array for i in range(tensor.shape[0])]
+
+
+def common_geometry(params: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Position, scale and rotation of Gaussians from a field's parameters, common to all transmitters."""
+    return {
+        "position": rows(params["position"]),
+        "scale": [dr.exp(s) for s in rows(params["log_scale"])],
+        "rotation": rows(params["rotation"]),
+    }
+
+
+def logistic(logit: Any) -> Any:
+    """Logistic function."""
+    return dr.rcp(1 + dr.exp(-logit))
 
 
 def by_component(gaussians: Gaussians, components: int) -> Gaussians:

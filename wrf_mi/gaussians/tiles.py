@@ -14,6 +14,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.device import on_device
 from ..core import InputError
@@ -70,30 +71,46 @@ class Plane:
         return self.height * self.width
 
 
+@lru_cache(maxsize=32)
+def tiling(height: int, width: int, tile: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Pixels of an image in tiles of (rows, columns), whose lanes have several rows of one column.
+
+    Returns:
+        Numbers of the pixels of each tile [tiles, pixels] and of each lane [rows, lanes], clamped to the image, and a
+        mask [rows, lanes] of those inside it.
+    """
+    rows, columns, group = tile
+    down, across = -(-height // rows), -(-width // columns)
+    row = np.arange(down * rows).reshape(down, 1, rows, 1)
+    column = np.arange(across * columns).reshape(1, across, 1, columns)
+    shape = (down, across, rows, columns)
+    number = np.broadcast_to(np.minimum(row, height - 1) * width + np.minimum(column, width - 1), shape)
+    inside = np.broadcast_to((row < height) & (column < width), shape)
+    by_lane = [
+        a.reshape(down * across, rows // group, group, columns).transpose(2, 0, 1, 3).reshape(group, -1)
+        for a in (number.astype(np.uint32), inside)
+    ]
+    return number.astype(np.uint32).reshape(down * across, rows * columns), by_lane[0], by_lane[1]
+
+
 @lru_cache(maxsize=16)
 def perception_plane(height: int, width: int, float_type: type) -> Plane:
     """The perception plane of ``height`` x ``width`` pixels over the hemisphere, arrays of ``float_type``."""
     index_type: Any = dr.uint32_array_t(float_type)
     mask_type: Any = dr.mask_t(float_type)
-    down, across = -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
-    tile, lane = np.divmod(np.arange(down * across * LANES), LANES)
-    group, lane_column = np.divmod(lane, TILE_COLUMNS)
-    column = (tile % across) * TILE_COLUMNS + lane_column
-    rows = [(tile // across) * TILE_ROWS + group * LANE_ROWS + k for k in range(LANE_ROWS)]
-    inside = [(row < height) & (column < width) for row in rows]
-    column, rows = np.minimum(column, width - 1), [np.minimum(row, height - 1) for row in rows]
-    azimuth, elevation = azimuth_rad(width)[column], elevation_rad(height)
-    number = np.arange(down * across)
+    tiles, pixel, inside = tiling(height, width, (TILE_ROWS, TILE_COLUMNS, LANE_ROWS))
+    azimuth, elevation = azimuth_rad(width)[pixel[0] % width], elevation_rad(height)
+    first_row, first_column = np.divmod(tiles[:, 0], width)
     result = Plane(
         height,
         width,
-        tile=on_device(tile, index_type),
-        azimuth=[on_device(np.cos(azimuth), float_type), on_device(np.sin(azimuth), float_type)],
-        elevation=[[on_device(f(elevation)[r], float_type) for f in (np.cos, np.sin)] for r in rows],
-        pixel=[on_device(row * width + column, index_type) for row in rows],
+        tile=on_device(np.arange(pixel.shape[1]) // LANES, index_type),
+        azimuth=[on_device(f(azimuth), float_type) for f in (np.cos, np.sin)],
+        elevation=[[on_device(f(elevation)[p // width], float_type) for f in (np.cos, np.sin)] for p in pixel],
+        pixel=[on_device(p, index_type) for p in pixel],
         active=[on_device(i, mask_type) for i in inside],
-        tile_row=on_device(number // across * TILE_ROWS, float_type),
-        tile_column=on_device(number % across * TILE_COLUMNS, float_type),
+        tile_row=on_device(first_row, float_type),
+        tile_column=on_device(first_column, float_type),
     )
     dr.eval(result)
     return result
