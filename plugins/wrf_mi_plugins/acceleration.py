@@ -57,7 +57,7 @@ STEP = 1e-4 * NEAREST
 """Step behind a hit: some roundings of float32 at the farthest part, and a hundredth of the smallest ellipsoid."""
 
 SPACING = 2 * SIZE + 4 * STEP
-"""From one part to the next: rays of one part end before the ellipsoids of the next begin."""
+"""Distance between parts: rays of one part end before the ellipsoids of the next begin."""
 
 ENTRIES, ENTRIES_EACH = 1 << 18, 8
 """Hits allocated at first, in all and per ellipsoid; if there are more, rays are traced again with enough room.

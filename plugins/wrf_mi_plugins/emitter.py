@@ -26,16 +26,15 @@ class GaussianEmitter(mi.Emitter):
     after each change of the emitter's parameters. The traced integrator reads the complex signals there.
     Declare the emitter in the scene and refer to it in the shape, so that ``mi.traverse(scene)`` lists its parameters.
 
-    ================ ============ ==== ======== =============== =====================================================
-    parameter        type         unit default  differentiable  meaning
-    ================ ============ ==== ======== =============== =====================================================
-    ``run``          string            required no              run folder made by ``wrf-mi train`` (or its
-                                                                ``model.npz``), looked for beside the scene file
-    ``tx_position``  point        m    required yes             transmitter, world frame
-    (weights)        tensor            of run   yes             each of the field's parameters by name, dots as
-                                                                underscores; ``position``, ``log_scale`` and
-                                                                ``rotation`` with discontinuities
-    ================ ============ ==== ======== =============== =====================================================
+    =============== ====== ==== ======== =========================================================================
+    parameter       type   unit default  meaning
+    =============== ====== ==== ======== =========================================================================
+    ``run``         string      required run folder made by ``wrf-mi train`` (or its ``model.npz``), relative to the
+    scene ``tx_position`` point  m    required position of the transmitter, world frame; differentiable
+    (weights)       tensor      from run parameters of the field by name, dots as underscores; differentiable
+    =============== ====== ==== ======== =========================================================================
+
+    The parameters ``position``, ``log_scale`` and ``rotation`` have discontinuities at the edges of footprints.
 
     Stock integrators carry power, not phase. For them each Gaussian radiates |a S|^2 along each ray, with its signal S
     and a = opacity times G under alpha blending, a = G under product blending, where G is its largest value along the

@@ -35,7 +35,7 @@ SHAPE = "gaussians"
 class SceneWalls:
     """The surfaces of a Sionna RT scene as walls of another Mitsuba scene, one mesh for each material.
 
-    The Sionna RT scene is read and never changed: materials are copies, with parameters of their own.
+    The Sionna RT scene is not changed: materials are copies.
 
     Args:
         scene: scene from `wrf_mi.tracing.open_scene`.
@@ -135,8 +135,8 @@ class Traced(Evaluation):
     """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`: `wrf_mi.graph.Evaluation`.
 
     Derivatives reach Gaussians, the receiver's pose and the walls' materials. With a scene each Gaussian behind walls
-    is multiplied by what they pass of a wave polarised along the world's z axis. Scenes are built by the first calls
-    and whenever the number of Gaussians changes; Dr.Jit then finds each kernel compiled, but cannot record a call
+    is multiplied by their transmission of a wave polarised along the world's z axis. Scenes are built by the first
+    calls and whenever the number of Gaussians changes; Dr.Jit then finds each kernel compiled, but cannot record a call
     (`dr.freeze`), which builds bounding volumes anew.
 
     Args:

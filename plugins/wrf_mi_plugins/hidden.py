@@ -40,7 +40,7 @@ def without_hidden(
         lists: Gaussians of each bundle, near to far.
         bundles: the rays.
         gaussians: Gaussians with batch 1.
-        footprints: their responses along rays.
+        footprints: responses of the Gaussians along rays.
         walls: walls that the rays cross.
         power: largest share of the power that opaque walls pass.
     """

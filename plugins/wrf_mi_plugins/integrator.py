@@ -79,20 +79,15 @@ class TracedField(ADIntegrator):
     ``sensor.film().bitmap()`` give them. Samples within a pixel are averaged as complex numbers, whatever the film's
     filter; `wrf_perception_plane` takes one sample.
 
-    ======================= ======= ===== ========= ================================================== ==============
-    parameter               type    unit  default   meaning                                            ``mi.traverse``
-    ======================= ======= ===== ========= ================================================== ==============
-    ``walls``               boolean       true      shapes other than ellipsoids attenuate
-    ``frequency_hz``        float   Hz    0         carrier; 0 takes that of the walls' Sionna scene,  exposed
-                                                    and is an error where walls have none
-    ``polarization``        vector        vertical  of the antenna, receiver's frame; by default
-                                                    the world's z axis, however the sensor is turned
-    ``thickness_<name>``    float   m     0.1       slab thickness of a material ``mat-<name>`` that
-                                                    is known by its BSDF's id alone, e.g.
-                                                    ``thickness_itu_glass``
-    ``opaque_power``        float         0         Gaussians behind walls that pass at most this
-                                                    share of the power are left out; 0: none
-    ======================= ======= ===== ========= ================================================== ==============
+    ==================== ======= ==== ======= =======================================================================
+    parameter            type    unit default meaning
+    ==================== ======= ==== ======= =======================================================================
+    ``walls``            boolean      true    shapes other than ellipsoids attenuate
+    ``frequency_hz``     float   Hz   0       carrier (in ``mi.traverse``); 0: that of the walls' Sionna RT scene
+    ``polarization``     vector       z axis  direction of the antenna, receiver's frame; default: the world's z axis
+    ``thickness_<name>`` float   m    0.1     slab thickness of a material ``mat-<name>`` known by its BSDF's id alone
+    ``opaque_power``     float        0       largest share of the power that walls pass if Gaussians behind are skipped
+    ==================== ======= ==== ======= =======================================================================
 
     With ``opaque_power`` p no pixel's field changes by more than sqrt(p) M, M the largest abs(signal) (alpha blending)
     or the sum of all (product blending), nor a derivative by a signal by more than sqrt(p) (`wrf_mi_plugins.hidden`).

@@ -40,21 +40,19 @@ class GaussianMedium(mi.Medium):
 
     The Gaussians come from a `wrf_gaussian_emitter`, from a run folder, or from arrays:
 
-    ================= ============== ==== ======== =============== ==================================================
-    parameter         type           unit default  differentiable  meaning
-    ================= ============== ==== ======== =============== ==================================================
-    (nested plugin)   emitter             one of   (its own)       a ``wrf_gaussian_emitter`` or a reference to one;
-                                          the                      the medium follows its changes
-    ``run``,          string, point  , m  three    ``tx_position`` as for ``wrf_gaussian_emitter``; the weights are
-    ``tx_position``                                and weights     exposed here, too
-    ``centers``       tensor [n, 3]  m             yes *           Gaussians as in Mitsuba's ``ellipsoids``
-    ``scales``        tensor [n, 3]  m             yes *           standard deviations along its axes
-    ``quaternions``   tensor [n, 4]                yes *           axes to world, order x, y, z, w
-    ``opacity``       tensor [n]          one of   yes             alpha at the centre, 0 to 1
-    ``attenuation``   tensor [n, 2]       the two  yes             complex delta (re, im); only its magnitude counts
-    ``scale``         float               1        yes             factor on the optical depth: 1 attenuates as the
-                                                                   field's amplitudes are, 2 as their powers are
-    ================= ============== ==== ======== =============== ==================================================
+    ================= ============= ==== ========== ===============================================================
+    parameter         type          unit default    meaning (differentiable, but for ``run``)
+    ================= ============= ==== ========== ===============================================================
+    (nested plugin)   emitter            one of 3   a ``wrf_gaussian_emitter`` or a reference, whose changes it follows
+    ``run``,          string, point , m  one of 3   as for ``wrf_gaussian_emitter``, weights included
+    ``tx_position``
+    ``centers``       tensor [n, 3] m    one of 3 * Gaussians as in Mitsuba's ``ellipsoids``
+    ``scales``        tensor [n, 3] m    *          standard deviations along its axes
+    ``quaternions``   tensor [n, 4]      *          axes to world, order x, y, z, w
+    ``opacity``       tensor [n]         one of 2   alpha at the centre, 0 to 1
+    ``attenuation``   tensor [n, 2]      one of 2   complex delta (re, im); only its magnitude has an effect
+    ``scale``         float              1          factor on the optical depth: 1 for amplitudes, 2 for powers
+    ================= ============= ==== ========== ===============================================================
 
     (*) with discontinuities: the edge at three standard deviations.
 
@@ -62,9 +60,7 @@ class GaussianMedium(mi.Medium):
     Opacity becomes extinction so that 1 - alpha = exp(-optical depth) along every line through the centre, see
     `wrf_mi_plugins.optical_depth`; for that the extinction depends on the ray's direction. Nothing is scattered.
 
-    Cost: free flights are drawn from one bound for the whole medium, so a ray of length L takes about bound times L
-    steps; a step visits the Gaussians that reach into its cell of a grid. Bound and grid are made anew, on the host,
-    when parameters change: some 0.2 s for 300 Gaussians. `optical_depth` visits every Gaussian for every ray. Mitsuba's
+    Free flights are drawn from one bound for the whole medium; for costs see `docs/plugins.md`. Mitsuba's
     ``volpathmis`` does not work in polarised variants.
     """
 

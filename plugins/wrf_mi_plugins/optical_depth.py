@@ -43,7 +43,8 @@ PEAK = 1 / (math.sqrt(2 * math.pi) * CENTRE_LINE)
 """Largest extinction of a Gaussian in units of optical depth per standard deviation along the ray."""
 
 _SHORTEST_HALF_CHORD = 1e-3
-"""In standard deviations: bounds the derivative of the chord, which is infinite where a ray grazes the cut-off."""
+"""Shortest half chord in standard deviations: it bounds the derivative of the chord, which is infinite where a ray
+grazes the cut-off."""
 
 Vector = list[Any]
 

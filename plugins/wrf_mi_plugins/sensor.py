@@ -110,7 +110,7 @@ class PerceptionPlane(mi.Sensor):
         return mi.ScalarBoundingBox3f()
 
     def traverse(self, callback: Any) -> None:
-        """Expose ``to_world`` beside the film's and the sensor's own parameters."""
+        """Expose ``to_world`` in addition to the base class's parameters."""
         super().traverse(callback)
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 

@@ -24,7 +24,7 @@ MOST_CROSSINGS = 64
 """Largest number of walls on a ray; more are taken for a mistake (terrain, say, or foliage)."""
 
 SMALLEST_SINE = 1e-6
-"""Below this sine of the angle of incidence there is no plane of incidence, and both polarisations pass alike."""
+"""Sine of the angle of incidence below which both polarisations have equal transmission."""
 
 
 @dataclass
@@ -62,7 +62,7 @@ def find_crossings(
 
     Args:
         scene: scene from `wall_scene`.
-        shapes: its shapes.
+        shapes: shapes of that scene.
         pose: pose of the receiver.
         direction: unit vectors of the rays, receiver's frame, three arrays [rays].
         polarization: direction of the receiver's antenna, receiver's frame; None: the world's z axis.

@@ -40,7 +40,7 @@ class Walls:
         distance: distance of each crossing from the receiver, ascending, infinite beyond the last, metres, [rays * k];
             detached.
         factor_re: real part of the transmission before the first crossing (1), after it, and so on, [rays * (k + 1)].
-        factor_im: its imaginary part.
+        factor_im: imaginary part of that transmission.
         k: crossings per ray.
     """
 

@@ -99,5 +99,5 @@ def adapt(
 
 
 def reset_opacity(opacity_logits: NDArray[np.float32], at_most: float) -> NDArray[np.float32]:
-    """Opacity logits that leave no Gaussian more opaque than ``at_most``."""
+    """Opacity logits, limited to an opacity of ``at_most``."""
     return np.minimum(opacity_logits, np.float32(logit(at_most)))

@@ -1,4 +1,4 @@
-"""From 3D Gaussians to footprints on the sphere of directions around a receiver.
+"""Footprints of 3D Gaussians on the sphere of directions around a receiver.
 
 The paper projects to an equirectangular ("Mercator") plane and takes the covariance there. The azimuth
 derivative of that map grows as 1 / cos(elevation), so the plane's Gaussian is wrong near the zenith, the direction of

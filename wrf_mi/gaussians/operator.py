@@ -295,27 +295,17 @@ class Images(_Operator):
         re, im = coefficients.real, coefficients.imag
         return np.block([[re, -im], [im, re]])
 
-    def _parts(self, coefficients: ArrayLike) -> NDArray[Any]:
-        rows = self.rows(np.asarray(coefficients, self.kind))
-        # For one transmitter two products with a vector: OpenBLAS takes 1.7 times as long for a matrix of two rows.
-        both: NDArray[Any] = np.stack([row @ self.table for row in rows]) if len(rows) == 2 else rows @ self.table
-        return both
-
-    def field(self, coefficients: ArrayLike) -> ComplexArray:
-        """R [batch, height * width] of coefficients [batch, K]."""
-        both = self._parts(coefficients)
-        field: ComplexArray = both[: len(both) // 2] + self.kind.type(1j) * both[len(both) // 2 :]
-        return field
-
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
-        both = self._parts(signals)
+        rows = self.rows(np.asarray(signals, self.kind))
+        # For one transmitter two products with a vector: OpenBLAS takes 1.7 times as long for a matrix of two rows.
+        both: NDArray[Any] = np.stack([row @ self.table for row in rows]) if len(rows) == 2 else rows @ self.table
         np.multiply(both, both, out=both)
         np.add(both[: len(out)], both[len(out) :], out=out)
 
 
 class PixelOperator(_Operator):
-    """From signals [batch, n] to the perception plane through sparse weights.
+    """Map from signals [batch, n] to the perception plane by sparse weights.
 
     Args:
         weights: matrix [pixels, n], see `pixel_weights`.

@@ -26,7 +26,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Projection:
-    """The Gaussians as a receiver sees them, in its own frame.
+    """Gaussians in a receiver's frame and on its sphere of directions.
 
     Attributes:
         centre_m: shape [n, 3], metres.

@@ -1,4 +1,4 @@
-"""From a field to a receiver's perception plane by splatting."""
+"""Splatting of a field on a receiver's perception plane."""
 
 from __future__ import annotations
 

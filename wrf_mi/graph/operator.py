@@ -74,7 +74,7 @@ class _MirroredSteering(Images):
 
 
 def steering(array: Array, height: int, width: int) -> Images:
-    """From element signals to the Bartlett spectrum, up to a phase in each pixel.
+    """Map from element signals to the Bartlett spectrum, up to a phase in each pixel.
 
     Phases are those to the array's centre, wherever its origin is: magnitudes are equal, and an array that is its
     own mirror image is symmetric about its centre.
@@ -117,7 +117,7 @@ class _PortOperator:
 
 
 class ArrayOperator(_PortOperator):
-    """From signals to an array's elements, and on to its spectrum.
+    """Map from signals to an array's elements, and to its spectrum.
 
     Args:
         matrix: response [m, n] of the elements, gains and pattern included.
@@ -163,7 +163,7 @@ def sector_of(directions: ArrayLike, azimuths: int, elevations: int) -> NDArray[
 
 
 class SectorOperator(_PortOperator):
-    """From signals to the amplitude that arrives from each sector of directions, and to received power.
+    """Map from signals to the amplitude from each sector of directions, and to received power.
 
     Inside a sector waves add as complex numbers, between sectors as powers. With one sector the whole sum is coherent,
     as in `wrf_mi.graph.combine.PowerReceiver`; with more, waves from different directions do not interfere, which
