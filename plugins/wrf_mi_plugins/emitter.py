@@ -19,7 +19,7 @@ from .source import FieldSource, source_from_properties, source_of
 
 
 class GaussianEmitter(mi.Emitter):
-    """Gaussians as virtual transmitters whose complex signals depend on where the real transmitter is.
+    """Gaussians as virtual transmitters whose complex signals depend on the position of the real transmitter.
 
     The emitter holds a trained field and a transmitter position. It is an area emitter of one shape `wrf_gaussians`,
     whose geometry and attributes ``signal``, ``opacity`` or ``attenuation`` it writes when the shape is loaded and
@@ -29,8 +29,8 @@ class GaussianEmitter(mi.Emitter):
     =============== ====== ==== ======== =========================================================================
     parameter       type   unit default  meaning
     =============== ====== ==== ======== =========================================================================
-    ``run``         string      required run folder made by ``wrf-mi train`` (or its ``model.npz``), relative to the
-    scene ``tx_position`` point  m    required position of the transmitter, world frame; differentiable
+    ``run``         string      required run folder made by ``wrf-mi train`` (or its ``model.npz``)
+    ``tx_position`` point  m    required position of the transmitter, world frame; differentiable
     (weights)       tensor      from run parameters of the field by name, dots as underscores; differentiable
     =============== ====== ==== ======== =========================================================================
 

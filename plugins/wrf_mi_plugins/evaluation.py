@@ -27,7 +27,7 @@ from wrf_mi.tracing.material_parameters import Materials, slabs_of_faces
 from wrf_mi.tracing.surfaces import scene_surfaces
 
 from . import register_all
-from .shape import gaussian_shape, shape_parameters
+from .shape import deinterleave, gaussian_shape, shape_parameters
 
 SHAPE = "gaussians"
 
@@ -132,7 +132,7 @@ class _FieldScene:
 
 
 class Traced(Evaluation):
-    """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`: `wrf_mi.graph.Evaluation`.
+    """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`.
 
     Derivatives reach Gaussians, the receiver's pose and the walls' materials. With a scene each Gaussian behind walls
     is multiplied by their transmission of a wave polarised along the world's z axis. Scenes are built by the first
@@ -180,15 +180,13 @@ class Traced(Evaluation):
             common | {f"{SHAPE}.{name}": value for name, value in shape_parameters(gaussians, k).items()}
             for k in range(gaussians.batch)
         ]
-        taking_turns = not dr.grad_enabled(each)
-        images = [
-            image
-            for k, values in enumerate(each)
-            for image in self._scene(0 if taking_turns else k, gaussians, plane, len(poses)).render(values, len(poses))
-        ]
+        images = []
+        for k, values in enumerate(each):
+            scene = self._scene(k if dr.grad_enabled(each) else 0, gaussians, plane, len(poses))
+            images += scene.render(values, len(poses))
         flat = dr.concat([image.array for image in images])
-        index = 2 * dr.arange(mi.UInt32, dr.width(flat) // 2)
-        return dr.gather(mi.Float, flat, index), dr.gather(mi.Float, flat, index + 1)
+        re, im = deinterleave(flat, dr.width(flat) // 2)
+        return re, im
 
     def release(self) -> None:
         """Detach the scenes' parameters.

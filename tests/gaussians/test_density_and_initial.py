@@ -60,7 +60,7 @@ def one_round(parameters: dict[str, np.ndarray], view_gradient_norm: Any, **chan
     return adapt(parameters, np.asarray(view_gradient_norm, float), **(arguments | changes))
 
 
-def test_small_ones_are_cloned_and_large_ones_split() -> None:
+def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     parameters = made_up(8)
     parameters["log_scale"][:] = np.log(0.01)
     parameters["log_scale"][1, 5] = np.log(0.5)  # one axis is enough
@@ -86,7 +86,7 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
                 np.testing.assert_array_equal(values[:, part], parameters[name][:, old])
 
 
-def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
+def test_angular_size_decides_between_clone_and_split() -> None:
     """The same Gaussian is split near the receiver and cloned far from it."""
     parameters = made_up(2)
     parameters["log_scale"][:] = np.log(0.2)
@@ -95,7 +95,7 @@ def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [0, 2, 3])
 
 
-def test_parts_of_a_split_one_are_drawn_from_it() -> None:
+def test_split_positions_are_drawn_from_the_gaussian() -> None:
     """In the Gaussian's own axes the parts lie as its density: each coordinate over its scale is standard normal."""
     n = 400
     parameters = made_up(n)
@@ -108,7 +108,7 @@ def test_parts_of_a_split_one_are_drawn_from_it() -> None:
         assert kstest(own[:, axis] / scale, "norm").pvalue > SMALLEST_P
 
 
-def test_faint_and_unseen_ones_are_pruned() -> None:
+def test_transparent_and_unseen_gaussians_are_pruned() -> None:
     parameters = made_up(5)
     parameters["opacity"][0] = [0, logit(LEAST_OPACITY) - 0.1, logit(LEAST_OPACITY) + 0.1, 0, 0]
     change = one_round(parameters, [1, 1, 1, 0, 1], growth_fraction=0.0)
@@ -120,7 +120,7 @@ def test_faint_and_unseen_ones_are_pruned() -> None:
 
 
 @pytest.mark.parametrize("opacity", [True, False])
-def test_a_field_never_becomes_empty(opacity: bool) -> None:
+def test_pruning_keeps_at_least_one_gaussian(opacity: bool) -> None:
     parameters = made_up(4, opacity=opacity)
     if opacity:
         parameters["opacity"][0] = [-20, -19, -18, -19]
@@ -137,7 +137,9 @@ def test_a_field_never_becomes_empty(opacity: bool) -> None:
     seed=st.integers(0, 1000),
     opacity=st.booleans(),
 )
-def test_what_every_round_keeps(n: int, max_gaussians: int, growth_fraction: float, seed: int, opacity: bool) -> None:
+def test_invariants_of_a_density_round(
+    n: int, max_gaussians: int, growth_fraction: float, seed: int, opacity: bool
+) -> None:
     parameters = made_up(n, seed, opacity)
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
@@ -189,7 +191,7 @@ def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
     return state, state.params()
 
 
-def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
+def test_density_round_keeps_momentum_of_old_gaussians() -> None:
     n = 6
     state, before = trained_state(n)
     first, second, count = state.moments()
@@ -221,7 +223,7 @@ def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
     np.testing.assert_array_equal(state.view_gradient_norm.numpy(), np.zeros(7))
 
 
-def test_a_step_works_after_a_round() -> None:
+def test_training_step_works_after_a_density_round() -> None:
     state, _ = trained_state(5)
     parameters = state.params()
     own = {name: parameters[name] for name in made_up(1)}
@@ -233,7 +235,7 @@ def test_a_step_works_after_a_round() -> None:
     assert all((values != before[name]).all() for name, values in state.params().items())
 
 
-def test_reset_forgets_momentum_of_that_parameter_alone() -> None:
+def test_opacity_reset_clears_only_its_momentum() -> None:
     state, before = trained_state(5)  # opacity is the last parameter: the step count must not come from it
     first, _, _ = state.moments()
     state.set_param("opacity", reset_opacity(before["opacity"], 0.05))
@@ -246,7 +248,7 @@ def test_reset_forgets_momentum_of_that_parameter_alone() -> None:
     assert {int(t[0]) for _, _, _, (t, _, _, _) in state.adam.state.values()} == {3}
 
 
-def test_state_survives_its_arrays() -> None:
+def test_state_round_trips_through_arrays() -> None:
     state, _ = trained_state(4)
     arrays = state.arrays()
     again = FitState.from_arrays(arrays).arrays()
@@ -255,7 +257,7 @@ def test_state_survives_its_arrays() -> None:
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
 
-def test_the_best_moment_stays_as_it_was() -> None:
+def test_best_parameters_are_not_modified_later() -> None:
     """Dr.Jit gives memory of an array that is summed to in place to the next one of that size."""
     state, _ = trained_state(4)
     state.keep_best(1.0)
@@ -300,7 +302,7 @@ def test_fewer_gaussians_than_receivers() -> None:
     assert np.isfinite(start.position_m).all()
 
 
-def test_geometry_of_the_start() -> None:
+def test_initial_geometry() -> None:
     start = random_gaussians([TILTED], 9, np.random.default_rng(2), opacity=0.3)
     weights = start.geometry()
     np.testing.assert_allclose(weights["position"].T, start.position_m, rtol=FLOAT32_EPS)
@@ -309,7 +311,7 @@ def test_geometry_of_the_start() -> None:
     np.testing.assert_allclose(sigmoid(start.opacity_logit()), 0.3, rtol=FLOAT32_EPS)
 
 
-def test_points_give_the_gap_to_their_neighbours() -> None:
+def test_initial_scale_is_the_gap_to_neighbours() -> None:
     """A square grid's nearest three points lie one step away (at a corner two, and one across)."""
     grid = np.stack(np.meshgrid(np.arange(5), np.arange(5), [2.0], indexing="ij"), axis=-1).reshape(-1, 3) * 0.5
     start = gaussians_from_points(grid, 25, np.random.default_rng(0))
@@ -320,7 +322,7 @@ def test_points_give_the_gap_to_their_neighbours() -> None:
     np.testing.assert_allclose(start.scale_m[order], expected)
 
 
-def test_chosen_points_are_points_of_the_cloud() -> None:
+def test_initial_positions_are_points_of_the_cloud() -> None:
     cloud = np.random.default_rng(3).normal(size=(50, 3))
     first = gaussians_from_points(cloud, 10, np.random.default_rng(4))
     assert len({tuple(p) for p in first.position_m} & {tuple(p) for p in cloud}) == 10
@@ -340,7 +342,7 @@ def test_chosen_points_are_points_of_the_cloud() -> None:
         (np.where(np.arange(27).reshape(9, 3) == 13, np.nan, 1.0), 4, "row 5: not a number"),
     ],
 )
-def test_point_clouds_that_cannot_be_used(points: np.ndarray, count: int, message: str) -> None:
+def test_invalid_point_clouds_are_refused(points: np.ndarray, count: int, message: str) -> None:
     with pytest.raises(InputError, match=message):
         gaussians_from_points(points, count, np.random.default_rng(0))
 
@@ -365,7 +367,7 @@ def test_points_are_read(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(points, POINTS, rtol=FLOAT32_EPS)
 
 
-def test_a_meshs_vertices_are_points(tmp_path: Path) -> None:
+def test_mesh_vertices_are_read_as_points(tmp_path: Path) -> None:
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     box.export(tmp_path / "box.obj")
     points = read_points(tmp_path / "box.obj")
@@ -383,7 +385,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_files_without_points(name: str, tmp_path: Path) -> None:
+def test_files_without_points_are_refused(name: str, tmp_path: Path) -> None:
     content, message = BAD_FILES[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
@@ -402,13 +404,13 @@ def test_files_without_points(name: str, tmp_path: Path) -> None:
         ({"points": np.where(POINTS == -7.75, np.inf, POINTS)}, "point 3: not finite"),
     ],
 )
-def test_arrays_without_points(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_arrays_without_points_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "cloud.npz", **arrays)
     with pytest.raises(InputError, match=message):
         read_points(tmp_path / "cloud.npz")
 
 
-def test_missing_and_damaged_files(tmp_path: Path) -> None:
+def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_points(tmp_path / "none.ply")
     write_points(tmp_path / "cloud.ply")

@@ -26,7 +26,7 @@ KNOWN = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 PLACES = (np.array([5.2, 2.4, 1.1]), np.array([0.9, 3.4, 1.9]))
 SETTINGS = (
-    "steps=800",
+    "steps=300",
     "batch=16",
     "validate_every=50",
     "initial.gaussians=24",

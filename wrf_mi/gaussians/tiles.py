@@ -209,13 +209,9 @@ def _meets_columns(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase
 
 
 def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> TileLists:
-    """Lists without spare room: of each row of tiles first, then of its tiles, counted and filled.
+    """Lists without spare room: those of each row of tiles first, then of its tiles, counted and filled.
 
-    Args:
-        boxes: boxes of all columns, each transmitter's from near to far.
-        column: number ``b * n + i`` of each, [batch * n].
-        plane: the perception plane.
-        batch: number of transmitters.
+    Boxes are near to far for each transmitter, and ``column`` holds their numbers ``b * n + i``, [batch * n].
     """
     index_type: Any = type(column)
     n = dr.width(column) // batch
