@@ -235,15 +235,15 @@ def _derivatives(
 
 @dr.syntax
 def _backward(
-    table: Any,
-    signals: Any,
+    table: Any,  # [batch * n * RECORD], or [n * RECORD] of a shared geometry
+    signals: Any,  # [2 * batch * n] of a shared geometry, else None
     lists: TileLists,
     plane: Plane,
     n: int,
     product: bool,
     batch: int,
-    total: tuple[Any, Any],
-    gradient: tuple[Any, Any],
+    total: tuple[Any, Any],  # re, im, [batch * pixels] each
+    gradient: tuple[Any, Any],  # re, im, [batch * pixels] each
 ) -> tuple[Any, Any]:
     """Gradients of both tables, in their layouts."""
     float_type, index_type = type(table), type(lists.index)

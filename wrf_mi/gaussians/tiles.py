@@ -242,14 +242,14 @@ def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> T
 
 @dr.syntax
 def _list_tiles(
-    boxes: tuple[dr.ArrayBase, ...],
-    column: dr.ArrayBase,
+    boxes: tuple[dr.ArrayBase, ...],  # 4 arrays [batch * n], near to far
+    column: dr.ArrayBase,  # [batch * n]
     plane: Plane,
-    members: dr.ArrayBase | None,
-    begin: dr.ArrayBase,
-    end: dr.ArrayBase,
-    index: dr.ArrayBase | None,
-    start: dr.ArrayBase | None,
+    members: dr.ArrayBase | None,  # [entries of all rows]
+    begin: dr.ArrayBase,  # [batch * tiles]
+    end: dr.ArrayBase,  # [batch * tiles]
+    index: dr.ArrayBase | None,  # [entries of all tiles]
+    start: dr.ArrayBase | None,  # [batch * tiles]
 ) -> dr.ArrayBase:
     """Length of each tile's list, [batch * tiles]; with ``index``, the lists are written from ``start`` on.
 
