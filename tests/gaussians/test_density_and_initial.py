@@ -67,9 +67,9 @@ def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     view_gradient_norm = [1, 9, 2, 3, 4, 8, 5, 6]
     change = one_round(parameters, view_gradient_norm)
     assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
-    # The two that ask most, 1 and 5, stand once more behind the old ones.
+    # The two largest gradients, 1 and 5, have copies behind the old ones.
     np.testing.assert_array_equal(change.source, [0, 1, 2, 3, 4, 5, 6, 7, 1, 5])
-    # A clone's original goes on; both parts of a split one are new.
+    # The original of a clone is kept; both parts of a split Gaussian are new.
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [5, 8, 9])
     for name, values in change.parameters.items():
         for part, old in ((1, 1), (8, 1), (5, 5), (9, 5)):
@@ -144,13 +144,8 @@ def test_invariants_of_a_density_round(
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
     view_gradient_norm, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
-    change = one_round(
-        parameters,
-        view_gradient_norm,
-        distance_m=distance,
-        max_gaussians=max_gaussians,
-        growth_fraction=growth_fraction,
-    )
+    limits = {"max_gaussians": max_gaussians, "growth_fraction": growth_fraction}
+    change = one_round(parameters, view_gradient_norm, distance_m=distance, **limits)
     count = len(change.source)
     assert count >= 1
     # Growth ends at the most; a field that is larger to begin with is not cut.
