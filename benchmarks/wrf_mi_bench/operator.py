@@ -22,7 +22,7 @@ from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.static_signals import FactorisedSignals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator
 from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.training.predictor import Predictor

@@ -35,7 +35,7 @@ from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.receivers import array_response, bartlett_spectrum
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.pose import receiver_pose

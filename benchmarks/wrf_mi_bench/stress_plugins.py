@@ -146,7 +146,7 @@ def _summed(gaussians: Gaussians, pose: Pose) -> list[Any]:
     bundles = ray_bundles([to_device(column, kind) for column in directions.T], *SIZE)
     footprints = ray_footprints(gaussians, pose)
     lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
-    parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.opacity, gaussians.attenuation)
+    parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending)
     return list(parts)
 
 

@@ -26,7 +26,7 @@ from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import hemisphere_pair, learned_field
+from wrf_mi.graph.evaluations import hemisphere_pair, learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers import array_response, bartlett_spectrum, csi, element_signals, minmax_scale

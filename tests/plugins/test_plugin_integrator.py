@@ -57,7 +57,7 @@ def complex_image(tensor: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_traced_is_splatted_where_gaussians_are_small(seed: int) -> None:
+def test_traced_matches_splatting_for_small_gaussians(seed: int) -> None:
     """Gaussians of up to 2 degrees and axes up to 2 : 1, one on the zenith, one on the seam; random poses."""
     for blending in bench_traced.BLENDINGS:
         gaussians, receiver = bench_traced.random_field(seed, blending)
@@ -68,7 +68,7 @@ def test_traced_is_splatted_where_gaussians_are_small(seed: int) -> None:
         assert found["complex_error"] <= LARGEST_ERROR
 
 
-def test_difference_grows_as_explained() -> None:
+def test_difference_from_splatting_grows_with_size() -> None:
     """Of second order in the size of round Gaussians, of first order in that of others."""
     rows = bench_traced.by_size((1.0, 2.0), fields=2)
     errors = {(row["size_deg"], row["ratio"]): row["complex_error"] for row in rows}
@@ -80,7 +80,7 @@ def test_difference_grows_as_explained() -> None:
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
 @pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
-def test_image_is_the_definition(blending: str, coverage: str) -> None:
+def test_image_matches_the_definition(blending: str, coverage: str) -> None:
     """``mi.render`` against float64 NumPy, and the film's channels; Gaussians of all shapes all around."""
     field = any_field(50)
     to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
@@ -135,7 +135,7 @@ def test_perspective_camera() -> None:
     assert mi.render(scene, spp=16).shape == (20, 30, 2)
 
 
-def test_what_is_traced_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traced_hits_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     """New signals trace nothing; new geometry or a new pose does, and the image is as that of a new scene."""
     calls = []
     real = integrator_module.traced_lists
@@ -204,7 +204,7 @@ def test_derivatives_through_render(blending: str) -> None:
     assert abs(np.sum(slope * weight) - backward) < GRADIENT_TOLERANCE * np.abs(slope * weight).sum()
 
 
-def test_derivative_by_the_receivers_place() -> None:
+def test_derivative_by_the_receiver_position() -> None:
     """Moving the receiver one way is moving all Gaussians the other way."""
     scene = scene_of(gaussians_of(any_field(20, seed=3, size=0.2), "alpha", mi.Float))
     params = mi.traverse(scene)
@@ -229,14 +229,14 @@ def test_derivative_by_the_receivers_place() -> None:
         ({"sensor": {"type": "orthographic", "film": film(4, 4)}}, "do not start at one point"),
     ],
 )
-def test_bad_scenes(more: dict[str, Any], text: str) -> None:
+def test_invalid_scenes_are_refused(more: dict[str, Any], text: str) -> None:
     scene = scene_of(gaussians_of(any_field(5), "alpha", mi.Float), **more)
     with pytest.raises(InputError, match=text):
         scene.integrator().render(scene)
 
 
 @pytest.mark.slow
-def test_as_fast_as_mitsubas_own() -> None:
+def test_tracing_is_not_slower_than_volprim() -> None:
     """10,000 Gaussians, 360 x 90 directions, hits found anew: not slower than ``volprim_rf_basic``."""
     for size in (1.0, 2.0):
         found = bench_traced.pace(size, repeats=9)
