@@ -64,15 +64,8 @@ class Job:
 def alone(job: Job, llvm: Path | str | None = None) -> Arrays:
     """Do a job in a process of its own.
 
-    Args:
-        job: what to do.
-        llvm: library to compute with; None: as this process.
-
     Returns:
         What it computed, see `KINDS`.
-
-    Raises:
-        AloneFailed: the process did not end well.
     """
     with TemporaryDirectory() as work:
         out = Path(work) / "out.npz"
@@ -147,8 +140,8 @@ def _channels(job: Job, work: Path) -> Arrays:
     from wrf_mi.models.physics.csi import CsiSettings, fit_csi
     from wrf_mi.synthetic import load_record
 
+    from .comparison import room_file
     from .physics_csi import scanned_scene
-    from .trace import room_file
 
     record = load_record(job.dataset)
     assert record.official is not None

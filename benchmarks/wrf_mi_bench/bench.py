@@ -130,7 +130,7 @@ _OWN: Mapping[str, Check] = {
     "scan-to-paths": Check("mesh from a scan", _here("scene:scans"), data=(CONFERENCE, OFFICE)),
     "large-scan": Check("mesh from a scan", _here("scene:large_scan"), data=(OFFICE,)),
     "flat-plan": Check("mesh of a flat", _here("plan:flat_plan"), data=(FLAT,)),
-    "flat-ble": Check("ray tracing in a flat", _here("calibration:flat"), data=(FLAT,)),
+    "flat-ble": Check("ray tracing in a flat", _here("physics_rssi:flat"), data=(FLAT,)),
     "stress": Check("numbers under stress", _here("stress:main"), _here("stress:quick")),
     "determinism": Check("the same again", _here("determinism:main"), data=(RFID, FLAT, CONFERENCE)),
     "physics-rfid-lab": Check("physics, rfid-lab", _here("physics_spectrum:rfid_lab"), data=(RFID,)),
@@ -139,7 +139,7 @@ _OWN: Mapping[str, Check] = {
     "physics-conference": Check("physics, newrf", _here("physics_csi:conference"), data=(CONFERENCE,)),
     "physics-office": Check("physics, newrf", _here("physics_csi:office"), data=(OFFICE,)),
     "physics-room": Check("physics, traced room", _here("physics_room:main")),
-    "physics-starts": Check("WRF-GS+, traced room", _here("starts:main")),
+    "physics-starts": Check("WRF-GS+, traced room", _here("physics_room:starts")),
     "pareto": Check("traced room", _here("pareto:main"), data=("traced-room",)),
     "scaling": Check("cost against work", _here("scaling:main")),
     "operator": Check("prediction by operator", _here("operator:main")),
@@ -159,11 +159,7 @@ CHECKS: Mapping[str, Check] = _CHECKS
 
 
 def register(name: str, check: Check) -> None:
-    """Add a check for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
-
-    Raises:
-        InputError: a name that is taken.
-    """
+    """Add a check for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`."""
     _CHECKS.add(name, check)
 
 
@@ -179,19 +175,8 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
     A case that is finished for the same arguments, data and versions is only written down again; one that was stopped
     goes on.
 
-    Args:
-        names: keys of `CASES` and `CHECKS`.
-        out: folder for ``<case>.json`` and the tables, ``README.md``.
-        runs: folder for run folders.
-        scheduler: whose workers measure a case each at a time, with their number of threads, and must see ``runs`` and
-            the data under the same names; None: this process.
-
     Returns:
         One dictionary a case, as in its JSON file.
-
-    Raises:
-        InputError: an unknown case, or what a check needs is not on this machine.
-        BenchFailed: a case that did not finish.
     """
     for name in names:
         if name not in CASES and name not in CHECKS:
@@ -215,15 +200,8 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
 def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:
     """Checks with few cases, in this process; nothing is stored, as stored figures are those of all cases.
 
-    Args:
-        names: keys of `CHECKS`.
-
     Returns:
         One dictionary a check: ``case``, ``title`` and ``figures``.
-
-    Raises:
-        InputError: an unknown name, or one without a quick form.
-        BenchFailed: a bound that is not held.
     """
     able = [name for name, check in CHECKS.items() if check.quick]
     for name in names:

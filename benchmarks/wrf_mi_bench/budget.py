@@ -69,13 +69,6 @@ def budgets(
 ) -> dict[str, Any]:
     """Fit a field at each budget on the official split and measure them beside each other.
 
-    Args:
-        record: of spectra, with an official split.
-        work: folder for the runs; a finished one with the same key (`wrf_mi.runs.fit_key`) is used again.
-        schedule: settings of every fit.
-        seed: of every fit.
-        given: by name; the first is what the others are compared with. What another starts by stands before it.
-
     Returns:
         By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
         `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.

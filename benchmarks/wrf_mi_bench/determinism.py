@@ -70,12 +70,7 @@ def _bits_row(what: str, one: Arrays, *others: Arrays) -> Row:
 
 
 def again(dataset: str) -> list[Row]:
-    """Everything that is promised bit for bit.
-
-    Args:
-        dataset: spectra that a field and a physics model are fitted to; other physics models where their data are on
-            this machine.
-    """
+    """Everything that is promised bit for bit."""
     field = Job("field", dataset, SMALL, deterministic=True)
     whole, repeated, resumed = (alone(job) for job in (field, field, replace(field, stop=STOP)))
     rows = [
@@ -100,11 +95,6 @@ def again(dataset: str) -> list[Row]:
 
 def apart(dataset: str, settings: Sequence[str] = SHORT, repeats: int = REPEATS) -> tuple[list[Row], dict[str, Any]]:
     """How far results lie apart without ``--deterministic``.
-
-    Args:
-        dataset: spectra that fields are fitted to.
-        settings: of the short fit, its ``steps`` first.
-        repeats: on the same threads.
 
     Returns:
         Rows, and all scores by what they were computed with.

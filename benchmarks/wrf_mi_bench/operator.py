@@ -69,12 +69,7 @@ def relative(found: Any, expected: Any) -> float:
 
 
 class Direct:
-    """Direct evaluation of one transmitter, in two recorded halves.
-
-    Args:
-        field: the model.
-        params: its parameters.
-    """
+    """Direct evaluation of one transmitter, in two recorded halves."""
 
     def __init__(self, field: Any, params: Mapping[str, NDArray[np.float32]]) -> None:
         self.params = {name: to_tensor(values) for name, values in params.items()}

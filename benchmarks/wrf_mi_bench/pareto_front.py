@@ -39,13 +39,6 @@ def measure_methods(
 
     Single predictions of all methods take turns in one process; batches do so in a second series.
 
-    Args:
-        place: data set, mesh, schedule.
-        methods: to be made ready and measured.
-        reference: name of the method that ratios of times are taken to.
-        repeats: rounds.
-        most_s: bound of each of the two series of rounds, seconds.
-
     Returns:
         For each method ``name``, ``family``, ``ms`` and ``batch_ms`` (of one spectrum; median and interval),
         ``over_reference`` (ratio of single times), ``error`` (1 - median SSIM over rows, and interval), ``l2`` (median
@@ -103,12 +96,7 @@ def front(points: Sequence[Point]) -> list[str]:
 
 
 def pareto_figure(points: Sequence[Point], title: str = "") -> Figure:
-    """Time of one prediction against error, a colour for each family, the front as a grey step.
-
-    Args:
-        points: from `measure_methods`; where there is ``batch_ms``, a pale ring marks the time in a batch.
-        title: above the picture.
-    """
+    """Time of one prediction against error, a colour for each family, the front as a grey step."""
     figure = Figure(figsize=(9, 5.4), layout="constrained", facecolor="white")
     axes = figure.subplots()
     families = list(dict.fromkeys(point["family"] for point in points))

@@ -241,17 +241,8 @@ def worse(measured: Mapping[str, Mapping[str, float]], stored: Mapping[str, Mapp
 def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, Any]:
     """Measure all pairs, and store them or hold them against what is stored.
 
-    Args:
-        out: folder of the stored ratios, see `file_of`.
-        store: write it.
-        pairs: to measure.
-
     Returns:
         What is (or would be) stored.
-
-    Raises:
-        InputError: nothing is stored, or what is cannot be read or comes from another kind of device.
-        BenchFailed: a ratio is worse.
     """
     file = file_of(out)
     stored = None if store else read_stored(file)
@@ -282,11 +273,7 @@ def file_of(out: Path) -> Path:
 
 
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
-    """Stored ratios.
-
-    Raises:
-        InputError: no such file, not such a file, or one from another backend, where other ratios are right.
-    """
+    """Stored ratios."""
     try:
         content = json.loads(file.read_text())
         ratios: dict[str, dict[str, float]] = content["figures"]["ratios"]

@@ -27,12 +27,6 @@ SLOW_MS, FEW = 4000.0, 2
 def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: float = CALL_S) -> dict[str, Any]:
     """Times and memory of one call at each size.
 
-    Args:
-        axis: what grows.
-        repeats: timed calls.
-        most_s: bound of the timed calls of one size, seconds; three (of slow ones `FEW`) are timed in any case.
-        call_s: see `CALL_S`.
-
     Returns:
         ``sizes`` that were measured, ``left_out``, ``ms`` and ``memory_mb`` of each, and the ``exponent`` of time with
         its interval and ``limit``, that of n log n at the same sizes.

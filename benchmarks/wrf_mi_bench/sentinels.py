@@ -32,7 +32,7 @@ from wrf_mi.runs.fit_key import dataset_files, fit_key, source_files
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, OFFICE, RFID, BenchFailed
-from .stress_summary import stages
+from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure
 
@@ -77,13 +77,7 @@ class Figure:
         return BETTER if (measured > self.high if self.higher_is_better else measured < self.low) else WORSE
 
     def row(self, measured: float | None, verdict: str, why: str = "") -> dict[str, Any]:
-        """As a row of the benchmark's table.
-
-        Args:
-            measured: None where it was not.
-            verdict: of it.
-            why: it was not measured.
-        """
+        """As a row of the benchmark's table."""
         value = verdict if measured is None else f"{measured:.4g}, {verdict}"
         return {
             "what": self.name,
@@ -112,10 +106,6 @@ class Group:
 
 def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float]:
     """Distribution-free 95 % interval of a median over test rows.
-
-    Args:
-        quantiles: of the rows' scores, equally spaced shares from 0 to 1.
-        rows: number of test rows.
 
     Source: order statistics and the binomial distribution, Conover, "Practical Nonparametric Statistics" (1999),
     section 3.2; `scipy.stats.quantile_test`.
@@ -154,10 +144,10 @@ def _stress() -> Group:
     def again(_: Path) -> list[float]:
         from .stress import QUICK
 
-        return [one.worst for one in stages([row for part in QUICK for row in part()])]
+        return [worst for _, _, worst, _ in stages([row for part in QUICK for row in part()])]
 
     known = stages(_stored("stress")["figures"]["rows"])
-    figures = [Figure(f"stress, {one.name}: worst error", one.worst, 0.0, one.bound, False) for one in known]
+    figures = [Figure(f"stress, {name}: worst error", worst, 0.0, bound, False) for name, _, worst, bound in known]
     return Group("stress", tuple(figures), again)
 
 
@@ -188,11 +178,7 @@ def _image_method(room: str, stored: Mapping[str, Any]) -> Group:
 
 
 def groups() -> list[Group]:
-    """All sentinels, with what is stored of them.
-
-    Raises:
-        InputError: a stored figure that is missing, or that the tables plan otherwise by now.
-    """
+    """All sentinels, with what is stored of them."""
     planned = {row.name: row for row in plan()}
     if gone := [name for name in TABLE_ROWS if f"{name}-100-seed0" not in planned]:
         raise InputError(f"sentinel {gone[0]}: no row of the tables any more; choose another")
@@ -212,9 +198,6 @@ def main() -> dict[str, Any]:
         ``rows``: of each figure ``what``, ``stored``, ``low`` and ``high`` of its interval, ``measured`` (None where it
         was not), ``verdict``, and ``date`` and ``seconds`` of the measurement, the seconds those of all figures that
         are measured together; ``failed``: a line, where a figure got worse or could not be measured.
-
-    Raises:
-        InputError: stored figures are not on this machine.
     """
     known = groups()
     place = RUNS / fit_key(source_files())

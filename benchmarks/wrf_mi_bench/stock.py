@@ -50,13 +50,7 @@ def rgb_variant() -> Iterator[None]:
 
 
 class StockRenderer:
-    """Renders Gaussians from a receiver's place.
-
-    Args:
-        receiver: whose directions are seen.
-        height: of the spectrum.
-        width: of the spectrum.
-    """
+    """Renders Gaussians from a receiver's place."""
 
     def __init__(self, receiver: Receiver, height: int, width: int) -> None:
         self.receiver, self.height, self.width = receiver, height, width
@@ -64,13 +58,7 @@ class StockRenderer:
         self._count = -1
 
     def load(self, data: Floats, opacity: Floats, colour: Floats) -> None:
-        """Put Gaussians into the scene, whose acceleration structure is then built anew.
-
-        Args:
-            data: centre, standard deviations (metres) and quaternion x, y, z, w of each, [n, 10].
-            opacity: alpha at the centre, [n].
-            colour: coefficients of degree 0, [n, 3].
-        """
+        """Put Gaussians into the scene, whose acceleration structure is then built anew."""
         with rgb_variant():
             if len(opacity) != self._count:
                 self._scene, self._count = self._build(data, opacity, colour), len(opacity)

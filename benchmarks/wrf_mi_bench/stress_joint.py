@@ -156,13 +156,7 @@ def cases(many: int = MANY) -> dict[str, Callable[[], Case]]:
 
 
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
-    """Rows of every case: values and derivatives, the worst of the receiver models.
-
-    Args:
-        many: transmitters of the case of many paths.
-        names: of `cases`; None: all.
-        models: of `MODELS`.
-    """
+    """Rows of every case: values and derivatives, the worst of the receiver models."""
     chosen = cases(many)
     rows = []
     for name in chosen if names is None else names:

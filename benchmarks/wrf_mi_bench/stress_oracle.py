@@ -56,11 +56,7 @@ class OraclePaths:
 
 
 class TracedOracle:
-    """The paths of a traced side as a function of its parameters.
-
-    Args:
-        traced: whose chains are followed.
-    """
+    """The paths of a traced side as a function of its parameters."""
 
     def __init__(self, traced: TracedField) -> None:
         self._traced, self._walls = traced, walls_of(traced.surfaces)

@@ -128,11 +128,7 @@ def _mirror_images(tx: FloatArray, rx: FloatArray, size: FloatArray, depth: int 
 
 
 def traced_gradients(count: int = 6) -> list[Row]:
-    """Derivatives of what is traced in a room against central differences, the paths kept.
-
-    Args:
-        count: of transmitters.
-    """
+    """Derivatives of what is traced in a room against central differences, the paths kept."""
     with tempfile.TemporaryDirectory() as work:
         kinds = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_concrete")
         parts = {n: (kind, wall) for kind, (n, wall) in zip(kinds, box_sheets(ROOM).items(), strict=True)}
@@ -224,15 +220,6 @@ def _against_differences(
     """Compare derivatives of a random functional of a float32 report with central differences of float32 reports.
 
     Sums over a report are NumPy's, in float64: what is tested is the report.
-
-    Args:
-        of: the report, a flat array, of parameters as tensors.
-        values: of the parameters.
-        steps: the longest step of some, see `_slope`.
-        step: of the others.
-        worst: takes the errors, each relative to the difference.
-        where: said with the worst.
-        done: called after each report when it is no longer needed.
     """
     rng = np.random.default_rng(3)
     tensors = {name: to_tensor(value) for name, value in values.items()}

@@ -1,8 +1,9 @@
-"""Parts of receivers that are written over any Dr.Jit float, in float32 against float64: values and derivatives."""
+"""Parts of receivers that compute in any Dr.Jit float, float32 against float64: values and derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -21,19 +22,19 @@ from wrf_mi.receivers.device import gaussian_signals as device_signals
 from wrf_mi.receivers.footprints import gaussian_signals
 from wrf_mi.tracing.traced_field import TracedPaths
 
-from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
+from .stress_fields import Rng
+from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
 
 CARRIER_HZ = 920e6
 WAVENUMBER = 2 * np.pi * CARRIER_HZ / speed_of_light
 ELEMENTS_M = planar_array(4, 4, 0.16)
-DOUBLE: Any = dr.float64_array_t(mi.Float)
 Inputs = Mapping[str, FloatArray]
 Function = Callable[[Mapping[str, Any]], Sequence[Any]]
-"""Of flat arrays by name, of one float type: flat arrays of that type."""
+"""Function from flat arrays of one float type, by name, to flat arrays of that type."""
 
 
 def twins(count: int) -> list[Row]:
-    """All parts, ``count`` cases of each kind of input."""
+    """Rows of all parts, ``count`` cases of each kind of input."""
     rows = []
     for name, kinds, function in (
         ("closed-form footprints", FOOTPRINTS, _footprints),
@@ -74,7 +75,7 @@ def _parts(flat: Any, count: int) -> list[Any]:
     return [dr.gather(type(flat), flat, dr.arange(mi.UInt32, size) + i * size) for i in range(count)]
 
 
-def _spread(rng: np.random.Generator, deviations: Any) -> dict[str, FloatArray]:
+def _spread(rng: Rng, deviations: Any) -> dict[str, FloatArray]:
     """Footprints with three axes of these standard deviations, rad."""
     n = 20
     direction = rng.normal(size=(n, 3))
@@ -87,7 +88,7 @@ def _spread(rng: np.random.Generator, deviations: Any) -> dict[str, FloatArray]:
     }
 
 
-FOOTPRINTS: Mapping[str, Callable[[np.random.Generator], Inputs]] = {
+FOOTPRINTS: Mapping[str, Callable[[Rng], Inputs]] = {
     "random": lambda r: _spread(r, r.uniform(0.01, 0.3, (20, 3))),
     "sizes of 1e-6 to 1 rad": lambda r: _spread(r, 10 ** r.uniform(-6, 0, (20, 1))),
     "each axis of 1e-6 to 1 rad": lambda r: _spread(r, 10 ** r.uniform(-6, 0, (20, 3))),
@@ -101,32 +102,34 @@ def _footprints(given: Mapping[str, Any]) -> Sequence[Any]:
     flat = _parts(given["axes"], 9)
     kind: Any = type(given["signal"])
     elements = [on_device(column, kind) for column in ELEMENTS_M.T]
-    # A unit vector that is one in float32 alone would be another footprint in float64.
+    # Normalised in this precision, as a vector of unit length in float32 is not one in float64.
     norm = dr.rsqrt(sum((c * c for c in direction[1:]), direction[0] * direction[0]))
     direction = [c * norm for c in direction]
     axes = [flat[0:3], flat[3:6], flat[6:9]]
     return device_signals((signal[0], signal[1]), direction, axes, elements, kind(WAVENUMBER))
 
 
-SIGNALS: Mapping[str, Callable[[np.random.Generator], Inputs]] = {
+SIGNALS: Mapping[str, Callable[[Rng], Inputs]] = {
     "random": lambda r: {"h": r.normal(size=(2, 48)), "gain": r.normal(size=(2, 16))},
     "signals of 1e-15 to 1e15": lambda r: {
         "h": r.normal(size=(2, 48)) * 10 ** r.uniform(-15, 15, 48),
         "gain": r.normal(size=(2, 16)),
     },
 }
-_LAGS: list[LagMatrix] = []
+
+
+@cache
+def _lag_matrix() -> LagMatrix:
+    return LagMatrix(Lags(ELEMENTS_M, CARRIER_HZ, 15, 30))
 
 
 def _lags(given: Mapping[str, Any]) -> Sequence[Any]:
-    if not _LAGS:
-        _LAGS.append(LagMatrix(Lags(ELEMENTS_M, CARRIER_HZ, 15, 30)))
     h, gain = (tuple(_parts(given[name], 2)) for name in ("h", "gain"))
-    return [_LAGS[0].squared(_LAGS[0].of_signals(with_gains(h, gain)))]
+    return [_lag_matrix().squared(_lag_matrix().of_signals(with_gains(h, gain)))]
 
 
 def _against_numpy(count: int) -> Row:
-    """The closed form in Dr.Jit's float64 is NumPy's, as far as a covariance matrix holds what the axes say."""
+    """Row of the closed form in Dr.Jit's float64 compared with NumPy, up to the rounding of covariance matrices."""
     worst = Worst()
     for seed in range(count):
         inputs = FOOTPRINTS["random"](np.random.default_rng(seed))

@@ -18,11 +18,7 @@ from .table_plan import PARTS, SHARES, Part, Row, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
-    """All rows stored in a folder.
-
-    Raises:
-        InputError: a file that is no JSON.
-    """
+    """All rows stored in a folder."""
     rows = []
     for path in sorted(place.glob("*-seed*.json")):
         try:
@@ -80,11 +76,6 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
-
-    Args:
-        name: of `OVERVIEWS`.
-        stored: rows by name.
-        quick: of the small version.
     """
     found: dict[Part, dict[str, list[float]]] = {}
     for row in plan(quick):

@@ -213,11 +213,7 @@ class Row:
         return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}}}"])])
 
     def arguments(self, scene: Sequence[str]) -> list[str]:
-        """Of ``wrf-mi``, without ``--out``.
-
-        Args:
-            scene: arguments that take the place of ``--scene {scene}``.
-        """
+        """Of ``wrf-mi``, without ``--out``."""
         words: list[str] = []
         for word in self.entry.arguments:
             if word == NAMED:

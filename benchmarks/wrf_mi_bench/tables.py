@@ -56,11 +56,7 @@ KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb",
 
 
 def scene_of(part: Part, folder: Path) -> list[str]:
-    """Arguments that name the scene of a part, which is made in ``folder`` where nobody has made it.
-
-    Raises:
-        InputError: data that are not on this machine.
-    """
+    """Arguments that name the scene of a part, which is made in ``folder`` where nobody has made it."""
     if part.scene == "open":
         return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
     if part.scene == "room":
@@ -103,12 +99,7 @@ def _scene(part: Part, runs: Path) -> list[str]:
 
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
-    """One row: the run, unless the same one is finished, and its figures.
-
-    Raises:
-        BenchFailed: the command ended with an error.
-        InputError: data or a scene that are not on this machine.
-    """
+    """One row: the run, unless the same one is finished, and its figures."""
     scene = _scene(row.part, runs) if NAMED in row.entry.arguments else []
     data = _data_digest(row.part.dataset)
     folder = runs / f"{row.name}-{fit_key(row.command, data, [scene_files(place) for place in scene[1:]])}"
@@ -154,18 +145,8 @@ def tables(
 
     A row whose command fails is reported and left out; the others go on.
 
-    Args:
-        out: folder of results; rows go to ``tables/`` in it, or ``tables-quick/``.
-        runs: folder for run folders.
-        quick: the small version.
-        scheduler: whose workers measure a row each at a time; None: this process.
-        most_s: no row is begun after so many seconds; None: all are.
-
     Returns:
         All stored rows.
-
-    Raises:
-        BenchFailed: rows that did not finish, after all others.
     """
     place = out / (f"{FOLDER}-quick" if quick else FOLDER)
     place.mkdir(parents=True, exist_ok=True)
@@ -205,24 +186,14 @@ def tables(
 
 
 def _data_digest(dataset: str) -> str:
-    """Digest of the content of a data set, which is made where it can be and is not there.
-
-    Raises:
-        InputError: it is not on this machine.
-    """
+    """Digest of the content of a data set, which is made where it can be and is not there."""
     if not dataset_files(dataset):
         load_record(dataset)
     return content_digest(dataset_files(dataset))
 
 
 def _holds(stored: Mapping[str, Any] | None, row: Row, digests: dict[str, str]) -> bool:
-    """Whether a stored row is what would be measured; rows that do not state their data hold for any.
-
-    Args:
-        stored: content of its file, or None.
-        row: as planned.
-        digests: of data sets, filled as they are asked for.
-    """
+    """Whether a stored row is what would be measured; rows that do not state their data hold for any."""
     if stored is None or stored["command"] != row.command:
         return False
     dataset = row.part.dataset

@@ -40,16 +40,7 @@ Image = NDArray[np.complex128]
 def random_field(
     seed: int, blending: str, count: int = 300, size_deg: float = SMALL_DEG, ratio: float = 2.0, opacity: float = 0.8
 ) -> tuple[Gaussians, Receiver]:
-    """Gaussians in random directions above a receiver at a random pose; one on its zenith, one on its azimuth seam.
-
-    Args:
-        seed: of the random numbers.
-        blending: ``"alpha"`` or ``"product"``.
-        count: of Gaussians, two or more.
-        size_deg: largest standard deviation of each as the receiver sees it.
-        ratio: between the largest and the smallest that the axes of one Gaussian may have.
-        opacity: the largest.
-    """
+    """Gaussians in random directions above a receiver at a random pose; one on its zenith, one on its azimuth seam."""
     rng = np.random.default_rng(seed)
     quaternion = rng.standard_normal(4)
     receiver = Receiver("receiver", rng.normal(0, 3, 3), quaternion / np.linalg.norm(quaternion))

@@ -98,11 +98,7 @@ FITS = dict(zip(TITLES, ("fit_wrf_gs_plus", "fit_wrf_gs", "fit_factorised", "fit
 
 
 def fit_alone(model: str) -> dict[str, Any]:
-    """`fit` in a process of its own.
-
-    Raises:
-        BenchFailed: it did not finish.
-    """
+    """`fit` in a process of its own."""
     with tempfile.TemporaryDirectory() as work:
         out = Path(work) / "fit.json"
         status, said = run_module("wrf_mi_bench.check", [f"{__name__.rpartition('.')[2]}:{FITS[model]}", str(out)])

@@ -11,7 +11,7 @@ from wrf_mi_bench import plan as bench_plan
 from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
 from wrf_mi_bench.check import main
 from wrf_mi_bench.pareto_front import full_table
-from wrf_mi_bench.stress_summary import STAGES, summary_table
+from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve

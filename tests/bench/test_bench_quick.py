@@ -72,18 +72,18 @@ def test_the_command_fails_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with_ratios(monkeypatch, made_up(0.5))
-    assert cli.main(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
-    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 0
+    assert cli(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
+    assert cli(["bench", "--quick", "--out", str(tmp_path)]) == 0
     capsys.readouterr()
     with_ratios(monkeypatch, made_up(2.0))
-    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 1
+    assert cli(["bench", "--quick", "--out", str(tmp_path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "wrf-mi: bench --quick: splatting 2 (1.82 to 2.2) is above 2 times the stored 0.5"
 
 
 @pytest.mark.parametrize("arguments", [["--store"], ["--quick", "demo"]])
 def test_what_does_not_belong_to_quick_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", *arguments]) == 2
+    assert cli(["bench", *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 

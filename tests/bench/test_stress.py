@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from wrf_mi_bench import stress as bench_stress
 from wrf_mi_bench import stress_fields, stress_joint, stress_plugins, stress_receivers, stress_rows
-from wrf_mi_bench.stress import held, worst_of
-from wrf_mi_bench.stress_fields import HARD, Field, image, made, reference
+from wrf_mi_bench.stress_fields import HARD, Field, image, image_row, made, reference
 from wrf_mi_bench.stress_joint import joint
 from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
 from wrf_mi_bench.stress_receivers import derivatives, of_fields
+from wrf_mi_bench.stress_rows import held, worst_of
 from wrf_mi_bench.stress_traced import traced_gradients
 from wrf_mi_bench.stress_twins import twins
 
@@ -31,7 +31,7 @@ def test_images_of_hard_fields(name: str) -> None:
             truth, clear = reference(field, blending, (30, 60))
             found = image(field, blending, (30, 60))
             assert np.isfinite(found).all()
-            assert np.linalg.norm((found - truth)[clear]) <= bench_stress.IMAGE * np.linalg.norm(truth)
+            assert np.linalg.norm((found - truth)[clear]) <= stress_rows.IMAGE * np.linalg.norm(truth)
             assert clear.mean() > 0.9
 
 
@@ -121,7 +121,7 @@ def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_integrator_of_the_plugins() -> None:
-    for row in [*plugin_images(2, 1, many=0), *plugin_gradients(1, bench_stress.HARDEST[:1])]:
+    for row in [*plugin_images(2, 1, many=0), *plugin_gradients(1, stress_fields.HARDEST[:1])]:
         assert held(row), row
 
 
@@ -138,10 +138,10 @@ def test_slim_gaussians_are_met_by_rays(monkeypatch: pytest.MonkeyPatch) -> None
 
     for name, value in {"NEAREST": 1.0, "FARTHEST": 4.0, "STEP": 1e-4, "SIZE": 12.0, "SPACING": 24.0004}.items():
         monkeypatch.setattr(acceleration, name, value)
-    lost = stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60))
+    lost = stress_plugins.plugin_row("needles", {"needles": HARD["needles, 1e6 to 1"]}, 1)
     assert worst_of(lost)[0] > 0.01
     monkeypatch.undo()
-    assert held(stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60)))
+    assert held(stress_plugins.plugin_row("needles", {"needles": HARD["needles, 1e6 to 1"]}, 1))
 
 
 def test_what_is_not_a_number_is_the_worst() -> None:
@@ -163,31 +163,30 @@ def test_what_is_not_a_number_is_the_worst() -> None:
 
 def test_the_quick_form_by_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def few() -> list[dict[str, str]]:
-        return [bench_stress._images("ordinary", lambda rng: made(20, rng), 1, bench_stress.IMAGE)]
+        return [image_row("image, ordinary", {"random": lambda rng: made(20, rng)}, 1)]
 
     monkeypatch.setattr(bench_stress, "QUICK", (few, lambda: losses(1), lambda: [bench_stress.fits(1)]))
-    assert cli.main(["bench", "stress", "--quick"]) == 0
+    assert cli(["bench", "stress", "--quick"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 1 + 7 + 1
     assert lines[2].startswith("| numbers under stress: image, ordinary, 2 cases | **worst ")
-    monkeypatch.setattr(bench_stress, "IMAGE", 1e-12)
-    assert cli.main(["bench", "stress", "--quick"]) == 1
+    monkeypatch.setattr(stress_fields, "IMAGE", 1e-12)
+    assert cli(["bench", "stress", "--quick"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("wrf-mi: bench stress --quick: image, ordinary, 2 cases: worst ")
 
 
 @pytest.mark.parametrize("names", [["operator"], ["stress", "demo"], ["nowhere"], ["stress", "--store"]])
 def test_what_has_no_quick_form_is_refused(names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", *names, "--quick"]) == 2
+    assert cli(["bench", *names, "--quick"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "stress" in line
 
 
-def test_an_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_row_reports_an_error_beyond_its_bound() -> None:
     def off(field: Field, blending: str, size: tuple[int, int]) -> np.ndarray:
         return image(field, blending, size) * 1.001
 
-    monkeypatch.setattr(bench_stress, "image", off)
-    worst, bound = worst_of(bench_stress._images("random", lambda rng: made(20, rng), 2, bench_stress.IMAGE))
+    worst, bound = worst_of(image_row("image, random", {"random": lambda rng: made(20, rng)}, 2, render=off))
     assert worst == pytest.approx(1e-3, rel=0.05)
     assert worst > bound
