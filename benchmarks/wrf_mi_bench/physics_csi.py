@@ -135,10 +135,7 @@ def _traced(record: Record, train: IntArray, test: IntArray, scene: Any, seed: i
     # An antenna on a wall may lie behind the noisy wall of the scan.
     position_m = clear_of_walls(record.receivers[0].position_m, record.tx_pos_m, scene_surfaces(scene).triangles)
     image = fit_csi(record, train[:0], scene, CsiSettings(), seed).predict(record.tx_pos_m[rows], 0).mean
-    found = {
-        "ray tracing": _tracer(record, rows, scene, position_m, seed),
-        "image method, antenna on its wall": image,
-    }
+    found = {"ray tracing": _tracer(record, rows, scene, position_m, seed), "image method, antenna on its wall": image}
     result: dict[str, Complex] = {}
     for name, values in found.items():
         known, unknown = values[: len(train)], values[len(train) :]

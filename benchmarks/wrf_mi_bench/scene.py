@@ -115,11 +115,7 @@ def match(truth: Paths, ours: Paths) -> tuple[IntArray, IntArray]:
 
 
 def scanned_points(
-    room: Path,
-    poses: int,
-    rays_per_pose: int = RAYS_PER_POSE,
-    range_noise_m: float = RANGE_NOISE_M,
-    seed: int = 1,
+    room: Path, poses: int, rays_per_pose: int = RAYS_PER_POSE, range_noise_m: float = RANGE_NOISE_M, seed: int = 1
 ) -> tuple[FloatArray, float]:
     """Points [n, 3] of a simulated scan of a NeWRF room from distant poses, and the room's frequency in Hz."""
     data = read_arrays(room, KEYS[:3])

@@ -1,13 +1,9 @@
-"""The joint graph of paths and Gaussians under stress, values and derivatives, float32 against float64.
+"""Joint graph of paths and Gaussians, values and derivatives, float32 compared with float64.
 
-What is compared is what a receiver reports of both sides with float32 parameters, and the derivatives of a random
-functional of it by every parameter. The reference is float64: paths by `stress_oracle` in NumPy, the Gaussians by the
-same code in float64; derivatives by what moves paths (the pose, which both sides see, included) are differences of the
-reference, those by the Gaussians its own.
-
-Errors of RSSI and CSI are counted in shares of the sum of the waves' magnitudes, those of spectra in shares of their
-norm (`stress_receivers`). Derivatives are weighed by a natural step of each parameter: 1 / k for metres, 1 for rad and
-logarithms.
+Reports and derivatives of a random functional by every parameter are compared. The reference for paths is
+`stress_oracle` in NumPy with central differences, that for Gaussians the same code in float64. Errors of RSSI and CSI
+are relative to the sum of the waves' magnitudes, those of spectra to their norm. Derivatives are weighed by a natural
+step of each parameter: 1 / k for metres, 1 for rad and logarithms.
 """
 
 from __future__ import annotations
@@ -42,10 +38,9 @@ from wrf_mi.tracing.pose import receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
 from .stress_oracle import TracedOracle, Values, slopes
-from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
-from .stress_traced import box_sheets
+from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
+from .stress_traced import ROOM, box_sheets
 
-DOUBLE: Any = dr.float64_array_t(mi.Float)
 HZ = 920e6
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
@@ -56,25 +51,23 @@ MODELS: Mapping[str, Any] = {
     "RSSI": PowerReceiver(*SIZE, (HZ,)),
     "CSI": CsiReceiver(*SIZE, (HZ, 1.01 * HZ)),
 }
-ROOM = (6.0, 5.0, 3.0)
 KINDS = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_metal")
 THICKNESS_M = {"itu_concrete": 0.3, "itu_metal": 0.1, **dict.fromkeys(KINDS[1:5], 0.02), "itu_chipboard": 0.02}
 GRAZING_M = 1e-3
-"""Height of both antennas over the floor: 4e-4 rad at 5 m."""
+"""Height of both antennas above the floor: 4e-4 rad at 5 m."""
 LEFT = 0.01
-"""Share of the traced side that is left where the learned one cancels it; float32 has 6e-8 of what it cancels."""
+"""Remaining share of the traced side where the learned side cancels it."""
 MANY = 160
 """Transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths."""
 STEP = 1e-5
-"""Of differences of the paths, in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away, and
-1e-1 rad where all but a hundredth is cancelled."""
+"""Step of differences of the paths in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away."""
 PLACE = Receiver(
     "array",
     np.array([4.2, 2.9, 0.4]),
     Rotation.from_euler("zyx", (30, 20, 10), degrees=True).as_quat(),
     Antenna(frame="array"),
 )
-"""Turned with its array, so that reports depend on how it is turned."""
+"""Receiver whose antenna turns with its array, so that reports depend on the rotation."""
 NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
 """Two transmitters."""
 
@@ -85,16 +78,16 @@ Parts = dict[str, tuple[str, Mesh]]
 
 @dataclass(frozen=True)
 class Case:
-    """A hard geometry.
+    """An ill-conditioned geometry.
 
     Attributes:
-        parts: the scene.
-        receiver: where it is searched from.
-        tx_pos_m: transmitters [n, 3].
-        options: what is traced.
-        values: parameters that are set, by name.
-        cancels: the traced side's gain is set so that it cancels the learned one at the first transmitter.
-        moved: planes are shifted by millimetres and tilted by a hundredth; else as the scene states them.
+        parts: scene.
+        receiver: receiver from which paths are searched.
+        tx_pos_m: positions of transmitters [n, 3].
+        options: options of the search.
+        values: given parameters by name.
+        cancels: whether the traced side's gain cancels the learned side at the first transmitter.
+        moved: whether planes are shifted by millimetres and tilted by 0.01 rad.
     """
 
     parts: Parts
@@ -111,7 +104,7 @@ def _room() -> Parts:
 
 
 def _coplanar() -> Case:
-    """A door and a panel that lie in a wall's plane, and a partition of two layers 2 cm apart that paths go through."""
+    """A door and a panel in a wall's plane, and a partition of two layers 2 cm apart with transmission."""
     parts = _room() | {
         "door": ("itu_wood", sheet(0, 0.0, (1.0, 3.5), (0.0, 2.1))),
         "panel": ("itu_metal", sheet(1, ROOM[1], (1.5, 4.5), (0.2, 2.0))),
@@ -122,14 +115,14 @@ def _coplanar() -> Case:
 
 
 def _grazing() -> Case:
-    """Both antennas a millimetre above the floor: line of sight and reflection cancel to a thousandth."""
+    """Both antennas 1 mm above the floor, where line of sight and reflection cancel to a thousandth."""
     low = replace(PLACE, position_m=np.array([5.6, 2.9, GRAZING_M]))
     tx = np.array([[0.6, 1.8, GRAZING_M], [0.5, 2.9, 2 * GRAZING_M]])
     return Case(_room(), low, tx, TraceOptions(max_depth=2, rays=1 << 13), {}, moved=False)
 
 
 def _mounted() -> Case:
-    """Searched 2 cm before a wall, evaluated on it: the reflection there coincides with the direct path."""
+    """Paths searched 2 cm in front of a wall and evaluated on it, where reflection and direct path coincide."""
     before = replace(PLACE, position_m=np.array([ROOM[0] - 0.02, 2.9, 1.4]))
     onto = {"receiver.array.position": np.array([np.float32(0.02), 0.0, 0.0])}
     return Case(_room(), before, NEAR_M, TraceOptions(max_depth=2, rays=1 << 13), onto, moved=False)
@@ -144,29 +137,26 @@ def _many(count: int) -> Case:
     return Case(_room(), PLACE, tx, TraceOptions(max_depth=3, rays=1 << 15), {})
 
 
-def cases(many: int = MANY) -> dict[str, Callable[[], Case]]:
-    """All by name; ``many``: transmitters of the last."""
-    return {
-        COPLANAR: _coplanar,
-        "grazing paths": _grazing,
-        "antenna on a wall": _mounted,
-        CANCELLING: _cancelling,
-        "many paths": lambda: _many(many),
-    }
+CASES: Mapping[str, Callable[[], Case]] = {
+    COPLANAR: _coplanar,
+    "grazing paths": _grazing,
+    "antenna on a wall": _mounted,
+    CANCELLING: _cancelling,
+}
 
 
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
-    """Rows of every case: values and derivatives, the worst of the receiver models."""
-    chosen = cases(many)
+    """Values and derivatives of `CASES` and of ``many`` transmitters, the worst of the receiver models."""
+    cases = {**CASES, "many paths": lambda: _many(many)}
     rows = []
-    for name in chosen if names is None else names:
+    for name in cases if names is None else names:
         with tempfile.TemporaryDirectory() as work:
-            rows += _Joint(chosen[name](), Path(work)).rows(name, models)
+            rows += _Joint(cases[name](), Path(work)).rows(name, models)
     return rows
 
 
 class _Joint:
-    """Both sides of a case, and their parameters as float32 holds them."""
+    """Both sides of a case, and their parameters rounded to float32."""
 
     def __init__(self, case: Case, work: Path) -> None:
         self._case, rng = case, np.random.default_rng(7)
@@ -174,7 +164,7 @@ class _Joint:
         options = TracedOptions(case.options, 2, gain=100.0, materials="surface", planes=True)
         self._traced = TracedField(scene, case.tx_pos_m, case.receiver, options)
         self._oracle = TracedOracle(self._traced)
-        # Encoded positions are detached, so the functional must hardly depend on them.
+        # Encoded positions are detached, so the functional may hardly depend on them.
         encoding = Encoding(position_octaves=1, position_scale_m=1e6, tx_octaves=2)
         self._field = WrfGsPlus(encoding=encoding, layers=2, width=16, skip=1)
         start = self._field.init(random_gaussians([case.receiver], 25, rng, opacity=0.4, signal=0.5), rng)

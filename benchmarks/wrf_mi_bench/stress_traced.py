@@ -1,4 +1,4 @@
-"""The tracer under stress: phases and delays against mirror images, derivatives against differences in float32."""
+"""Ray tracing: phases and delays compared with mirror images, derivatives with central differences in float32."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from .stress_fields import RECEIVER
 from .stress_rows import PHASE, Row, Worst, row
 
 TRACED_GRADIENT = 1e-2
-"""Relative error of a derivative through the tracer against central differences in float32."""
+"""Bound on the relative error of a derivative through ray tracing against central differences in float32."""
 DELAY = 1e-6
-"""Relative error of Sionna RT's delays: 17 roundings of float32, those of mirrored corners, their sums and roots."""
+"""Bound on the relative error of Sionna RT's delays: 17 roundings of float32."""
 HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
     (28e9, (100.0, 60.0, 12.0)),
     (915e6, (10_000.0, 4_000.0, 300.0)),
@@ -45,11 +45,11 @@ HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
 ROOM = (6.0, 5.0, 3.0)
 CARRIER_HZ = 2.4e9
 LEAST_SLOPE = 0.05
-"""Of the median slope: a smaller one, a metal's, is compared with that; roundings would drown it."""
+"""Floor of a slope relative to the median slope; those of metals are below rounding."""
 
 
 def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
-    """The six sides of a box."""
+    """Meshes of the six sides of a box."""
     spans = [(0.0, side) for side in size_m]
     return {
         f"{axis}{at:g}": sheet(axis, at, *(span for other, span in enumerate(spans) if other != axis))
@@ -59,12 +59,12 @@ def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
 
 
 def phases(count: int = 30) -> list[Row]:
-    """Phases of traced paths against mirror images in closed form, and Sionna RT's own delays, which are float32."""
+    """Rows of traced phases and of Sionna RT's float32 delays, compared with mirror images in closed form."""
     return [row for frequency_hz, size_m in HALLS for row in _phases(frequency_hz, size_m, count)]
 
 
 def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int) -> list[Row]:
-    """Halls of metal, up to two reflections."""
+    """Rows of a metal hall with up to two reflections."""
     rng = np.random.default_rng(0)
     tx, rx = rng.uniform(0.1, 0.9, (count, 3)) * size_m, rng.uniform(0.1, 0.9, 3) * size_m
     with tempfile.TemporaryDirectory() as work:
@@ -73,18 +73,18 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
         options = TraceOptions(max_depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
         delays_s = _sionna_delays(scene, tx, rx)
-    worst, single, own = Worst(), Worst(), Worst()
+    worst, single, delay = Worst(), Worst(), Worst()
     metres, counted = 0.0, 0
-    for index, place in enumerate(tx):
-        found, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(place, rx, np.array(size_m))
+    for index, position_m in enumerate(tx):
+        found, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(position_m, rx, np.array(size_m))
         theirs = speed_of_light * delays_s[index]
         for lengths, errors in ((found, worst), (found.astype(np.float32), single)):
             errors.add(np.abs(lengths - exact).max() if len(lengths) == len(exact) else np.inf)
-        # In large halls it finds some paths two or three times, by the two triangles of a wall.
+        # Sionna RT finds some paths of large halls two or three times, by both triangles of a wall.
         off = np.abs(theirs[:, None] - exact) if len(theirs) else np.full((1, len(exact)), np.inf)
         counted += len(theirs)
         metres = max(metres, float(off.min(axis=0).max()), float(off.min(axis=1).max()))
-        own.add(max((off.min(axis=0) / exact).max(), (off / exact).min(axis=1).max()))
+        delay.add(max((off.min(axis=0) / exact).max(), (off / exact).min(axis=1).max()))
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
     where = f"{frequency_hz / 1e9:g} GHz in {size_m[0]:g} m"
     more = f" rad; with lengths in float32 {wavenumber * single.error:.0e} rad"
@@ -92,7 +92,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
         row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more),
         row(
             f"Sionna RT's own delays at {where}, {counted} paths",
-            own.error,
+            delay.error,
             DELAY,
             f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad",
         ),

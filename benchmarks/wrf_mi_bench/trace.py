@@ -140,53 +140,47 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
 
 
 def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
-    """Which paths are lines of sight or mirror reflections that no triangle obstructs; brute force in float64.
+    """Which paths are mirror reflections or lines of sight without obstruction, by brute force in float64.
 
-    Source: Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection" (1997), J. Graphics Tools 2(1).
+    Args:
+        paths: paths of reflections to a receiver.
+        tx_pos_m: positions of the transmitters, [n_tx, 3].
+        rx_pos_m: position of the receiver, [3].
+        triangles: corners of the mesh in metres, [f, 3, 3].
     """
+    corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal = np.cross(first, second)
+    area = np.linalg.norm(normal, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal = normal / area[:, None]
+    offset, slack = (corner * normal).sum(axis=1), ON_SURFACE_M / np.sqrt(np.maximum(area, 1e-12))
+
+    def inside(points: FloatArray, which: IntArray, slack: Any) -> NDArray[np.bool_]:
+        """Whether points in the planes of triangles lie inside them, by barycentric coordinates."""
+        s, n = points - corner[which], normal[which] / area[which, None]
+        u, v = (np.cross(s, second[which]) * n).sum(axis=1), (np.cross(first[which], s) * n).sum(axis=1)
+        return np.asarray((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack))
+
+    def obstructed(here: FloatArray, there: FloatArray) -> bool:
+        length = float(np.linalg.norm(there - here))
+        way = (there - here) / length
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (offset - normal @ here) / (normal @ way)
+        which = np.flatnonzero((t > ON_SURFACE_M) & (t < length - ON_SURFACE_M))
+        return bool(inside(here + t[which, None] * way, which, 0.0).any())
+
+    def mirrored(before: FloatArray, at: FloatArray, after: FloatArray) -> bool:
+        which = np.flatnonzero(np.abs(normal @ at - offset) < ON_SURFACE_M)
+        which = which[inside(at, which, slack[which])]
+        half = sum((end - at) / np.linalg.norm(end - at) for end in (before, after))
+        return bool((np.abs(normal[which] @ half) > (1 - MIRRORED) * np.linalg.norm(half)).any())
+
     good = np.ones(len(paths), bool)
-    for index in range(len(paths)):
-        bounces = int(paths.bounces[index])
+    for index, bounces in enumerate(paths.bounces):
         points = [tx_pos_m[paths.tx[index]], *paths.vertices_m[index, :bounces], rx_pos_m]
-        for here, there in pairwise(points):
-            good[index] &= not _crosses(here, there, triangles)
-        for before, at, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
-            good[index] &= _mirrors(before, at, after, triangles)
+        good[index] = not any(obstructed(*ends) for ends in pairwise(points))
+        good[index] &= all(mirrored(*turn) for turn in zip(points, points[1:], points[2:], strict=False))
     return good
-
-
-def _crosses(here: FloatArray, there: FloatArray, triangles: FloatArray) -> bool:
-    """Whether a triangle lies between two points."""
-    way = there - here
-    length = float(np.linalg.norm(way))
-    a, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    p = np.cross(way, second)
-    volume = (first * p).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = here - a
-        u = (s * p).sum(axis=1) / volume
-        q = np.cross(s, first)
-        v = q @ way / volume
-        t = (second * q).sum(axis=1) / volume * length
-        return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > ON_SURFACE_M) & (t < length - ON_SURFACE_M)).any())
-
-
-def _mirrors(before: FloatArray, at: FloatArray, after: FloatArray, triangles: FloatArray) -> bool:
-    """Whether the turn at a point is that of a mirror in the plane of a triangle that holds the point."""
-    a, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(first, second)
-    area = np.linalg.norm(cross, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        n = cross / area[:, None]
-        near = np.abs(((at - a) * n).sum(axis=1)) < ON_SURFACE_M
-        s = at - a
-        u, v = (np.cross(s, second) * n).sum(axis=1) / area, (np.cross(first, s) * n).sum(axis=1) / area
-    slack = ON_SURFACE_M / np.sqrt(np.maximum(area, 1e-12))
-    holds = near & (u > -slack) & (v > -slack) & (u + v < 1 + slack)
-    to, fro = before - at, after - at
-    half = to / np.linalg.norm(to) + fro / np.linalg.norm(fro)
-    half /= np.linalg.norm(half)
-    return bool((np.abs(n[holds] @ half) > 1 - MIRRORED).any())
 
 
 def newrf() -> dict[str, Any]:

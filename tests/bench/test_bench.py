@@ -10,7 +10,7 @@ import pytest
 from wrf_mi_bench import plan as bench_plan
 from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
 from wrf_mi_bench.check import main
-from wrf_mi_bench.pareto_front import full_table
+from wrf_mi_bench.pareto import full_table
 from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError

@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 import pytest
 from small_fits import QUICK, official, settings
-from wrf_mi_bench.alone import AloneFailed, Job, alone
 from wrf_mi_bench.determinism import GRADIENT, IMAGE, cuda_works, different, distance, other_llvms
+from wrf_mi_bench.subprocess_job import Job, SubprocessJobFailed, subprocess_job
 
 from wrf_mi import backend
 from wrf_mi.cli import train as cli_train
@@ -36,8 +36,8 @@ def gpu_process(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_processes_give_the_same_bits(folder: Path) -> None:
     """One trains in one go, one stops, and a third goes on: parameters, moments, test rows and new positions."""
     job = Job("field", str(folder), FIT, deterministic=True)
-    whole = alone(job)
-    assert different(whole, alone(replace(job, stop=17))) == []
+    whole = subprocess_job(job)
+    assert different(whole, subprocess_job(replace(job, stop=17))) == []
     assert {"score", "model.npz: param/position", "predictions.npz: prediction", "new.npz: prediction"} <= set(whole)
     assert whole["model.npz: param/position"].shape[1] > 8
 
@@ -58,15 +58,15 @@ def test_distance_of_two_steps() -> None:
 
 
 def test_a_process_that_fails_says_why() -> None:
-    with pytest.raises(AloneFailed, match=r"nothing of nowhere ended with status 1: KeyError: 'nothing'"):
-        alone(Job("nothing", "nowhere"))
+    with pytest.raises(SubprocessJobFailed, match=r"nothing of nowhere ended with status 1: KeyError: 'nothing'"):
+        subprocess_job(Job("nothing", "nowhere"))
 
 
 @pytest.mark.skipif(not other_llvms(), reason="one version of LLVM here")
 def test_another_llvm_computes_the_same(folder: Path) -> None:
-    one = alone(Job("step", str(folder), STEP, threads=1))
+    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
     for path in other_llvms().values():
-        found = distance(one, alone(Job("step", str(folder), STEP, threads=1), path))
+        found = distance(one, subprocess_job(Job("step", str(folder), STEP, threads=1), path))
         assert found["image"] < IMAGE
         assert found["gradient"] < GRADIENT
 
@@ -74,8 +74,8 @@ def test_another_llvm_computes_the_same(folder: Path) -> None:
 @pytest.mark.gpu
 def test_a_gpu_computes_the_same(folder: Path) -> None:
     assert cuda_works()
-    one = alone(Job("step", str(folder), STEP, threads=1))
-    found = distance(one, alone(Job("step", str(folder), STEP, backend="cuda")))
+    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
+    found = distance(one, subprocess_job(Job("step", str(folder), STEP, backend="cuda")))
     assert found["image"] < IMAGE
     assert found["gradient"] < GRADIENT
 

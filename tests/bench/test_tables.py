@@ -138,7 +138,7 @@ def test_a_row_of_other_data_is_measured_again_and_one_of_other_versions_is_told
 
 
 def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_path):
-    monkeypatch.setattr(tables, "locate", lambda name: flat_folder)
+    monkeypatch.setattr(tables, "data_folder", lambda name: flat_folder)
     for name in ("flat-ble", "rfid-lab"):
         part = next(part for part in PARTS if part.dataset == name)
         (flag, path) = tables.scene_of(part, tmp_path)

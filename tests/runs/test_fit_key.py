@@ -15,7 +15,7 @@ import pytest
 from wrf_mi_bench import bench, methods, tables
 from wrf_mi_bench import budget as bench_budget
 from wrf_mi_bench.budget import Budget, budgets
-from wrf_mi_bench.methods import Place, field_run
+from wrf_mi_bench.methods import MethodInput, field_run
 from wrf_mi_bench.table_plan import PARTS, Row
 
 from wrf_mi.core import InputError, Record
@@ -29,8 +29,8 @@ def other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def place(one_gateway: Record, tmp_path: Path) -> Place:
-    return Place(one_gateway, Path("none"), tmp_path / "fits", rows=9, steps=10)
+def place(one_gateway: Record, tmp_path: Path) -> MethodInput:
+    return MethodInput(one_gateway, Path("none"), tmp_path / "fits", rows=9, steps=10)
 
 
 @pytest.fixture
@@ -47,17 +47,17 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return folders
 
 
-def with_data(place: Place, **changes: Any) -> Place:
+def with_data(place: MethodInput, **changes: Any) -> MethodInput:
     return replace(place, record=replace(place.record, **changes))
 
 
-def one_pixel(place: Place) -> Place:
+def one_pixel(place: MethodInput) -> MethodInput:
     observation = place.record.observation.copy()
     observation[0, 0, 3, 5] += 1e-3
     return with_data(place, observation=observation)
 
 
-CHANGES: dict[str, Callable[[Place], Place]] = {
+CHANGES: dict[str, Callable[[MethodInput], MethodInput]] = {
     "steps": lambda place: replace(place, steps=11),
     "rows": lambda place: replace(place, rows=8),
     "seed": lambda place: replace(place, seed=1),
@@ -70,14 +70,16 @@ CHANGES: dict[str, Callable[[Place], Place]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_field_of_other_settings_rows_or_data_is_fitted_anew(change: str, place: Place, trained: list[Path]) -> None:
+def test_field_of_other_settings_rows_or_data_is_fitted_anew(
+    change: str, place: MethodInput, trained: list[Path]
+) -> None:
     field_run(place, "wrf-gs", 7)
     field_run(CHANGES[change](place), "wrf-gs", 7)
     assert len(set(trained)) == 2
 
 
 def test_field_of_other_versions_is_fitted_anew(
-    place: Place, trained: list[Path], monkeypatch: pytest.MonkeyPatch
+    place: MethodInput, trained: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     field_run(place, "wrf-gs", 7)
     other_versions(monkeypatch)
@@ -86,7 +88,7 @@ def test_field_of_other_versions_is_fitted_anew(
 
 
 def test_same_field_is_used_again_and_logged(
-    place: Place, trained: list[Path], caplog: pytest.LogCaptureFixture
+    place: MethodInput, trained: list[Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     first = field_run(place, "wrf-gs", 7)
     assert "used again" not in caplog.text
@@ -97,7 +99,7 @@ def test_same_field_is_used_again_and_logged(
     assert f"{first.folder}: the same fit was finished before; used again" in caplog.text
 
 
-def test_stopped_field_is_fitted_from_the_start(place: Place, trained: list[Path]) -> None:
+def test_stopped_field_is_fitted_from_the_start(place: MethodInput, trained: list[Path]) -> None:
     folder = field_run(place, "wrf-gs", 7).folder
     (folder / "metrics.json").rename(folder / "left")
     assert field_run(place, "wrf-gs", 7).folder == folder
@@ -205,7 +207,7 @@ def test_rows_of_tables_are_run_anew_for_other_data_or_versions(
     class Scored:
         score, metrics = np.ones((1, 3)), dict.fromkeys(tables.KEPT, 1)
 
-    monkeypatch.setattr(tables, "run_module", run)
+    monkeypatch.setattr(bench, "run_module", run)
     monkeypatch.setattr(tables, "read_run", lambda folder: Scored)
     first = tables.measure(tmp_path, row)
     assert tables.measure(tmp_path, row)["data"] == first["data"]

@@ -7,8 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from wrf_mi_bench.scaling import rows, scale, verdict
-from wrf_mi_bench.scaling_axes import Axis
+from wrf_mi_bench.scaling import Axis, rows, scale, verdict
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.runs import timing
