@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -87,14 +86,14 @@ def again(dataset: str) -> list[Row]:
     return rows
 
 
-def apart(dataset: str, settings: Sequence[str] = SHORT, repeats: int = REPEATS) -> tuple[list[Row], dict[str, Any]]:
-    """Rows of differences without ``--deterministic``, and all scores; ``settings`` begin with ``steps``."""
+def apart(dataset: str) -> tuple[list[Row], dict[str, Any]]:
+    """Rows of differences without ``--deterministic``, and all scores."""
     most, own = max(2, os.cpu_count() or 1), init()
-    fit = Job("field", dataset, tuple(settings))
-    ways: dict[str, tuple[Job, Any, int]] = {f"{most} threads": (replace(fit, threads=most), None, repeats)}
+    fit = Job("field", dataset, SHORT)
+    ways: dict[str, tuple[Job, Any, int]] = {f"{most} threads": (replace(fit, threads=most), None, REPEATS)}
     ways |= {name: (replace(fit, threads=1), path, 1) for name, path in other_llvms().items()}
     if cuda_works():
-        ways["CUDA"] = (replace(fit, backend="cuda"), None, repeats)
+        ways["CUDA"] = (replace(fit, backend="cuda"), None, REPEATS)
     first = replace(fit, threads=1)
     here = [subprocess_job(step) for step in _steps(first)]
     scores = {"1 thread": [float(subprocess_job(first)["score"])]}
@@ -106,10 +105,10 @@ def apart(dataset: str, settings: Sequence[str] = SHORT, repeats: int = REPEATS)
             worst = max(distance(*pair)[what] for pair in pairs)
             rows.append(line(f"{what}, {against}", f"worst {worst:.1e}", f"at most {bound:g}"))
         scores[name] = [float(subprocess_job(job, llvm)["score"]) for _ in range(runs)]
-    of_all = [score for one in scores.values() for score in one]
+    every = [score for one in scores.values() for score in one]
     listed = "; ".join(f"{name} {', '.join(f'{score:.4f}' for score in one)}" for name, one in scores.items())
-    steps = int(settings[0].removeprefix("steps="))
-    value = f"{max(of_all) - min(of_all):.4f} apart: {listed}"
+    steps = int(SHORT[0].removeprefix("steps="))
+    value = f"{max(every) - min(every):.4f} apart: {listed}"
     rows.append(line(f"median SSIM after {steps:,} steps, {dataset}", value, f"at most {SCORE:g}"))
     return rows, {"scores": scores}
 

@@ -4,7 +4,6 @@ and WRF-GS+ from several starts."""
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +36,7 @@ START_SCHEDULE = ("steps=2000", "holdout_steps_fraction=0")
 NOTHING = "nothing"
 
 
-def compare(
-    record: Record, scene: str | Path, sizes: Sequence[int] = SIZES, seeds: Sequence[int] = SEEDS
-) -> dict[str, Any]:
+def compare(record: Record, scene: Path) -> dict[str, Any]:
     """SSIM of all methods on the official test rows; WRF-GS+ is trained with the first seed only.
 
     Returns:
@@ -52,20 +49,20 @@ def compare(
             return read_run(train(record, Path(work) / name, model, n_train=n_train, **asked).folder, name)
 
         traced = run("traced", "physics", 0, scene=scene)
-        learned = {size: run(f"gs-{size}", "wrf-gs+", size, seed=seeds[0], settings=SCHEDULE) for size in sizes}
+        learned = {size: run(f"gs-{size}", "wrf-gs+", size, seed=SEEDS[0], settings=SCHEDULE) for size in SIZES}
         found = []
-        for size in sizes:
-            fits = [run(f"physics-{size}-{seed}", "physics", size, scene=scene, seed=seed) for seed in seeds]
+        for size in SIZES:
+            fits = [run(f"physics-{size}-{seed}", "physics", size, scene=scene, seed=seed) for seed in SEEDS]
             scores: dict[str, list[FloatArray]] = {"physics": [fit.score[0] for fit in fits]}
-            simple = [_simple(record, size, seed) for seed in seeds]
+            simple = [_simple(record, size, seed) for seed in SEEDS]
             scores |= {name: [one[name] for one in simple] for name in simple[0]}
             for name, result in (
                 ("traced", traced),
                 ("wrf-gs+", learned[size]),
-                (f"wrf-gs+ of {max(sizes)} rows", learned[max(sizes)]),
+                (f"wrf-gs+ of {max(SIZES)} rows", learned[max(SIZES)]),
             ):
-                scores[name] = [result.score[0]] * len(seeds)
-            pairs = {name: compared(scores["physics"], each, seeds, "spectrum") for name, each in scores.items()}
+                scores[name] = [result.score[0]] * len(SEEDS)
+            pairs = {name: compared(scores["physics"], each, SEEDS, "spectrum") for name, each in scores.items()}
             facts = ("train_seconds", "ms_per_sample", "fitted")
             found.append(
                 {

@@ -62,7 +62,7 @@ def flat() -> dict[str, Any]:
     return {"rows": rows, **found}
 
 
-def strengths(asked: str, n_train: int | None = None, seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
+def strengths(asked: str, n_train: int | None = None) -> dict[str, Any]:
     """Errors of every method on the official test rows, fitted to ``n_train`` seeded training rows (None: all).
 
     Returns:
@@ -77,7 +77,7 @@ def strengths(asked: str, n_train: int | None = None, seeds: Sequence[int] = SEE
     with tempfile.TemporaryDirectory() as work:
         made = _scene(folder, work)
         scene = open_scene(made, float(record.frequencies_hz[0]))
-        for seed in seeds:
+        for seed in SEEDS:
             (split,) = make_splits(record, "official", seed=seed, n_train=n_train)
             found = _interpolated(record, split)
             out = Path(work) / str(seed)
@@ -92,7 +92,7 @@ def strengths(asked: str, n_train: int | None = None, seeds: Sequence[int] = SEE
             for name, errors in found.items():
                 scored.setdefault(name, []).append(errors)
     scores = {name: [error for error, _ in each] for name, each in scored.items()}
-    pairs = {name: compared(scores["physics"], each, seeds, "rssi") for name, each in scores.items()}
+    pairs = {name: compared(scores["physics"], each, SEEDS, "rssi") for name, each in scores.items()}
     methods = {name: [_figures(*one) for one in each] for name, each in scored.items()}
     rows: list[Row] = []
     for name, blocks in methods.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ KEPT = ("inside_90", "train_seconds", "ms_per_sample", "peak_memory_mb", "fitted
 ASKED = {"official": "better than the blend, or a tie; aim 0.985", "blocked": "better than all, 0.69; aim 0.78"}
 
 
-def spectra(record: Record, split: str, seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
+def spectra(record: Record, split: str) -> dict[str, Any]:
     """SSIM of the physics model and of simpler methods on the test rows of a split, all folds pooled.
 
     Returns:
@@ -37,7 +37,7 @@ def spectra(record: Record, split: str, seeds: Sequence[int] = SEEDS) -> dict[st
         by method the paired differences, and the verdicts on which all seeds agree.
     """
     runs = []
-    for seed in seeds:
+    for seed in SEEDS:
         with tempfile.TemporaryDirectory() as work:
             run = train(record, Path(work) / "run", "physics", split=split, seed=seed)
             runs.append(read_run(run.folder, "physics"))
@@ -45,7 +45,7 @@ def spectra(record: Record, split: str, seeds: Sequence[int] = SEEDS) -> dict[st
     methods["blend of 4 nearest"] = runs[0].reference_score[0]
     against = {}
     for name, values in methods.items():
-        pairs = compared([run.score[0] for run in runs], [values] * len(runs), seeds, "spectrum")
+        pairs = compared([run.score[0] for run in runs], [values] * len(runs), SEEDS, "spectrum")
         medians, means = verdicts(pairs)
         against[name] = {"pairs": [pair.plain() for pair in pairs], "medians": medians, "means": means}
     return {

@@ -36,29 +36,19 @@ SCANNER_HEIGHTS_M = (1.2, 1.8)
 """Least distance of a scanner from surfaces, and range of its height above the floor."""
 
 
-def scan_to_paths(
-    room: str | Path,
-    *,
-    receivers: int = 40,
-    poses: int = 6,
-    rays_per_pose: int = RAYS_PER_POSE,
-    range_noise_m: float = RANGE_NOISE_M,
-    rays: int = 1 << 20,
-    seed: int = 1,
-    keep: str | Path | None = None,
-) -> dict[str, Any]:
-    """Scan a room, make a scene of the points, and compare its paths with those of the room's own mesh.
+def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = 6, seed: int = 1) -> dict[str, Any]:
+    """Paths of a scene made from a scan, compared with those of the room's own mesh.
 
-    Reflectors are perfect, up to two reflections, so a path of length d has the power 1 / d^2 (up to a constant). Paths
-    of both meshes between the same ends are matched one to one. *Recall* is the share of the power of the room's paths
-    that have a partner, *precision* that of the made scene's.
+    Reflections are perfect, two at most, so a path of length d has the power 1 / d^2 up to a constant. Paths of equal
+    ends are matched one to one. *Recall* is the share of power of the room's paths that are matched, *precision* that
+    of the made scene's.
 
     Returns:
         ``recall`` and ``precision`` of power and of the number of paths, by the number of reflections too, numbers of
         points, surfaces and paths, seconds and the process's memory.
     """
     file = Path(room)
-    points, frequency_hz = scanned_points(file, poses, rays_per_pose, range_noise_m, seed)
+    points, frequency_hz = scanned_points(file, poses, seed=seed)
     data = read_arrays(file, KEYS[:3])
     original = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     triangles, moving = scene_surfaces(original).triangles, data["rx_pos"].astype(float)
@@ -68,23 +58,22 @@ def scan_to_paths(
     with tempfile.TemporaryDirectory() as folder:
         scan = write_arrays(Path(folder) / f"{file.stem}.npz", {"points": points})
         start = time.perf_counter()
-        made = make_scene(scan, keep or Path(folder) / "scene")
+        made = make_scene(scan, Path(folder) / "scene")
         seconds = time.perf_counter() - start
         memory = peak_memory_mb()
         other = open_scene(made.folder, frequency_hz)
         end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
-        options = TraceOptions(max_depth=2, rays=rays, seed=seed)
+        options = TraceOptions(max_depth=2, rays=1 << 20, seed=seed)
         truth, ours = (trace_paths(scene, chosen, end, options).paths for scene in (original, other))
     found = match(truth, ours)
     shares = {
         name: {"power": _power_share(paths, which), "paths": len(which) / max(len(paths), 1)}
         for name, paths, which in (("recall", truth, found[0]), ("precision", ours, found[1]))
     }
-    bounces = truth.bounces
     return {
         "room": file.stem,
         "points": len(points),
-        "range_noise_m": range_noise_m,
+        "range_noise_m": RANGE_NOISE_M,
         "outliers": OUTLIERS,
         "poses": poses,
         "surfaces": made.counts["surfaces"],
@@ -93,7 +82,8 @@ def scan_to_paths(
         "paths_made": len(ours),
         **shares,
         "recall_by_reflections": {
-            depth: _power_share(truth, found[0], bounces == depth) for depth in range(int(bounces.max(initial=0)) + 1)
+            depth: _power_share(truth, found[0], truth.bounces == depth)
+            for depth in range(int(truth.bounces.max(initial=0)) + 1)
         },
         "make_seconds": seconds,
         "peak_memory_mb": memory,
@@ -115,7 +105,7 @@ def match(truth: Paths, ours: Paths) -> tuple[IntArray, IntArray]:
 
 
 def scanned_points(
-    room: Path, poses: int, rays_per_pose: int = RAYS_PER_POSE, range_noise_m: float = RANGE_NOISE_M, seed: int = 1
+    room: Path, poses: int, rays_per_pose: int = RAYS_PER_POSE, seed: int = 1
 ) -> tuple[FloatArray, float]:
     """Points [n, 3] of a simulated scan of a NeWRF room from distant poses, and the room's frequency in Hz."""
     data = read_arrays(room, KEYS[:3])
@@ -124,8 +114,7 @@ def scanned_points(
     high = (places[:, 2] > SCANNER_HEIGHTS_M[0]) & (places[:, 2] < SCANNER_HEIGHTS_M[1])
     clear = _clearance(scene_surfaces(scene).triangles)(places) > SCANNER_CLEAR_M
     stands = spread(places[high & clear], poses)
-    points = simulate_scan(scene.mi_scene, stands, rays_per_pose=rays_per_pose, range_noise_m=range_noise_m, seed=seed)
-    return points, frequency_hz
+    return simulate_scan(scene.mi_scene, stands, rays_per_pose=rays_per_pose, seed=seed), frequency_hz
 
 
 def clear_of_walls(position_m: FloatArray, others_m: FloatArray, triangles: FloatArray) -> FloatArray:
@@ -179,9 +168,9 @@ def scans() -> dict[str, Any]:
     return {"rows": rows, "rooms": figures}
 
 
-def large_scan(points: int = 5_000_000, poses: int = 10) -> dict[str, Any]:
+def large_scan() -> dict[str, Any]:
     """Time and memory of a scene made from a large scan of the office of the NeWRF data."""
-    cloud, _ = scanned_points(room_file("office"), poses, points // poses)
+    cloud, _ = scanned_points(room_file("office"), 10, 500_000)
     with tempfile.TemporaryDirectory() as folder:
         scan = write_arrays(Path(folder) / "scan.npz", {"points": cloud.astype(np.float32)})
         count = len(cloud)

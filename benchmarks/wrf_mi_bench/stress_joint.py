@@ -9,8 +9,8 @@ step of each parameter: 1 / k for metres, 1 for rad and logarithms.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,12 @@ NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 
+TWO_BOUNCES = TraceOptions(max_depth=2, rays=1 << 13)
 Parts = dict[str, tuple[str, Mesh]]
+
+
+def _room() -> Parts:
+    return {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ class Case:
     """An ill-conditioned geometry.
 
     Attributes:
-        parts: scene.
+        parts: parts of the scene beside the room.
         receiver: receiver from which paths are searched.
         tx_pos_m: positions of transmitters [n, 3].
         options: options of the search.
@@ -90,68 +95,50 @@ class Case:
         moved: whether planes are shifted by millimetres and tilted by 0.01 rad.
     """
 
-    parts: Parts
-    receiver: Receiver
-    tx_pos_m: FloatArray
-    options: TraceOptions
-    values: Mapping[str, FloatArray]
+    parts: Parts = field(default_factory=dict)
+    receiver: Receiver = PLACE
+    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)
+    options: TraceOptions = TWO_BOUNCES
+    values: Mapping[str, FloatArray] = field(default_factory=dict)
     cancels: bool = False
     moved: bool = True
 
 
-def _room() -> Parts:
-    return {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
-
-
-def _coplanar() -> Case:
-    """A door and a panel in a wall's plane, and a partition of two layers 2 cm apart with transmission."""
-    parts = _room() | {
-        "door": ("itu_wood", sheet(0, 0.0, (1.0, 3.5), (0.0, 2.1))),
-        "panel": ("itu_metal", sheet(1, ROOM[1], (1.5, 4.5), (0.2, 2.0))),
-        "partition": ("itu_chipboard", sheet(0, 3.1, (0.0, 2.6), (0.0, 2.0))),
-        "layer": ("itu_plasterboard", sheet(0, 3.12, (0.0, 2.6), (0.0, 2.0))),
-    }
-    return Case(parts, PLACE, NEAR_M, TraceOptions(max_depth=3, max_reflections=2, transmission=True, rays=1 << 13), {})
-
-
-def _grazing() -> Case:
-    """Both antennas 1 mm above the floor, where line of sight and reflection cancel to a thousandth."""
-    low = replace(PLACE, position_m=np.array([5.6, 2.9, GRAZING_M]))
-    tx = np.array([[0.6, 1.8, GRAZING_M], [0.5, 2.9, 2 * GRAZING_M]])
-    return Case(_room(), low, tx, TraceOptions(max_depth=2, rays=1 << 13), {}, moved=False)
-
-
-def _mounted() -> Case:
-    """Paths searched 2 cm in front of a wall and evaluated on it, where reflection and direct path coincide."""
-    before = replace(PLACE, position_m=np.array([ROOM[0] - 0.02, 2.9, 1.4]))
-    onto = {"receiver.array.position": np.array([np.float32(0.02), 0.0, 0.0])}
-    return Case(_room(), before, NEAR_M, TraceOptions(max_depth=2, rays=1 << 13), onto, moved=False)
-
-
-def _cancelling() -> Case:
-    return Case(_room(), PLACE, NEAR_M[:1], TraceOptions(max_depth=2, rays=1 << 13), {}, cancels=True)
-
-
-def _many(count: int) -> Case:
-    tx = np.random.default_rng(5).uniform(0.15, 0.85, (count, 3)) * ROOM
-    return Case(_room(), PLACE, tx, TraceOptions(max_depth=3, rays=1 << 15), {})
-
-
-CASES: Mapping[str, Callable[[], Case]] = {
-    COPLANAR: _coplanar,
-    "grazing paths": _grazing,
-    "antenna on a wall": _mounted,
-    CANCELLING: _cancelling,
+CASES: Mapping[str, Case] = {
+    # A door and a panel in a wall's plane, and a partition of two layers 2 cm apart with transmission.
+    COPLANAR: Case(
+        {
+            "door": ("itu_wood", sheet(0, 0.0, (1.0, 3.5), (0.0, 2.1))),
+            "panel": ("itu_metal", sheet(1, ROOM[1], (1.5, 4.5), (0.2, 2.0))),
+            "partition": ("itu_chipboard", sheet(0, 3.1, (0.0, 2.6), (0.0, 2.0))),
+            "layer": ("itu_plasterboard", sheet(0, 3.12, (0.0, 2.6), (0.0, 2.0))),
+        },
+        options=TraceOptions(max_depth=3, max_reflections=2, transmission=True, rays=1 << 13),
+    ),
+    # Line of sight and reflection cancel to a thousandth.
+    "grazing paths": Case(
+        receiver=replace(PLACE, position_m=np.array([5.6, 2.9, GRAZING_M])),
+        tx_pos_m=np.array([[0.6, 1.8, GRAZING_M], [0.5, 2.9, 2 * GRAZING_M]]),
+        moved=False,
+    ),
+    # Searched 2 cm in front of a wall and evaluated on it, where its reflection and the direct path coincide.
+    "antenna on a wall": Case(
+        receiver=replace(PLACE, position_m=np.array([ROOM[0] - 0.02, 2.9, 1.4])),
+        values={"receiver.array.position": np.array([np.float32(0.02), 0.0, 0.0])},
+        moved=False,
+    ),
+    CANCELLING: Case(tx_pos_m=NEAR_M[:1], cancels=True),
 }
 
 
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
     """Values and derivatives of `CASES` and of ``many`` transmitters, the worst of the receiver models."""
-    cases = {**CASES, "many paths": lambda: _many(many)}
+    tx_pos_m = np.random.default_rng(5).uniform(0.15, 0.85, (many, 3)) * ROOM
+    cases = {**CASES, "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(max_depth=3, rays=1 << 15))}
     rows = []
     for name in cases if names is None else names:
         with tempfile.TemporaryDirectory() as work:
-            rows += _Joint(cases[name](), Path(work)).rows(name, models)
+            rows += _Joint(cases[name], Path(work)).rows(name, models)
     return rows
 
 
@@ -160,7 +147,7 @@ class _Joint:
 
     def __init__(self, case: Case, work: Path) -> None:
         self._case, rng = case, np.random.default_rng(7)
-        scene = open_scene(write_scene(work, case.parts, "Stress"), HZ, THICKNESS_M)
+        scene = open_scene(write_scene(work, _room() | case.parts, "Stress"), HZ, THICKNESS_M)
         options = TracedOptions(case.options, 2, gain=100.0, materials="surface", planes=True)
         self._traced = TracedField(scene, case.tx_pos_m, case.receiver, options)
         self._oracle = TracedOracle(self._traced)

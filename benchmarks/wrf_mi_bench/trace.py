@@ -30,25 +30,25 @@ from .comparison import line, room_file
 ROOMS = ("conference", "office")
 SAME_LENGTH_M = 1e-3
 SAME_POINT_M = 1e-2
-"""The same path: as long to 1 mm, and its last interaction point within 1 cm."""
+"""Tolerances of equal paths: length, and last interaction point."""
 ON_SURFACE_M = 1e-4
-"""Crossings so close to a path's own points are the reflections themselves."""
+"""Distance from a path's points within which a crossing is the reflection itself."""
 MIRRORED = 1e-5
-"""Cosines of the angles before and after a reflection: 1e-6 m over the shortest segments."""
+"""Tolerance of the cosine between bisector and normal of a reflection."""
 SHORTEST_M = 1e-2
-"""Sionna RT drops paths with a shorter segment."""
+"""Least length of a segment in Sionna RT."""
 
 
-def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) -> dict[str, Any]:
+def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, Any]:
     """Paths and channels of a room of the NeWRF data compared with MATLAB's.
 
     MATLAB's image method has perfect reflections without change of sign, two at most, so the channel is the sum over
     paths of lambda / (4 pi d) exp(-j k d). Paths that MATLAB lacks are confirmed in float64 by `confirm_paths`.
 
     Returns:
-        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers that MATLAB has a
-        channel for and over those of them where MATLAB lacks no path, seconds, and the process's memory. Quantiles
-        of no receiver and the share of no path are None.
+        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers with a channel in
+        MATLAB and over those where MATLAB lacks no path, seconds, and memory; None for quantiles of no receiver and
+        the share of no path.
     """
     file = Path(room)
     data = read_arrays(file, KEYS)
@@ -57,8 +57,8 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
     scene = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     access_point = Receiver("access-point", data["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0]))
     start = time.perf_counter()
-    options = TraceOptions(max_depth=2, rays=rays, seed=seed)
-    # The moving end is the transmitter, by reciprocity: MATLAB's last point is our first.
+    options = TraceOptions(max_depth=2, rays=rays, seed=1)
+    # The moving end is the transmitter, by reciprocity, so MATLAB's last point is the first one here.
     trace = trace_paths(scene, data["rx_pos"], access_point, options)
     seconds = time.perf_counter() - start
     paths = trace.paths
