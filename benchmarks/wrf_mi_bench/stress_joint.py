@@ -37,7 +37,7 @@ from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.pose import receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
-from .stress_oracle import TracedOracle, Values, slopes
+from .stress_oracle import OraclePaths, TracedOracle, Values, slopes
 from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
 from .stress_traced import ROOM, box_sheets
 
@@ -180,26 +180,32 @@ class _Joint:
 
     def rows(self, name: str, models: Iterable[str]) -> list[Row]:
         """Values and derivatives of the receiver models."""
-        value, slope, count = Worst(), GradientWorst(), 0
-        paths = int(self._traced.exists.sum())
-        for kind in models:
-            model, count = MODELS[kind], count + 1
-            size = len(self._traced) * int(np.prod(model.shape))
-            weight = np.random.default_rng(3).normal(size=size).astype(np.float32)
-            found, single = self._by_graph(model, weight, mi.Float)
-            _, double = self._by_graph(model, weight, DOUBLE, learned_alone=True)
-            reference = _Reference(self, model)
-            value.add(reference.error(found), kind)
-            steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
-            of_paths = slopes(reference, self._values, steps, weight.astype(float))
-            truth = {key: part + of_paths.get(key, 0) for key, part in double.items()}
-            felt = {key: self._felt(key) for key in truth}
-            slope.add(single, truth, felt, kind)
-        what = f"{name}, {paths} paths, {count} cases"
+        value, slope = Worst(), GradientWorst()
+        references = {kind: _Reference(self, MODELS[kind]) for kind in models}
+        weights = {
+            kind: np.random.default_rng(3).normal(size=len(self._traced) * int(np.prod(MODELS[kind].shape)))
+            for kind in references
+        }
+        weights = {kind: weight.astype(np.float32) for kind, weight in weights.items()}
+
+        def functionals(values: Values) -> FloatArray:
+            paths = self._oracle(values)
+            return np.array([references[kind].report(paths) @ weights[kind].astype(float) for kind in references])
+
+        paths = self._oracle(self._values)
+        steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
+        of_paths = slopes(functionals, self._values, steps)
+        for number, (kind, reference) in enumerate(references.items()):
+            found, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
+            _, double = self._by_graph(MODELS[kind], weights[kind], DOUBLE, learned_alone=True)
+            value.add(reference.error(found, paths), kind)
+            truth = {key: part + (of_paths[key][number] if key in steps else 0) for key, part in double.items()}
+            slope.add(single, truth, {key: self._felt(key) for key in truth}, kind)
+        what = f"{name}, {int(self._traced.exists.sum())} paths, {len(references)} cases"
         return [value.row(f"joint: {what}", IMAGE), slope.row(f"joint: derivatives, {what}", GRADIENT)]
 
     def _felt(self, name: str) -> FloatArray:
-        """What a parameter's derivatives are multiplied with to be compared with those of others."""
+        """Factors of a parameter's derivatives that make them comparable."""
         if name.startswith("field."):
             values = self._values[name]
             return values - self._case.receiver.position_m[:, None] if name == "field.position" else values
@@ -209,15 +215,15 @@ class _Joint:
         return self._learned_of(model, {name: _tensor(value, kind) for name, value in values.items()}, kind)
 
     def _learned_of(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
-        own = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
-        gaussians = self._field.gaussians(own, _tensor(self._case.tx_pos_m.T, kind))
+        weights = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
+        gaussians = self._field.gaussians(weights, _tensor(self._case.tx_pos_m.T, kind))
         pose = receiver_pose(self._case.receiver, params, kind)
         return learned_field(gaussians, pose, perception_plane(*SIZE, kind), model.sphere)
 
     def _by_graph(
         self, model: Any, weight: Any, kind: Any, learned_alone: bool = False
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Report, and derivatives of its weighted sum: of both sides, or with the paths held."""
+        """Report, and derivatives of its weighted sum, by both sides or with constant paths."""
         params = {name: _tensor(value, kind) for name, value in self._values.items()}
         dr.enable_grad(params)
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
@@ -228,35 +234,34 @@ class _Joint:
 
 
 class _Reference:
-    """A report in NumPy as a function of what moves paths, the learned side held; that is Dr.Jit's in float64."""
+    """Report in NumPy as a function of the paths, with the learned side of Dr.Jit's float64."""
 
     def __init__(self, joint: _Joint, model: Any) -> None:
-        self._joint, self._model = joint, model
+        self._model = model
         re, im = joint._learned(model, joint._values, DOUBLE)
         there = (re.numpy() + 1j * im.numpy()).reshape(len(joint._case.tx_pos_m), -1)
         if isinstance(model, CsiReceiver):
             there = np.repeat(there @ _solid(model)[:, None], len(model.frequencies_hz), axis=1)
         self._there = there
 
-    def __call__(self, values: Values) -> FloatArray:
-        return self._report(self._here(values), self._there)
+    def report(self, paths: OraclePaths) -> FloatArray:
+        """Flat report."""
+        return self._report(self._here(paths), self._there)
 
-    def error(self, found: FloatArray) -> float:
-        """Of a report with the joint's own parameters."""
-        joint, model = self._joint, self._model
-        here, there = self._here(joint._values), self._there
+    def error(self, found: FloatArray, paths: OraclePaths) -> float:
+        """Error of a report."""
+        model, here, there = self._model, self._here(paths), self._there
         truth = self._report(here, there)
         if not isinstance(model, CsiReceiver):
             return relative(found - truth, truth)
-        paths = joint._oracle(joint._values)
         waves = np.abs(paths.gain).reshape(len(here), -1).sum(axis=1) + np.abs(there).max(axis=1)
         if isinstance(model, PowerReceiver):
             return float((np.abs(10 ** (found / 20) - 10 ** (truth / 20)) / waves).max())
         return float((np.abs((found - truth).reshape(len(here), -1)) / waves[:, None]).max())
 
-    def _here(self, values: Values) -> NDArray[np.complex128]:
+    def _here(self, paths: OraclePaths) -> NDArray[np.complex128]:
         """Traced signals [n, ports]."""
-        model, paths = self._model, self._joint._oracle(values)
+        model = self._model
         if isinstance(model, CsiReceiver):
             return paths.at(np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz))
         return paths.at(ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))

@@ -175,20 +175,17 @@ def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
     return np.exp(series)
 
 
-def slopes(
-    of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float], weight: FloatArray
-) -> dict[str, FloatArray]:
-    """Derivatives of ``weight . of(values)`` by the parameters in ``steps``, by fourth-order central differences."""
+def slopes(of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float]) -> dict[str, FloatArray]:
+    """Derivatives [m, ...] of functionals [m] by the parameters in ``steps``, by fourth-order central differences."""
     found = {}
     for name, step in steps.items():
-        slope = np.zeros(values[name].shape)
-        for k in np.ndindex(*slope.shape):
-            way = np.zeros(slope.shape)
-            way[k] = 1
+        shape = values[name].shape
+        columns = []
+        for way in np.eye(int(np.prod(shape))).reshape(-1, *shape):
             near, far = (
                 (of({**values, name: values[name] + h * way}) - of({**values, name: values[name] - h * way})) / (2 * h)
                 for h in (step / 2, step)
             )
-            slope[k] = ((4 * near - far) / 3) @ weight
-        found[name] = slope
+            columns.append((4 * near - far) / 3)
+        found[name] = np.transpose(columns).reshape(-1, *shape)
     return found

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +144,8 @@ def traced_gradients(count: int = 6) -> list[Row]:
     return [_solver_gradients(scene, traced), *_physics_gradients(scene, traced, receiver, options)]
 
 
-Reported = Callable[[Mapping[str, Any]], Any]
+Reports = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""Flat differentiable reports by name, from parameters as tensors."""
 
 
 def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
@@ -163,19 +164,20 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
         constants = {
             n: (1 + dr.exp(given[f"permittivity {n}"].array), dr.exp(given[f"conductivity {n}"].array)) for n in names
         }
-        # The calculator is asked again in the reverse pass, when the materials have to be these.
+        # The reverse pass evaluates the field again and needs these materials.
         kept.enter_context(with_materials(scene, constants))
         return field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
 
+    def reports(given: Mapping[str, Any]) -> Mapping[str, Any]:
+        parts = field(given)
+        # Power relative to what was traced, as dB in float32 are too coarse for differences.
+        power = sum(dr.square(part) for part in parts) * scale
+        return {"gains": dr.concat([part * 1e3 for part in parts]), "power": power}
+
     kept = ExitStack()
-    reports: dict[str, Reported] = {
-        "gains": lambda given: dr.concat([part * 1e3 for part in field(given)]),
-        # In shares of what was traced: dB in float32 are too coarse for differences.
-        "power": lambda given: sum(dr.square(part) for part in field(given)) * scale,
-    }
     worst = Worst()
-    for report, of in reports.items():
-        _against_differences(of, values, {}, 0.2, worst, report, kept.close)
+    for name, found in _against_differences(reports, values, {}, 0.2, kept.close).items():
+        worst.add(found.error, f"{found.where}, {name}")
     return worst.row(f"derivatives of Sionna RT's fields by {len(values)} constants of materials", TRACED_GRADIENT)
 
 
@@ -195,71 +197,79 @@ def _physics_gradients(scene: Any, traced: TraceResult, receiver: Receiver, opti
         "rssi": PowerReceiver(12, 40, (CARRIER_HZ,)),
         "csi": CsiReceiver(12, 40, (CARRIER_HZ, 1.01 * CARRIER_HZ)),
     }
-    rows = []
-    for name, model in models.items():
-        worst = Worst()
-        _against_differences(_reporter(model, field), values, steps, 0.02, worst)
-        what = f"derivatives of the traced side, {name}, by {len(values)} parameters"
-        rows.append(worst.row(what, TRACED_GRADIENT))
-    return rows
 
+    def reports(given: Mapping[str, Any]) -> Mapping[str, Any]:
+        paths = field(given)
+        return {name: model(paths, None) for name, model in models.items()}
 
-def _reporter(model: Any, field: TracedField) -> Reported:
-    return lambda given: model(field(given), None)
+    found = _against_differences(reports, values, steps, 0.02)
+    by = f"by {len(values)} parameters"
+    return [w.row(f"derivatives of the traced side, {name}, {by}", TRACED_GRADIENT) for name, w in found.items()]
 
 
 def _against_differences(
-    of: Reported,
+    of: Reports,
     values: Mapping[str, FloatArray],
     steps: Mapping[str, float],
     step: float,
-    worst: Worst,
-    where: str = "",
     done: Callable[[], None] = lambda: None,
-) -> None:
-    """Compare derivatives of a random functional of a float32 report with central differences of float32 reports.
+) -> dict[str, Worst]:
+    """Errors of derivatives of random functionals of float32 reports, relative to central differences.
 
-    Sums over a report are NumPy's, in float64: what is tested is the report.
+    Sums over a report are NumPy's, in float64, so that only the report is tested.
+
+    Args:
+        of: reports of parameters.
+        values: parameters.
+        steps: longest steps of some parameters, see `_slope`.
+        step: longest step of the others.
+        done: called when reports and their derivatives are no longer needed.
+
+    Returns:
+        Worst error and parameter of each report.
     """
-    rng = np.random.default_rng(3)
-    tensors = {name: to_tensor(value) for name, value in values.items()}
-    dr.enable_grad(tensors)
-    report = of(tensors)
-    weight = rng.normal(size=dr.width(report))
-    dr.backward(dr.sum(report * on_device(weight, type(report))))
-    slopes = {name: np.asarray(dr.grad(value).numpy(), float) for name, value in tensors.items()}
-    done()
+    weights: dict[str, FloatArray] = {}
+    slopes: dict[str, dict[str, FloatArray]] = {}
     fixed = {name: to_tensor(value) for name, value in values.items()}
+    with dr.suspend_grad():
+        for name, report in of(fixed).items():
+            weights[name] = np.random.default_rng(3).normal(size=dr.width(report))
+    done()
+    for name, weight in weights.items():
+        tensors = {key: to_tensor(value) for key, value in values.items()}
+        dr.enable_grad(tensors)
+        report = of(tensors)[name]
+        dr.backward(dr.sum(report * on_device(weight, type(report))))
+        slopes[name] = {key: np.asarray(dr.grad(value).numpy(), float) for key, value in tensors.items()}
+        done()
 
-    def along(name: str, way: FloatArray) -> Callable[[float], float]:
-        def moved(by: float) -> float:
-            with dr.suspend_grad():
-                found = of(fixed | {name: to_tensor(values[name] + by * way)}).numpy().astype(float)
-            done()
-            return float(found @ weight)
+    def along(key: str, way: FloatArray, by: float) -> FloatArray:
+        with dr.suspend_grad():
+            reports = of(fixed | {key: to_tensor(values[key] + by * way)})
+            found = [reports[name].numpy().astype(float) @ weight for name, weight in weights.items()]
+        done()
+        return np.array(found)
 
-        return moved
+    rng = np.random.default_rng(4)
+    ways = {key: rng.normal(size=v.shape) if v.size > 1 else np.ones(v.shape) for key, v in values.items()}
+    sizes = {key: _slope(partial(along, key, way), steps.get(key, step)) for key, way in ways.items()}
+    worst = {name: Worst() for name in weights}
+    for number, name in enumerate(weights):
+        least = LEAST_SLOPE * float(np.median([abs(size[number]) for size in sizes.values()]))
+        for key, way in ways.items():
+            size = float(sizes[key][number])
+            worst[name].add(abs(size - float((slopes[name][key] * way).sum())) / max(abs(size), least), key)
+    return worst
 
-    errors, sizes = {}, {}
-    for name, value in values.items():
-        way = rng.normal(size=value.shape) if value.size > 1 else np.ones(value.shape)
-        sizes[name] = _slope(along(name, way), steps.get(name, step))
-        errors[name] = abs(sizes[name] - float((slopes[name] * way).sum()))
-    least = LEAST_SLOPE * float(np.median(np.abs(list(sizes.values()))))
-    for name, error in errors.items():
-        worst.add(error / max(abs(sizes[name]), least), f"{name}, {where}" if where else name)
 
-
-def _slope(of: Callable[[float], float], longest: float, halvings: int = 4) -> float:
-    """Derivative at 0 by central differences of the fourth order: of steps halved, the two that agree best.
-
-    Long steps feel the curvature, short ones the roundings; where neither matters the estimates agree.
+def _slope(of: Callable[[float], FloatArray], longest: float, halvings: int = 4) -> FloatArray:
+    """Derivatives at 0 by fourth-order central differences of halved steps: the two estimates that agree best.
 
     Source: Ridders, "Accurate computation of F'(x)" (1982), for choosing the step by the estimates alone.
     """
     steps = longest * 0.5 ** np.arange(halvings + 1)
-    second = [(of(h) - of(-h)) / (2 * h) for h in steps]
-    fourth = [(4 * near - far) / 3 for far, near in pairwise(second)]
-    apart = [abs(a - b) for a, b in pairwise(fourth)]
-    best = int(np.argmin(apart))
-    return (fourth[best] + fourth[best + 1]) / 2
+    second = np.array([(of(h) - of(-h)) / (2 * h) for h in steps])
+    fourth = (4 * second[1:] - second[:-1]) / 3
+    best = np.abs(np.diff(fourth, axis=0)).argmin(axis=0)
+    each = np.arange(fourth.shape[1])
+    return np.asarray((fourth[best, each] + fourth[best + 1, each]) / 2)
