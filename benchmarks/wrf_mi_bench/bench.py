@@ -45,7 +45,7 @@ MEASURED, STORED_CHECK = "bench.json", "check.json"
 
 
 class CheckRefused(InputError):
-    """Data of a check are missing; its process has said so on standard error."""
+    """Data of a check are missing; its process has printed that on standard error."""
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def again(dataset: str) -> list[Row]:
 
 def apart(dataset: str) -> tuple[list[Row], dict[str, Any]]:
     """Rows of differences without ``--deterministic``, and all scores."""
-    most, own = max(2, os.cpu_count() or 1), init()
+    most, version = max(2, os.cpu_count() or 1), init().llvm_version
     fit = Job("field", dataset, SHORT)
     ways: dict[str, tuple[Job, Any, int]] = {f"{most} threads": (replace(fit, threads=most), None, REPEATS)}
     ways |= {name: (replace(fit, threads=1), path, 1) for name, path in other_llvms().items()}
@@ -100,7 +100,7 @@ def apart(dataset: str) -> tuple[list[Row], dict[str, Any]]:
     rows = []
     for name, (job, llvm, runs) in ways.items():
         pairs = [(one, subprocess_job(s, llvm)) for one, s in zip(here, _steps(job), strict=True) for _ in range(runs)]
-        against = f"{name} against 1 thread of LLVM {own.llvm_version}, {len(pairs)} cases"
+        against = f"{name} against 1 thread of LLVM {version}, {len(pairs)} cases"
         for what, bound in (("image", IMAGE), ("gradient", GRADIENT)):
             worst = max(distance(*pair)[what] for pair in pairs)
             rows.append(line(f"{what}, {against}", f"worst {worst:.1e}", f"at most {bound:g}"))
@@ -120,11 +120,11 @@ def _steps(fit: Job) -> list[Job]:
 
 def other_llvms() -> dict[str, Any]:
     """Files of usable LLVM libraries of other major versions than this process uses, by name."""
-    own = (init().llvm_version or "").split(".")[0]
+    major = (init().llvm_version or "").split(".")[0]
     found: dict[str, Any] = {}
     for library in find_llvm(ignore_variable=True):
         verdict = try_llvm(library)
-        if verdict.usable and verdict.version.split(".")[0] != own:
+        if verdict.usable and verdict.version.split(".")[0] != major:
             found.setdefault(f"LLVM {verdict.version}", library.path)
     return found
 

@@ -35,7 +35,7 @@ from wrf_mi.training.config import TrainConfig
 from .stock import StockRenderer, rgb_variant
 
 Predict = Callable[[FloatArray], NDArray[Any]]
-"""From transmitter positions [m, 3] in metres to spectra [m, height, width]."""
+"""Function from transmitter positions [m, 3] in metres to spectra [m, height, width]."""
 
 STEPS = 3000
 """Training steps of every learned field: a third of the default, so that all fits take minutes."""

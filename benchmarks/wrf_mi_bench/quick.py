@@ -207,7 +207,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
 
 def file_of(out: Path) -> Path:
     """File of this backend's stored ratios: ``quick.json``, or ``quick-cuda.json``."""
-    return out / (FILE if (own := init().name) == "llvm" else FILE.replace(".", f"-{own}."))
+    return out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
 
 
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
@@ -220,8 +220,8 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
         raise InputError(f"{file}: no stored ratios; measure them with `wrf-mi bench --quick --store`") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: not readable ({one_line(error)}); restore it") from None
-    if backend != (own := init().name):
-        raise InputError(f"{file}: ratios of the backend {backend}; store those of {own} in another folder with --out")
+    if backend != (name := init().name):
+        raise InputError(f"{file}: ratios of the backend {backend}; store those of {name} in another folder with --out")
     return ratios
 
 

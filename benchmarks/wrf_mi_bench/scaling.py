@@ -208,7 +208,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         "work": axis.work,
         "sizes": sizes,
         "left_out": list(axis.sizes[len(sizes) :]),
-        "ms": [float(np.median(own)) for own in times],
+        "ms": [float(np.median(ms)) for ms in times],
         "memory_mb": memory,
         "exponent": vars(found),
         "limit": n_log_n(sizes),
@@ -216,7 +216,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
 
 
 def verdict(found: Interval, limit: float) -> str:
-    """Whether growth is at most that of the limit: only what lies above it with its whole interval is not."""
+    """Whether growth is at most that of the limit; it fails only where its whole interval lies above."""
     if found.low > limit:
         return "does not hold"
     return "holds" if found.high <= limit else "holds within its interval"

@@ -125,7 +125,7 @@ def _of_table(row: Row) -> Group:
     def again(runs: Path) -> list[float]:
         found = measure(runs, row)
         if found["data"] != stored.get("data", found["data"]):
-            raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it anew")
+            raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it again")
         return [found["score"]["median"]]
 
     return Group(row.name, (figure,), again, available(row.part))

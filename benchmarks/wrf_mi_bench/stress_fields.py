@@ -158,7 +158,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
     if sphere:
         directions = np.concatenate([directions, directions * [1, -1, -1]])
     parts = (field.position_m, field.scale_m, field.rotation)
-    own = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
+    last = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
     seen = oracle.project(*parts, RECEIVER)
     clear = np.ones(directions.shape[:2], bool)
     for i in seen.order:
@@ -167,7 +167,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
         reach = np.sqrt(np.einsum("...i,ij,...j->...", point, np.linalg.inv(seen.covariance[i]), point))
         clear &= (np.abs(reach - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
         clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
-    return oracle.render(*parts, field.signal, RECEIVER, directions, **own), clear
+    return oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 
 Report = Callable[[Gaussians, Pose], Sequence[Any]]

@@ -86,8 +86,8 @@ class TracedOracle:
         sent = np.einsum("ijp,pi->pj", turned, traced.options.tx_antenna.field(departure)).astype(complex)
         for level, before, after in zip(self._levels, ways, ways[1:], strict=False):
             sent = self._interact(walls, level, before, after, sent, values)
-        own = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
-        taken = receiver.antenna.field(-ways[-1] @ own) @ own.T
+        antenna = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
+        taken = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
         loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
         gain = (taken * sent).sum(axis=-1) * loss
         amplitude, phase = values.get(traced.gain_name, np.array([np.log(traced.options.gain), 0.0]))
@@ -110,7 +110,7 @@ class TracedOracle:
             return stated if whole is None else least + np.exp(whole)
         entries = [values.get(name_of(name, quantity)) for name in slabs.names]
         return np.array(
-            [s if own is None else least + np.exp(own[0]) for s, own in zip(stated, entries, strict=True)], float
+            [s if entry is None else least + np.exp(entry[0]) for s, entry in zip(stated, entries, strict=True)], float
         )
 
     def _interact(

@@ -128,7 +128,7 @@ def _mirror_images(tx: FloatArray, rx: FloatArray, size: FloatArray, depth: int 
 
 
 def traced_gradients(count: int = 6) -> list[Row]:
-    """Derivatives of what is traced in a room against central differences, the paths kept."""
+    """Rows of derivatives in a room with constant paths, compared with central differences."""
     with tempfile.TemporaryDirectory() as work:
         kinds = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_concrete")
         parts = {n: (kind, wall) for kind, (n, wall) in zip(kinds, box_sheets(ROOM).items(), strict=True)}
@@ -137,7 +137,7 @@ def traced_gradients(count: int = 6) -> list[Row]:
         scene = open_scene(write_scene(Path(work), parts, "Room"), CARRIER_HZ, thickness)
     rng = np.random.default_rng(0)
     tx = np.array([1.9, 1.8, 1.3]) + rng.uniform(-0.3, 0.3, (count, 3))
-    # Turned with its array, so that reports depend on how it is turned.
+    # The antenna turns with its array, so that reports depend on the rotation.
     receiver = Receiver("array", np.array([4.2, 2.9, 0.4]), np.array([0.0, 0.0, 0.0, 1.0]), Antenna(frame="array"))
     options = TraceOptions(max_depth=2, transmission=True, rays=1 << 12)
     traced = trace_paths(scene, tx, receiver, options)
@@ -182,8 +182,7 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
 
 
 def _physics_gradients(scene: Any, traced: TraceResult, receiver: Receiver, options: TraceOptions) -> list[Row]:
-    """What the receivers of the physics model report of its traced side, in float32, by materials, pose, gain and
-    patterns."""
+    """Rows of reports of the traced side in float32 by materials, pose, gain and patterns."""
     field = TracedField(scene, traced.tx_pos_m, receiver, TracedOptions(options, 2, gain=300.0), traced=traced)
     rng, elements = np.random.default_rng(1), planar_array(3, 3, 0.06)
     values = {name: value.astype(float) for name, value in field.parameters().items()}

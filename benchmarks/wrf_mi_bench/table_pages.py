@@ -36,12 +36,12 @@ def write_tables(place: Path, quick: bool = False) -> None:
         if shown := overview(name, stored, quick):
             text += [f"## {heading.capitalize()}: medians", shown]
     for part in PARTS:
-        own = [row for row in plan(quick) if row.part == part and row.name in stored]
-        if not own:
+        rows = [row for row in plan(quick) if row.part == part and row.name in stored]
+        if not rows:
             continue
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, own, stored)]
-        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
+        text += [f"## {title}", part_table(part, rows, stored)]
+        whole = [row for row in rows if row.share == max(row.share for row in rows) and row.seed == 0]
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
             {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
@@ -156,7 +156,7 @@ def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapp
     if "idw" in part.entries:
         return []
     digits, share = 2, max(share for share, _ in groups)
-    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
+    one = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
     words, lines = TASKS[part.task].references, []
     for key, block in one["reference"].items():
         scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))

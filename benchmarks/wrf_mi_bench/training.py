@@ -39,7 +39,7 @@ from .comparison import line
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "physics": "physics"}
 ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Of the physics model and of WRF-GS+, on two cores."""
+"""Bounds on time and memory of the physics model and of WRF-GS+, on two cores."""
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
 STEPS, ROUNDS = 10, 9
@@ -51,7 +51,7 @@ FORWARD, BACKWARD = 28, 63
 """Operations of a pixel and a Gaussian on its tile's list, counted in `wrf_mi.gaussians.blend` (alpha blending): a
 multiply-add is two, a root, an exponential or a reciprocal one."""
 SHARED_FORWARD, SHARED_BACKWARD = 4, 8
-"""Of these, what a further transmitter of the same geometry adds."""
+"""Operations of a further transmitter with the same geometry."""
 QUIET = ("density.every=0", "log_every=1000000", "validate_every=1000000", "checkpoint_every=1000000")
 
 
@@ -106,8 +106,8 @@ def fit_in_subprocess(model: str) -> dict[str, Any]:
 def trainer(model: str, gaussians: int, batch: int) -> Trainer:
     """Trainer with a number of Gaussians and transmitters a step, otherwise default, without end."""
     record = load_record(DATA)
-    own = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
-    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), own))
+    given = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
+    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), given))
 
 
 def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
@@ -192,7 +192,7 @@ PRODUCTS, WALKS = "products of networks", "two longest kernels, the walks of spl
 def shares(call: Callable[[], Any]) -> dict[str, float]:
     """Shares of the time of a call by kind of work, from Dr.Jit's kernel history."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()  # recorded anew, as recordings depend on this flag
+        call()  # recorded again, as recordings depend on this flag
         dr.sync_thread()
         dr.kernel_history_clear()
         whole = 1e3 * seconds(call)
@@ -218,7 +218,7 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
 
 def main() -> dict[str, Any]:
     """Fits of all models, and their steps beside the machine's best."""
-    load_record(DATA)  # what is missing is said first
+    load_record(DATA)  # missing data are reported first
     fits = {model: fit_in_subprocess(model) for model in TITLES}
     trainers = {
         f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)

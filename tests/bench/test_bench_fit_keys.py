@@ -68,7 +68,7 @@ CHANGES: dict[str, Callable[[MethodInput], MethodInput]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_field_of_other_settings_rows_or_data_is_fitted_anew(
+def test_field_of_other_settings_rows_or_data_is_fitted_again(
     change: str, place: MethodInput, trained: list[Path]
 ) -> None:
     field_run(place, "wrf-gs", 7)
@@ -76,7 +76,7 @@ def test_field_of_other_settings_rows_or_data_is_fitted_anew(
     assert len(set(trained)) == 2
 
 
-def test_field_of_other_versions_is_fitted_anew(
+def test_field_of_other_versions_is_fitted_again(
     place: MethodInput, trained: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     field_run(place, "wrf-gs", 7)
@@ -105,7 +105,7 @@ def test_stopped_field_is_fitted_from_the_start(place: MethodInput, trained: lis
     assert not (folder / "left").exists()
 
 
-def test_budgets_of_other_seeds_or_schedules_are_fitted_anew(
+def test_budgets_of_other_seeds_or_schedules_are_fitted_again(
     one_gateway: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folders = []
@@ -123,9 +123,7 @@ def test_budgets_of_other_seeds_or_schedules_are_fitted_anew(
 
 
 @pytest.mark.parametrize("name", ["wrf-gs-official", "flat-ble"])
-def test_cases_of_bench_have_a_folder_for_data_and_versions(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_case_folder_depends_on_data_and_versions(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
     monkeypatch.setattr(bench, "dataset_files", lambda dataset: [data])
     data.mkdir()
@@ -143,7 +141,7 @@ def test_cases_of_bench_have_a_folder_for_data_and_versions(
     assert all(folder.name.startswith(f"{name}-") for folder in folders)
 
 
-def test_rows_of_tables_are_run_anew_for_other_data_or_versions(
+def test_rows_of_tables_are_run_again_for_other_data_or_versions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     row = Row(next(part for part in PARTS if part.dataset == "flat-ble"), "idw", 1.0, 0)

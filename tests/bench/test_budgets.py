@@ -12,7 +12,7 @@ from wrf_mi.core import Record
 from wrf_mi.training.compress import Compression
 
 
-def test_budgets_are_measured_beside_each_other(folder: Path, one_gateway: Record, tmp_path: Path) -> None:
+def test_budgets_are_compared_with_the_first(folder: Path, one_gateway: Record, tmp_path: Path) -> None:
     record = replace(one_gateway, source=str(folder))
     small_one = ("model=factorised", "network.terms=2", "network.width=8")
     given = {

@@ -15,7 +15,7 @@ DATA = os.environ.get("WRF_MI_DATA")
 @pytest.mark.skipif(
     not DATA or not Path(DATA, "flat-ble", "lidar").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/lidar/"
 )
-def test_flat_from_the_robots_map():
+def test_walls_from_a_robots_map_agree_with_the_layout():
     from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 
     from wrf_mi.scene.plan_sources import read_plan

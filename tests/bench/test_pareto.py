@@ -40,7 +40,7 @@ def point(name: str, ms: float, error: float, **more: Any) -> dict[str, Any]:
 POINTS = [point("slow", 10, 0.01), point("fast", 1, 0.3), point("middle", 3, 0.1), point("beaten", 5, 0.2)]
 
 
-def test_front_holds_what_no_other_beats_in_both() -> None:
+def test_front_holds_the_pareto_optimal_points() -> None:
     assert front(POINTS) == ["fast", "middle", "slow"]
     assert front([*POINTS, point("best", 0.5, 0.001)]) == ["best"]
     # As good in one and better in the other is better.
@@ -83,7 +83,7 @@ def test_names_of_methods_are_unique_and_the_reference_is_there() -> None:
     assert REFERENCE in names
 
 
-def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -> None:
+def test_user_defined_method_is_measured(one_gateway: Record, tmp_path: Path) -> None:
     """One that answers truly and slowly, one that does not and fast; only the first gains nothing from batches."""
     truth = one_gateway.observation[0]
     entered: list[bool] = []

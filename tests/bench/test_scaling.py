@@ -20,7 +20,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_growth_beyond_n_log_n_is_said(clock: list[float]) -> None:
+def test_growth_beyond_n_log_n_is_reported(clock: list[float]) -> None:
     def axis(power: float) -> Axis:
         def make(n: int):
             def call() -> None:

@@ -18,7 +18,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 FREQUENCY_HZ = 2.4e9
 
 
-def test_paths_of_the_made_scene_are_those_of_the_room(tmp_path: Path) -> None:
+def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path: Path) -> None:
     """Two rooms with a doorway, scanned from both: LoS and two reflections."""
     xml = scene_file(tmp_path / "room", two_rooms())
     np.savez(tmp_path / "scan.npz", points=simulate_scan(xml, [[2, 2, 1.4], [5.5, 2, 1.4]], rays_per_pose=40_000))
@@ -36,7 +36,7 @@ def test_paths_of_the_made_scene_are_those_of_the_room(tmp_path: Path) -> None:
     assert power_ours[matched].sum() > 0.95 * power_ours.sum()
 
 
-def test_scanners_are_spread() -> None:
+def test_scanner_poses_are_far_from_each_other() -> None:
     places = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [2.4, 0, 0]])
     np.testing.assert_array_equal(spread(places, 3), places[[0, 2, 3]])
     assert len(spread(places, 9)) == 4
