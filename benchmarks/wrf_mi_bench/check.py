@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+from wrf_mi.backend import init
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import resolve
@@ -17,6 +18,7 @@ def main(function: str, out: str) -> int:
     Returns:
         Exit status: 2 with one line where data are missing, 130 where it was interrupted.
     """
+    init()
     try:
         figures = resolve(function)()
     except InputError as error:

@@ -7,11 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
+from wrf_mi.backend import init
 from wrf_mi.core.angles import FloatArray
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
 
 Row = dict[str, str]
 DOUBLE: Any = dr.float64_array_t(mi.Float)
