@@ -20,7 +20,6 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS, InitialGaussians, random_gaussians
 from wrf_mi.gaussians.chunks import gaussians_in_parts
 from wrf_mi.receivers import bartlett_spectrum, element_signals
-from wrf_mi.receivers.footprints import gaussian_signals
 from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -108,14 +107,6 @@ def _array(elements: int) -> Any:
     return planar_array(side, side, SPACING_M)
 
 
-def _antennas_of_gaussians(elements: int) -> Call:
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal((GAUSSIANS, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    array_m, size = _array(elements), np.full(GAUSSIANS, np.radians(5))
-    return lambda: gaussian_signals(direction, size, array_m, FREQUENCY_HZ)
-
-
 @cache
 def _paths() -> Any:
     scene = open_scene("laboratory", FREQUENCY_HZ)
@@ -164,7 +155,6 @@ AXES: list[Axis] = [
     Axis("gaussians-networks", "networks of WRF-GS+", "Gaussians", HALF_TENS, _networks),
     Axis("directions-splat", "splatting", "directions", DIRECTIONS, partial(_directions, _splat, GAUSSIANS)),
     Axis("directions-array", "Bartlett spectrum", "directions", DIRECTIONS, partial(_directions, _bartlett, ELEMENTS)),
-    Axis("antennas-gaussians", "Gaussians in closed form", "antennas", ANTENNAS, _antennas_of_gaussians),
     Axis("antennas-paths", "paths", "antennas", ANTENNAS, _antennas_of_paths),
     Axis("antennas-spectrum", "Bartlett spectrum", "antennas", ANTENNAS, _bartlett),
     Axis("transmitters-field", "WRF-GS+ of 90 Gaussians", "transmitters", TRANSMITTERS, _field),

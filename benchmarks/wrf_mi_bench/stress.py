@@ -26,10 +26,9 @@ from .stress_fields import HARD, HARDEST, RECEIVER, SMALL, cases, gradient_row, 
 from .stress_joint import CANCELLING, COPLANAR, joint
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
-from .stress_receivers import derivatives, of_fields
+from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
 from .stress_traced import phases, traced_gradients
-from .stress_twins import twins
 
 PICTURE = Path("docs/images/numerics.png")
 """Picture of the error curves, written only in a checkout of the project."""
@@ -155,7 +154,7 @@ def main() -> dict[str, Any]:
         *field_functions(),
         *of_fields(50, 5),
         *derivatives(2),
-        *twins(25),
+        of_paths(25),
         *losses(10),
         *phases(),
         *traced_gradients(),
@@ -176,7 +175,7 @@ QUICK: Sequence[Callable[[], list[Row]]] = (
     lambda: field_functions(tries=3),
     lambda: of_fields(2, 1),
     lambda: derivatives(1, ("spectrum", "RSSI"), ("random", *HARDEST[:1])),
-    lambda: twins(1),
+    lambda: [of_paths(1)],
     lambda: losses(1),
     lambda: phases(5),
     lambda: traced_gradients(2),

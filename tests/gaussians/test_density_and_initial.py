@@ -51,8 +51,8 @@ def one_round(parameters: dict[str, np.ndarray], view_gradient_norm: Any, **chan
     arguments = {
         "distance_m": np.ones(n),
         "rng": np.random.default_rng(1),
-        "grow": 0.25,
-        "most": 10 * n,
+        "growth_fraction": 0.25,
+        "max_gaussians": 10 * n,
         "split_rad": SPLIT_RAD,
         "least_opacity": LEAST_OPACITY,
     }
@@ -89,7 +89,7 @@ def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
     """The same Gaussian is split near the receiver and cloned far from it."""
     parameters = made_up(2)
     parameters["log_scale"][:] = np.log(0.2)
-    change = one_round(parameters, [1.0, 1.0], distance_m=np.array([1.0, 10.0]), grow=1.0)
+    change = one_round(parameters, [1.0, 1.0], distance_m=np.array([1.0, 10.0]), growth_fraction=1.0)
     assert (change.cloned, change.split) == (1, 1)
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [0, 2, 3])
 
@@ -99,7 +99,7 @@ def test_parts_of_a_split_one_are_drawn_from_it() -> None:
     n = 400
     parameters = made_up(n)
     parameters["log_scale"][:] = np.log([[0.3], [1.0], [3.0]])
-    change = one_round(parameters, np.ones(n), grow=1.0)
+    change = one_round(parameters, np.ones(n), growth_fraction=1.0)
     assert change.split == n
     moved = (change.parameters["position"] - parameters["position"][:, change.source]).T
     own = np.einsum("nij,ni->nj", rotation_matrix(parameters["rotation"][:, change.source].T), moved)
@@ -110,11 +110,11 @@ def test_parts_of_a_split_one_are_drawn_from_it() -> None:
 def test_faint_and_unseen_ones_are_pruned() -> None:
     parameters = made_up(5)
     parameters["opacity"][0] = [0, logit(LEAST_OPACITY) - 0.1, logit(LEAST_OPACITY) + 0.1, 0, 0]
-    change = one_round(parameters, [1, 1, 1, 0, 1], grow=0.0)
+    change = one_round(parameters, [1, 1, 1, 0, 1], growth_fraction=0.0)
     assert change.pruned == 2
     np.testing.assert_array_equal(change.source, [0, 2, 4])
     # Without opacities (product blending) only those that no pixel saw go.
-    change = one_round(made_up(5, opacity=False), [1, 1, 1, 0, 1], grow=0.0)
+    change = one_round(made_up(5, opacity=False), [1, 1, 1, 0, 1], growth_fraction=0.0)
     np.testing.assert_array_equal(change.source, [0, 1, 2, 4])
 
 
@@ -141,7 +141,7 @@ def test_what_every_round_keeps(n: int, most: int, grow: float, seed: int, opaci
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
     view_gradient_norm, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
-    change = one_round(parameters, view_gradient_norm, distance_m=distance, most=most, grow=grow)
+    change = one_round(parameters, view_gradient_norm, distance_m=distance, max_gaussians=most, growth_fraction=grow)
     count = len(change.source)
     assert count >= 1
     # Growth ends at the most; a field that is larger to begin with is not cut.
@@ -189,7 +189,7 @@ def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
     assert count == 3
     assert all(m.any() and v.any() for m, v in zip(first.values(), second.values(), strict=True))
     own = {name: values for name, values in before.items() if name != "net.bias"}
-    change = one_round(own, [0, 1, 2, 3, 9, 8], grow=0.4)
+    change = one_round(own, [0, 1, 2, 3, 9, 8], growth_fraction=0.4)
     assert (change.cloned, change.split, change.pruned) == (1, 1, 1)
     mean = state.mean_params()
     state.change_density(change)
@@ -218,7 +218,7 @@ def test_a_step_works_after_a_round() -> None:
     state, _ = trained_state(5)
     parameters = state.params()
     own = {name: parameters[name] for name in made_up(1)}
-    state.change_density(one_round(own, np.ones(5), grow=1.0))
+    state.change_density(one_round(own, np.ones(5), growth_fraction=1.0))
     state.adam.set_learning_rate(0.1)
     before = state.params()
     dr.backward(sum(dr.sum(dr.square(p.array + 1)) for p in state.adam.values()))
@@ -256,7 +256,7 @@ def test_the_best_moment_stays_as_it_was() -> None:
         state.view_gradient_norm += to_float(np.ones(4))
         dr.eval(state.view_gradient_norm)
     assert state.best is not None
-    np.testing.assert_array_equal(state.best["urge"], np.arange(4))
+    np.testing.assert_array_equal(state.best["view_gradient_norm"], np.arange(4))
 
 
 TILTED = Receiver("a", np.array([5.0, 0.3, 1.0]), np.array([0.5, -0.5, -0.5, 0.5]))

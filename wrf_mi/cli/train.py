@@ -53,7 +53,7 @@ def _train(a: Arguments, asked: dict[str, Any]) -> int:
     from ..runs.api import train
 
     with progress_bar() as watch:
-        asked |= {"listen": watch.on_progress, "stop": watch.stop, "progress": sys.stderr.isatty()}
+        asked |= {"on_progress": watch.on_progress, "stop": watch.stop, "progress": sys.stderr.isatty()}
         run = train(a.dataset, a.out, **asked)
     return show_metrics(run.metrics, run.folder, a.json)
 
