@@ -10,8 +10,8 @@ import pytest
 from wrf_mi_bench import plan as bench_plan
 from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
 from wrf_mi_bench.check import main
-from wrf_mi_bench.pareto_front import full_table
-from wrf_mi_bench.stress_summary import STAGES, summary_table
+from wrf_mi_bench.pareto import full_table
+from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -77,7 +77,7 @@ def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_checks_say_what_data_they_lack(
+def test_checks_name_missing_data(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The function is there; without data it is one line, exit status 2 and no file."""
@@ -91,7 +91,7 @@ def test_checks_say_what_data_they_lack(
     assert not (tmp_path / "out.json").exists()
 
 
-def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
     monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
     assert main("wrf_mi_bench.plan:flat_plan", str(tmp_path / "out.json")) == 0

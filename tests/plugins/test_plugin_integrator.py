@@ -12,7 +12,6 @@ import pytest
 import wrf_mi_plugins
 from test_plugin_integrator_rays import brute, bundles_of, gaussians_of, pose_of
 from traced_fields import RECEIVER, any_field, blended
-from wrf_mi_bench import traced as bench_traced
 from wrf_mi_plugins import integrator as integrator_module
 from wrf_mi_plugins.sensor import receiver_to_world
 from wrf_mi_plugins.shape import gaussian_shape, shape_parameters
@@ -26,8 +25,6 @@ pytestmark = pytest.mark.all_threads
 
 wrf_mi_plugins.register_all()
 
-LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02
-"""Traced against splatted where Gaussians are small in angle: what projection may cost."""
 FLOAT32_TOLERANCE = 1e-4
 """Relative L2 error of an image by float32 rounding."""
 GRADIENT_TOLERANCE = 1e-3
@@ -54,28 +51,6 @@ def scene_of(field: Gaussians, height: int = 12, width: int = 40, **more: Any) -
 
 def complex_image(tensor: Any) -> np.ndarray:
     return np.asarray(tensor.numpy(), float) @ np.array([1, 1j])
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_traced_matches_splatting_for_small_gaussians(seed: int) -> None:
-    """Gaussians of up to 2 degrees and axes up to 2 : 1, one on the zenith, one on the seam; random poses."""
-    for blending in bench_traced.BLENDINGS:
-        gaussians, receiver = bench_traced.random_field(seed, blending)
-        traced, splatted = (f(gaussians, receiver) for f in (bench_traced.traced, bench_traced.splatted))
-        found = bench_traced.difference(traced, splatted)
-        assert found["ssim"] >= LOWEST_SSIM
-        assert found["magnitude_error"] <= LARGEST_ERROR
-        assert found["complex_error"] <= LARGEST_ERROR
-
-
-def test_difference_from_splatting_grows_with_size() -> None:
-    """Of second order in the size of round Gaussians, of first order in that of others."""
-    rows = bench_traced.by_size((1.0, 2.0), fields=2)
-    errors = {(row["size_deg"], row["ratio"]): row["complex_error"] for row in rows}
-    # Pixels whose edge moved, by half the order more, are on both.
-    assert errors[2.0, 1.0] / errors[1.0, 1.0] > 1.8
-    assert 1.5 < errors[2.0, 2.0] / errors[1.0, 2.0] < 2.5
-    assert errors[1.0, 2.0] > 2 * errors[1.0, 1.0]
 
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
@@ -233,11 +208,3 @@ def test_invalid_scenes_are_refused(more: dict[str, Any], text: str) -> None:
     scene = scene_of(gaussians_of(any_field(5), "alpha", mi.Float), **more)
     with pytest.raises(InputError, match=text):
         scene.integrator().render(scene)
-
-
-@pytest.mark.slow
-def test_tracing_is_not_slower_than_volprim() -> None:
-    """10,000 Gaussians, 360 x 90 directions, hits found anew: not slower than ``volprim_rf_basic``."""
-    for size in (1.0, 2.0):
-        found = bench_traced.pace(size, repeats=9)
-        assert found["stock_over_traced"] >= 1, found
