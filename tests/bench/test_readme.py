@@ -16,7 +16,7 @@ from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
 
-from wrf_mi.cli.main import _parser
+from wrf_mi.cli.main import build_parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder
@@ -63,7 +63,7 @@ def tiny_folder(tmp_path: Path) -> Path:
 
 def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """As they stand, but for the data set and the number of steps."""
-    script = "\n".join(blocks(README, "python"))
+    script = "\n".join([*blocks(README, "python"), *blocks(CHECKOUT / "docs" / "model.md", "python")])
     for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
@@ -94,7 +94,7 @@ def test_commands_parse(path: Path) -> None:
             continue
         assert program == "wrf-mi", line
         try:
-            parsed: argparse.Namespace = _parser().parse_args(arguments)
+            parsed: argparse.Namespace = build_parser().parse_args(arguments)
         except SystemExit:
             pytest.fail(f"{path.name}: {line}")
         with_settings(TrainConfig(), getattr(parsed, "set", []))

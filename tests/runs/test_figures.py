@@ -45,7 +45,7 @@ def test_outline_is_where_the_footprint_is_one_deviation() -> None:
     assert footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
 
 
-def test_largest_weight_is_drawn_last_and_what_has_no_footprint_not_at_all() -> None:
+def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> None:
     directions = unit_vectors(np.radians([0, 90, 180, 270]), np.radians(45))
     distance = np.array([3.0, 3.0, 3.0, NEAR_M / 2])
     position = RECEIVER.position_m + (distance[:, None] * directions) @ RECEIVER.to_world.T

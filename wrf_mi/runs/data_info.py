@@ -1,4 +1,4 @@
-"""What a data set holds: ``wrf-mi data info``."""
+"""Summary of a data set: ``wrf-mi data info``."""
 
 from __future__ import annotations
 
@@ -15,14 +15,11 @@ SHOWN_CARRIERS = 8
 
 
 def data_info(record: Record) -> dict[str, Any]:
-    """What a record holds, in plain values.
+    """Summary of a record in plain values; None: not stated.
 
-    Returns:
-        ``name``, ``task``, ``source``; ``rows``; ``receivers``: rows that each received, by name; ``observation``:
-        shape of one; ``official``: numbers of training and test rows; ``frequencies_hz``: of the carrier or the
-        subcarriers; ``carriers_hz``: numbers of rows by carrier, where there are several; ``n_readings`` and
-        ``std_db``: least, median and largest; and whether there are ``positions``, ``headings``, ``uplink`` and
-        ``truth``. None: not stated.
+    ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
+    training and test rows, ``frequencies_hz`` the carrier or the subcarriers, ``carriers_hz`` rows by carrier,
+    ``n_readings`` and ``std_db`` minimum, median and maximum.
 
     Raises:
         InputError: parts of the record that do not fit together.
@@ -38,7 +35,7 @@ def data_info(record: Record) -> dict[str, Any]:
         "task": record.task,
         "source": record.source,
         "rows": len(record),
-        "receivers": {one.name: int(count) for one, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
+        "receivers": {r.name: int(count) for r, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
         "observation": list(record.observation.shape[2:]),
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
@@ -67,9 +64,9 @@ def render(found: dict[str, Any]) -> str:
     elif frequencies is None:
         carrier = "not stated"
     else:
-        ends = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
-        carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else ends
-    more = [name for name in ("positions", "headings", "uplink", "truth") if found[name]]
+        band = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
+        carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else band
+    known = [name for name in ("positions", "headings", "uplink", "truth") if found[name]]
     lines = {
         "data set": f"{found['name']}, {found['task']}, {found['source']}",
         "rows": f"{found['rows']}, each {shape}",
@@ -78,16 +75,16 @@ def render(found: dict[str, Any]) -> str:
         "carrier": carrier,
         "readings per row": _shown(found["n_readings"], ""),
         "noise": _shown(found["std_db"], " dB"),
-        "known": ", ".join(more) or "observations alone",
+        "known": ", ".join(known) or "observations alone",
     }
-    return "\n".join(f"{what + ':':<18}{text}" for what, text in lines.items())
+    return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 
 
 def _range(values: NDArray[Any] | None, seen: NDArray[np.bool_]) -> list[float] | None:
-    """Least, median and largest value where something was received."""
+    """Minimum, median and maximum where something was received."""
     if values is None or not seen.any():
         return None
-    return [float(one) for one in np.percentile(values[seen], [0, 50, 100])]
+    return [float(value) for value in np.percentile(values[seen], [0, 50, 100])]
 
 
 def _shown(values: list[float] | None, unit: str) -> str:
