@@ -120,7 +120,7 @@ def test_bad_data_and_folders_are_refused(
 )
 def test_resume_takes_no_settings(own: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """They would be left aside."""
-    refused(["train", "--resume", run, *own], "leave data set and settings away", capsys)
+    refused(["train", "--resume", run, *own], "omit data set and settings", capsys)
 
 
 BAD_POSITIONS = {

@@ -256,7 +256,7 @@ def test_bad_calls_are_refused(
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
         (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
-        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; leave --scene away"),
+        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; omit --scene"),
         (
             [*train, "--preset", "quick"],
             "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
@@ -264,7 +264,7 @@ def test_bad_calls_are_refused(
         (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
         (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
         (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
-        (["train", "--resume", run, "--model", "mri"], "leave data set and settings away"),
+        (["train", "--resume", run, "--model", "mri"], "omit data set and settings"),
         (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
     ):
         refused(arguments, message, capsys)

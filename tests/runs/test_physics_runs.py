@@ -347,9 +347,9 @@ def test_bad_calls_are_refused(
         ([*train, "--preset", "quick"], "physics on .*waves: takes no preset"),
         (["train", waves, "--model", "physics"], "train needs DATASET and --out RUN"),
         (["train", waves, "--model", "physics", "--out", waves], "exists and is not empty; choose another --out"),
-        (["train", "--resume", run, "--model", "physics"], "leave data set and settings away"),
-        (["train", "--resume", run, "--scene", "x"], "leave data set and settings away"),
-        (["train", "--resume", run, "--set", "lengths=2"], "leave data set and settings away"),
+        (["train", "--resume", run, "--model", "physics"], "omit data set and settings"),
+        (["train", "--resume", run, "--scene", "x"], "omit data set and settings"),
+        (["train", "--resume", run, "--set", "lengths=2"], "omit data set and settings"),
         (["train", waves, "--scene", "x", "--out", tmp_path / "out"], "x: no such scene file"),
         (["evaluate", run, "--split", "nowhere"], "split 'nowhere'"),
     ):

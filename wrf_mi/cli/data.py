@@ -5,8 +5,15 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Record
+from ..core.carriers import carriers_text
 from .options import DATASET, Arguments, add_command
 from .output import print_json
+
+SHOWN_CARRIERS = 8
 
 
 def add_parser(commands: Any) -> None:
@@ -55,12 +62,90 @@ def fetch_command(a: Arguments) -> int:
 
 def info_command(a: Arguments) -> int:
     """Summarise a data set."""
-    from ..runs.data_info import data_info, render
     from ..synthetic import load_record
 
-    found = data_info(load_record(a.dataset, progress=True))
+    found = summary(load_record(a.dataset, progress=True))
     if a.json:
         print_json(found)
     else:
         print(render(found))
     return 0
+
+
+def summary(record: Record) -> dict[str, Any]:
+    """Summary of a record in plain values; None: not stated.
+
+    ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
+    training and test rows, ``frequencies_hz`` the carrier or the subcarriers, ``carriers_hz`` rows by carrier,
+    ``n_readings`` and ``std_db`` minimum, median and maximum.
+
+    Raises:
+        InputError: parts of the record that do not fit together.
+    """
+    from ..models.checks import check_parts
+
+    check_parts(record)
+    seen = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
+    carriers = None
+    if record.carriers_hz is not None:
+        hz, rows = np.unique(record.carriers_hz, return_counts=True)
+        carriers = dict(zip(hz.tolist(), rows.tolist(), strict=True))
+    return {
+        "name": record.name,
+        "task": record.task,
+        "source": record.source,
+        "rows": len(record),
+        "receivers": {r.name: int(count) for r, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
+        "observation": list(record.observation.shape[2:]),
+        "official": None if record.official is None else [len(part) for part in record.official],
+        "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
+        "carriers_hz": carriers,
+        "n_readings": _range(record.n_readings, seen),
+        "std_db": _range(record.std, seen),
+        "positions": record.has_positions,
+        "headings": record.tx_heading_rad is not None,
+        "uplink": record.uplink is not None,
+        "truth": record.truth is not None,
+    }
+
+
+def render(found: dict[str, Any]) -> str:
+    """`summary` as text."""
+    shape = " x ".join(map(str, found["observation"])) or "one number"
+    received = ", ".join(f"{name} {count}" for name, count in found["receivers"].items())
+    official = (
+        "not stated" if found["official"] is None else "{} training rows, {} test rows".format(*found["official"])
+    )
+    carriers, frequencies = found["carriers_hz"], found["frequencies_hz"]
+    if carriers is not None:
+        carrier = carriers_text(np.array(list(carriers)))
+        if len(carriers) <= SHOWN_CARRIERS:
+            carrier = ", ".join(f"{hz:.10g} Hz in {rows} rows" for hz, rows in carriers.items())
+    elif frequencies is None:
+        carrier = "not stated"
+    else:
+        band = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
+        carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else band
+    known = [name for name in ("positions", "headings", "uplink", "truth") if found[name]]
+    lines = {
+        "data set": f"{found['name']}, {found['task']}, {found['source']}",
+        "rows": f"{found['rows']}, each {shape}",
+        "received": received,
+        "official split": official,
+        "carrier": carrier,
+        "readings per row": _shown(found["n_readings"], ""),
+        "noise": _shown(found["std_db"], " dB"),
+        "known": ", ".join(known) or "observations alone",
+    }
+    return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
+
+
+def _range(values: NDArray[Any] | None, seen: NDArray[np.bool_]) -> list[float] | None:
+    """Minimum, median and maximum where something was received."""
+    if values is None or not seen.any():
+        return None
+    return [float(value) for value in np.percentile(values[seen], [0, 50, 100])]
+
+
+def _shown(values: list[float] | None, unit: str) -> str:
+    return "not stated" if values is None else f"{values[0]:g} to {values[2]:g}{unit}, median {values[1]:g}{unit}"

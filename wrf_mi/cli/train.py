@@ -40,7 +40,7 @@ def train_command(a: Arguments) -> int:
     if a.resume:
         given = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
         if any(value is not None and value is not False and value != [] for value in given):
-            raise InputError("--resume RUN goes on with the settings of RUN: leave data set and settings away")
+            raise InputError("--resume RUN goes on with the settings of RUN: omit data set and settings")
         return _resume(a)
     if not a.dataset or not a.out:
         raise InputError("train needs DATASET and --out RUN (or --resume RUN)")

@@ -137,7 +137,7 @@ def _check_scene(
         if material is not None or antennas:
             raise InputError("--material and antenna options belong to a scene that is traced; give --scene")
     elif model.scene == "none":
-        raise InputError(f"{model.name} on {place_of(record)}: takes no scene; leave --scene away")
+        raise InputError(f"{model.name} on {place_of(record)}: takes no scene; omit --scene")
     elif antennas and not model.uses_antennas:
         raise InputError(f"{model.name} on {record.name}: takes no antenna options: its channels are of isotropic ones")
 
@@ -276,7 +276,7 @@ def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = 
     run = open_run(folder, operator=operator)
     config, problem, folders = run.config, run.problem, run_parts(run.folder)
     if split is not None and folders != [run.folder]:
-        raise InputError(f"{run.folder}: every row is held out in one of its folds; leave --split away")
+        raise InputError(f"{run.folder}: every row is held out in one of its folds; omit --split")
     parts = [Part(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
     if split is not None:
         return score_other(config, problem, parts[0], split)

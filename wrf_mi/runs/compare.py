@@ -104,7 +104,7 @@ def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
 
 
 def _rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
-    """The table's rows of one data set: each run, and each reference once."""
+    """Rows of the table for a data set: each run, and each reference once."""
     label, block_name = TASKS[runs[0].task].label, TASKS[runs[0].task].block
     named = [
         ({key: run.metrics[key] for key in COLUMNS if key in run.metrics} | {"run": run.name, "seed": run.seed}, block)
@@ -196,7 +196,7 @@ def _columns(runs: Sequence[Results]) -> list[str]:
 def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
     first = runs[0]
-    aligned = [_aligned(run, places) for run, places in zip(runs, _positions(runs), strict=True)]
+    aligned = [_aligned(run, indices) for run, indices in zip(runs, _positions(runs), strict=True)]
     maps = [first.truth, *aligned, first.reference]
     rows = [
         (name, [None if values is None else _power_db(values[r]) for values in maps])

@@ -125,8 +125,8 @@ def render(found: Mapping[str, Any]) -> str:
     """Table of the result of `compress_run`."""
     lines = [f"{'':<8}{'Gaussians':>10}{'kB':>9}{'ms':>8}{'SSIM':>8}"]
     for name in ("before", "after"):
-        one = found[name]
-        lines.append(f"{name:<8}{one['gaussians']:>10}{one['bytes'] / 1e3:>9.1f}{one['ms']:>8.2f}{one['ssim']:>8.3f}")
+        row = found[name]
+        lines.append(f"{name:<8}{row['gaussians']:>10}{row['bytes'] / 1e3:>9.1f}{row['ms']:>8.2f}{row['ssim']:>8.3f}")
     value, low, high = found["after"]["times_faster"]
     lines.append(
         f"{found['times_smaller']:.1f} times smaller, {value:.1f} times as fast ({low:.1f} to {high:.1f}), "

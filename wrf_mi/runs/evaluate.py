@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
-from ..core.carriers import FREQUENCY
+from ..core.carriers import FREQUENCY, by_carrier
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
 from ..models import Fitted, Problem
+from ..models.interpolation.idw import InverseDistance
 from ..models.method import inputs_of
-from ..tasks import TASKS
+from ..tasks import TASKS, UPLINK, Task
 from ..tasks.scores import inside_interval, summary
 from ..training.trainer import peak_memory_mb
 from .folder import METRICS, PREDICTIONS, RunConfig
-from .references import reference_predictions
-from .results import reference_key
+from .results import Observations, reference_key
 
 Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
 """Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
@@ -69,7 +69,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
 
     Args:
         record: data of any task in `wrf_mi.tasks.TASKS`.
-        split: rows; references (`wrf_mi.runs.references`) use all its training rows, validation rows included.
+        split: rows; references (`reference_predictions`) use all its training rows, validation rows included.
         predict: predictions to score; finite wherever something was received.
         single: prediction that is timed at one row; None: ``predict``.
 
@@ -125,8 +125,8 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     references = {key: scorer.of_rows(arrays[reference_key(key)], arrays["truth"]) for key in keys}
 
     def blocks(chosen: Any) -> dict[str, Any]:
-        beside = {key: summary(values[chosen]) for key, values in references.items()}
-        return {scorer.block: summary(scores[chosen]), "reference": beside}
+        reference = {key: summary(values[chosen]) for key, values in references.items()}
+        return {scorer.block: summary(scores[chosen]), "reference": reference}
 
     metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
     if len(scores) > 1:
@@ -176,11 +176,7 @@ def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Seque
 
 
 def score_other(config: RunConfig, problem: Problem, part: Part, split: str) -> dict[str, Any]:
-    """Metrics on the test rows of another split that were not used in training; nothing is written.
-
-    Raises:
-        InputError: no such row is left.
-    """
+    """Metrics on the test rows of another split that were not used in training; `InputError` if there are none."""
     asked = np.unique(np.concatenate([s.test for s in make_splits(problem.record, split, config.seed)]))
     unseen = np.setdiff1d(asked, problem.rows(part.split))
     if not len(unseen):
@@ -245,3 +241,59 @@ def stored_metrics(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return stored if isinstance(stored, dict) else {}
+
+
+def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> dict[str, Observations]:
+    """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] by key.
+
+    Inverse-distance weighting (IDW) needs positions of training rows ``known`` and scored ``rows``; the copy of the
+    uplink needs an uplink.
+
+    Raises:
+        InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
+            received no training row.
+    """
+    task, kind = TASKS[record.task], record.observation.dtype
+    found: dict[str, Any] = {}
+    if record.uplink is not None and task.from_uplink:
+        found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
+    if np.isfinite(record.tx_pos_m[np.concatenate([known, rows])]).all():
+        found[task.reference] = _interpolate(task, record, known, rows).astype(kind)
+    if not found:
+        lacking = "positions" + (" and uplink" if task.from_uplink else "")
+        raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
+    return found
+
+
+def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:
+    """Uplink [m, antennas, subcarriers] in the shape of a downlink, [m, subcarriers] or [m, antennas, subcarriers].
+
+    Where the numbers of subcarriers differ, each takes the uplink's at the nearest relative position in the band.
+    """
+    shape = record.observation.shape[2:]
+    antennas = shape[0] if len(shape) == 2 else 1
+    if uplink.shape[1] != antennas:
+        raise InputError(
+            f"{record.name}: uplink of {uplink.shape[1]} antennas, downlink of {antennas}; give both for the same ones"
+        )
+    nearest = np.round(np.linspace(0, uplink.shape[2] - 1, shape[-1])).astype(int)
+    return uplink[:, :, nearest].reshape(len(uplink), *shape)
+
+
+def _interpolate(task: Task, record: Record, known: IntArray, rows: IntArray) -> Observations:
+    carriers = record.carriers_hz
+    if carriers is not None:  # neighbours are rows of the same carrier
+
+        def of_carrier(carrier_hz: float, which: IntArray) -> Observations:
+            same = record.at_carrier(carrier_hz)
+            return _interpolate(task, same, known[carriers[known] == carrier_hz], rows[which])
+
+        return by_carrier(carriers[rows], of_carrier, axis=1)
+    found = []
+    for receiver, observed in zip(record.receivers, record.observation, strict=True):
+        idw = InverseDistance(task.neighbours, softening_m=task.softening_m)
+        try:
+            found.append(idw.fit(record.tx_pos_m[known], observed[known]).predict(record.tx_pos_m[rows]))
+        except InputError as error:
+            raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
+    return np.stack(found)

@@ -45,11 +45,7 @@ def fit_key(*determining: Any) -> str:
 
 
 def content_digest(*values: Any) -> str:
-    """SHA-256 (hex) of values as `fit_key` takes them, without versions.
-
-    Raises:
-        InputError: a path that does not exist.
-    """
+    """SHA-256 (hex) of values as for `fit_key`, without versions."""
     digest = hashlib.sha256()
     for value in values:
         _add(digest, value)
@@ -90,7 +86,7 @@ def _add(digest: Any, value: Any) -> None:
 
 def _files_below(folder: Path) -> list[Path]:
     """All files below a folder; links are followed."""
-    below = (Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+    below = (Path(parent) / name for parent, _, names in os.walk(folder, followlinks=True) for name in names)
     return sorted(path for path in below if path.is_file())
 
 
@@ -112,8 +108,8 @@ def dataset_files(name_or_folder: str) -> list[Path]:
         InputError: no such data set.
     """
     path = Path(name_or_folder)
-    place = path if path.exists() else locate(name_or_folder)
-    return [] if place is None else [place]
+    found = path if path.exists() else locate(name_or_folder)
+    return [] if found is None else [found]
 
 
 def scene_files(scene: str | Path) -> list[Path]:
@@ -131,18 +127,13 @@ def scene_files(scene: str | Path) -> list[Path]:
         stated = [node.get("value", "") for node in ElementTree.parse(path).iter("string")]
     except (ElementTree.ParseError, OSError) as error:
         raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
-    return [path, *(place for value in stated if value and (place := path.parent / value).is_file())]
+    return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]
 
 
 def fit_once(folder: Path, fit: Callable[[], object]) -> Path:
-    """Fit into a folder whose name holds the fit's key, unless it holds a finished fit; the log states which.
+    """Write a run by ``fit`` into a folder whose name holds the fit's key, unless it holds a finished run (logged).
 
-    Args:
-        folder: run folder; a stopped run in it is removed.
-        fit: function that writes the run.
-
-    Returns:
-        The folder.
+    A stopped run in the folder is removed. Returns the folder.
     """
     if (folder / METRICS).exists():
         logger.info("%s: the same fit was finished before; used again", folder)

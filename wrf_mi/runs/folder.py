@@ -111,11 +111,7 @@ def write_config(folder: Path, config: RunConfig) -> None:
 
 
 def read_config(folder: Path) -> RunConfig:
-    """Read ``config.yaml``.
-
-    Raises:
-        InputError: missing, not YAML, of another format, or with unknown settings.
-    """
+    """Read ``config.yaml``; `InputError` where it is missing, not YAML, of another format or has unknown settings."""
     path = folder / CONFIG
     missing = f"{folder}: no {CONFIG}, so not a run folder; give one made by train or trace"
     with readable(path, missing, "restore it"):
@@ -132,11 +128,7 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def check_format(folder: Path) -> None:
-    """Refuse a run folder of another format; a configuration that cannot be read passes.
-
-    Raises:
-        InputError: a run of version 0.1, or of another format.
-    """
+    """Refuse a run of version 0.1 or of another format by `InputError`; an unreadable configuration passes."""
     try:
         content = yaml.safe_load((folder / CONFIG).read_text())
     except (OSError, ValueError, yaml.YAMLError):
@@ -150,11 +142,7 @@ def check_format(folder: Path) -> None:
 
 
 def check_new(folder: Path) -> None:
-    """Refuse a folder that is not empty.
-
-    Raises:
-        InputError: a file, or a folder with content.
-    """
+    """Refuse a file or a folder that is not empty by `InputError`."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         remedy = f"choose another --out, or go on with train --resume {folder}"
         raise InputError(f"{folder}: exists and is not empty; {remedy}")
@@ -189,11 +177,7 @@ def run_parts(folder: Path) -> list[Path]:
 
 
 def load_rows(folder: Path, record: Record) -> Split:
-    """Read the split of a run.
-
-    Raises:
-        InputError: no split file, a damaged one, or rows that the record lacks.
-    """
+    """Read the split of a run; `InputError` where it is missing, damaged, or has rows that the record lacks."""
     split = load_split(folder / SPLIT)
     check_rows(split, record, str(folder / SPLIT))
     return split

@@ -94,11 +94,7 @@ class Results:
 
 
 def read_run(path: str | Path, name: str | None = None) -> Results:
-    """Read a run folder; with folds, the pooled scores.
-
-    Args:
-        path: run folder.
-        name: name for tables and legends; None: that of the folder.
+    """Read a run folder (with folds, the pooled scores); ``name`` is for tables, by default that of the folder.
 
     Raises:
         InputError: not a run folder, or a file in it that is missing or damaged.

@@ -154,38 +154,36 @@ class Run:
         Raises:
             InputError: heading, carrier or uplink that is not used, missing, or of another shape.
         """
-        model, heading = self.model, inputs.tx_heading_rad
-        if heading is not None:
+        model = self.model
+        if inputs.tx_heading_rad is not None:
             if not (model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading):
                 raise InputError(f"{self.folder}: {UNUSED_HEADING}")
-            if heading.shape != (len(inputs),) or not np.isfinite(heading).all():
-                text = f"{len(inputs)} positions and headings {heading.shape}; give one finite heading for each"
+            self._check_numbers(inputs, inputs.tx_heading_rad, "headings", "finite heading")
+        if inputs.carriers_hz is not None or model.several_carriers:
+            known = self.problem.record.carriers_hz
+            if known is None and inputs.carriers_hz is not None:
+                raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
+            if known is not None and inputs.carriers_hz is None:
+                text = f"its data have {carriers_text(known)}; give {FREQUENCY} for each position"
                 raise InputError(f"{self.folder}: {text}")
-        if model.several_carriers or inputs.carriers_hz is not None:
-            self._check_carriers(inputs)
+            if inputs.carriers_hz is not None:
+                self._check_numbers(inputs, inputs.carriers_hz, "carriers", f"positive {FREQUENCY}", 0.0)
         if model.uplink == "none":
             if inputs.uplink is not None:
                 raise InputError(f"{self.folder}: {UNUSED_UPLINK}")
         elif inputs.uplink is not None or model.needs_uplink:
             check_inputs(inputs, self.problem.record, model)
 
-    def _check_carriers(self, inputs: Inputs) -> None:
-        known, asked = self.problem.record.carriers_hz, inputs.carriers_hz
-        if known is None and asked is not None:
-            raise InputError(f"{self.folder}: its data have one carrier; leave {FREQUENCY} away")
-        if known is not None and asked is None:
-            raise InputError(f"{self.folder}: its data have {carriers_text(known)}; give {FREQUENCY} for each position")
-        if asked is not None and not (asked.shape == (len(inputs),) and (np.isfinite(asked) & (asked > 0)).all()):
-            text = f"{len(inputs)} positions and carriers {asked.shape}; give one positive {FREQUENCY} for each"
+    def _check_numbers(
+        self, inputs: Inputs, values: FloatArray, name: str, wanted: str, above: float = -np.inf
+    ) -> None:
+        if values.shape != (len(inputs),) or not (np.isfinite(values) & (values > above)).all():
+            text = f"{len(inputs)} positions and {name} {values.shape}; give one {wanted} for each"
             raise InputError(f"{self.folder}: {text}")
 
 
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
-    """Fitted model of a run or fold, and the training time in seconds.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+    """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part)
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
         return config.entry.load(arrays, problem, part), seconds

@@ -244,11 +244,7 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
 
 
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse rows without scores.
-
-    Raises:
-        SweepFailed: naming the runs.
-    """
+    """Raise `SweepFailed` with the names of runs without scores."""
     failed = [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]
     if failed:
         raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {'; '.join(failed)}")
