@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
-from ..backend.probe import Verdict, try_cuda, try_llvm
+from ..backend.probe import try_cuda, try_llvm
 from ..backend.remedy import install_commands, package_manager
 from .options import Arguments, add_command
 from .output import print_json
@@ -59,7 +59,7 @@ def report() -> dict[str, Any]:
         "python": f"{platform.python_version()} ({sys.executable})",
         "system": platform.platform(),
         "versions": versions,
-        "threads": _threads(),
+        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "backend": backend,
         "llvm": llvm,
         "gpu": gpu,
@@ -76,10 +76,8 @@ def render(found: dict[str, Any]) -> str:
         ("threads", str(found["threads"])),
         ("GPU", found["gpu"]["device"] or found["gpu"]["reason"]),
     ]
-    for library in found["llvm"] or [None]:
-        lines.append(("LLVM", _llvm_line(library, backend) if library else "none found"))
-    lines.append(("Python", found["python"]))
-    lines.append(("system", found["system"]))
+    lines += [("LLVM", _llvm_line(library, backend)) for library in found["llvm"]] or [("LLVM", "none found")]
+    lines += [("Python", found["python"]), ("system", found["system"])]
     lines += [(name, text or "not installed") for name, text in found["versions"].items()]
     lines.append(("data", found["data"]["home"]))
     lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in found["data"]["sets"]]
@@ -142,14 +140,10 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _verdict(verdict: Verdict) -> dict[str, Any]:
-    return {"usable": verdict.usable, "reason": verdict.reason}
-
-
 def _llvm(library: LlvmLibrary) -> dict[str, Any]:
     verdict = try_llvm(library, fresh=True)
     number = verdict.version or ".".join(map(str, library.version))
-    return {"path": str(library.path), "version": number, **_verdict(verdict)}
+    return {"path": str(library.path), "version": number, "usable": verdict.usable, "reason": verdict.reason}
 
 
 def _gpu() -> dict[str, Any]:
@@ -157,7 +151,7 @@ def _gpu() -> dict[str, Any]:
     if driver is None:
         return {"driver": None, "usable": False, "reason": "no NVIDIA GPU with its driver", "device": ""}
     verdict = try_cuda(driver, fresh=True)
-    return {"driver": str(driver), **_verdict(verdict), "device": verdict.device}
+    return {"driver": str(driver), "usable": verdict.usable, "reason": verdict.reason, "device": verdict.device}
 
 
 def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
@@ -172,16 +166,9 @@ def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
         name, folder = entry.dataset.name, entry.location
         sets.append({"name": name, "task": entry.dataset.task, "folder": str(folder) if folder else None})
         if folder is None and entry.dataset.base_url is not None:
-            remedy = f"wrf-mi data fetch {name}"
-            problems.append({"problem": f"the data set {name} is not on this machine", "remedy": remedy})
+            problem = f"the data set {name} is not on this machine"
+            problems.append({"problem": problem, "remedy": f"wrf-mi data fetch {name}"})
     return {"home": str(home), "cache": str(user_cache()), "sets": sets}
-
-
-def _threads() -> int:
-    """Cores this process may use, the number of Dr.Jit's threads."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _llvm_line(library: dict[str, Any], backend: dict[str, Any] | None) -> str:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
-import io
 import re
 import sys
 from collections.abc import Sequence
@@ -21,7 +19,7 @@ from ..models.ray_tracing import PATHS
 from ..tasks import TASKS
 from . import figures
 from .folder import FITTED
-from .results import Results, read_runs
+from .results import Results, read_runs, write_csv
 from .scene_view import scene_view
 
 QUANTILES = (0.1, 0.5, 0.9)
@@ -77,11 +75,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     ]
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(COLUMNS), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    write_atomically(folder / "compare.csv", text.getvalue())
+    write_csv(folder / "compare.csv", table, list(COLUMNS))
     for _, pictures in sections:
         for name, _, figure in pictures:
             figures.save(figures.without_formulas(figure), folder / name)

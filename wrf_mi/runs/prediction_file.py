@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,12 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, stored_arrays, text_lines, write_atomically
+from ..core.files import one_line, stored_arrays, text_lines
 from ..models.method import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
+from .results import write_csv
 
 NPZ, CSV = ".npz", ".csv"
 HEADING = "heading_rad"
@@ -141,20 +141,15 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
     """
     if out.suffix.lower() == NPZ:
         return write_predictions(out, arrays)
-    columns = dict(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True))
+    columns, rows = dict(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True)), range(len(arrays["tx_pos"]))
     for name, values in ((HEADING, tx_heading_rad), (FREQUENCY, arrays.get(FREQUENCY))):
         if values is not None:
             columns[name] = np.asarray(values, float)
-    table = list(columns.items())
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in arrays:
-            table += [(f"{name}_{suffix}", v) for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([name for name, _ in table])
+            columns |= {f"{name}_{suffix}": v for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)}
     # str gives the shortest number that reads back as the same number.
-    rows = zip(*(values for _, values in table), strict=True)
-    writer.writerows(["" if np.isnan(value) else str(value) for value in row] for row in rows)
-    write_atomically(out, text.getvalue())
+    text = ({name: "" if np.isnan(values[k]) else str(values[k]) for name, values in columns.items()} for k in rows)
+    write_csv(out, text, list(columns))
     single = len(arrays["receiver_name"]) == 1
     return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}

@@ -10,8 +10,6 @@ run goes on from its checkpoint. A folder made with other data, scenes or versio
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import json
 import re
@@ -32,6 +30,7 @@ from .api import plan_run
 from .evaluate import stored_metrics
 from .fit_key import content_digest, dataset_files, scene_files
 from .folder import CONFIG, METRICS, package_versions
+from .results import write_csv
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset"),
@@ -269,10 +268,6 @@ def _cell(key: str, value: Any) -> str:
 
 
 def _write_table(sweep: Sweep, rows: Sequence[Mapping[str, Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, ["run", *sweep.varied, *HEADINGS], extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(sweep.folder / "scores.csv", text.getvalue())
+    write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
     write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
     write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")
