@@ -122,7 +122,7 @@ def test_budgets_of_other_seeds_or_schedules_are_fitted_anew(
     assert folders[3] == folders[0]
 
 
-def test_digest_differs_for_different_values() -> None:
+def test_digest_tells_values_apart() -> None:
     values: list[Any] = [
         "a", "b", 1, 1.0, True, None, (), ("a",), ("a", "b"), "a\n'b'", {"a": 1}, {"a": 2}, {"b": 1}, [("a", 1)],
         np.zeros(2), np.zeros(2, np.float32), np.zeros((1, 2)), np.zeros((2, 1)), np.array([0, 1.0]),
@@ -134,7 +134,7 @@ def test_digest_differs_for_different_values() -> None:
         content_digest(object())
 
 
-def test_digest_of_a_folder_depends_on_names_and_contents(tmp_path: Path) -> None:
+def test_digest_of_a_folder_is_that_of_names_and_contents(tmp_path: Path) -> None:
     (tmp_path / "scene" / "meshes").mkdir(parents=True)
     named = '<scene><shape type="ply"><string name="filename" value="{}"/></shape></scene>'
     (tmp_path / "scene" / "scene.xml").write_text(named.format("meshes/wall.ply"))
