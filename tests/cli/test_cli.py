@@ -122,7 +122,7 @@ def test_train_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_train_with_one_row_logs_no_validation_score(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """There is no row left for validation: no score meanwhile, and none that is not a number."""
+    """Without validation rows the logged score is null, not NaN."""
     status, _, err = call(["train", folder, "--out", tmp_path / "run", "--n-train", 1, *SET], capsys)
     assert status == 0
     assert "4/4" in err
@@ -132,7 +132,7 @@ def test_train_with_one_row_logs_no_validation_score(
 
 
 def test_settings_override_the_preset(folder: Path, tmp_path: Path) -> None:
-    """What is set by hand wins."""
+    """``--set`` takes precedence over ``--preset``."""
     arguments = [
         "train",
         folder,
@@ -206,7 +206,7 @@ def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 
 def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not bad input, but one line all the same."""
+    """The error is one line, without traceback."""
     own = [*SET, "--set", "optimiser.signal=1e38", "--set", "steps=20"]
     status, out, err = call(["train", folder, "--out", tmp_path / "run", *own], capsys)
     assert (status, out) == (1, "")
@@ -230,7 +230,7 @@ def test_stopped_run_ends_with_status_130(
 
 
 def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
-    """A training process gets the signal that Ctrl-C sends."""
+    """A training process receives SIGINT."""
     out = tmp_path / "run"
     own = [*SET, "--set", "steps=400", "--set", "log_every=1", "--set", "validate_every=400"]
     process = subprocess.Popen(
@@ -326,7 +326,7 @@ def test_demo_finds_or_fetches_real_data(
 def test_demo_on_real_data(
     folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A field on spectra and a traced flat, here of data made up in the same layouts."""
+    """A field on spectra and a traced flat, with synthetic data in the layouts of the real data sets."""
     monkeypatch.setattr(demo, "REAL", str(folder))
     monkeypatch.setattr(demo, "FLAT", str(flat_folder))
     monkeypatch.setattr(demo, "find_data", Path)
@@ -344,7 +344,7 @@ def test_demo_on_real_data(
 def test_demo_in_the_embedded_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without real data: the field and the ray tracer, on the mesh of the room's scan, on the same rows."""
+    """Without real data the field and the ray tracer are scored on the same rows of the embedded room."""
     monkeypatch.setattr(demo, "find_data", lambda name: None)
     monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
     status, _, err = call(["demo", "--out", tmp_path / "run"], capsys)

@@ -25,7 +25,7 @@ def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_bad_arguments_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """By the parser of arguments: one line too, which names the command."""
+    """The parser's error is one line that names the command."""
     for arguments, message in (
         ([], "wrf-mi: the following arguments are required: COMMAND; see wrf-mi --help"),
         (["fly"], "argument COMMAND: invalid choice: 'fly'"),
@@ -119,7 +119,7 @@ def test_bad_data_and_folders_are_refused(
     ],
 )
 def test_resume_takes_no_settings(own: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """They would be left aside."""
+    """Options beside ``--resume`` are refused."""
     refused(["train", "--resume", run, *own], "omit data set and settings", capsys)
 
 
@@ -185,7 +185,7 @@ def test_system_errors_are_one_line_with_a_remedy(
 
 
 def test_closed_pipe_ends_the_command_silently() -> None:
-    """As ``head`` does; all output goes to a pipe that nobody reads."""
+    """The command writes to a pipe without reader, as with ``head``."""
     code = "import sys; sys.stdin.read(1); from wrf_mi.cli.main import main; sys.exit(main(['data', 'list']))"
     with subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, stderr=-1) as command:
         assert command.stdin

@@ -153,7 +153,7 @@ TRAINED: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("name", list(TRAINED))
 def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_path: Path) -> None:
-    """Stopped between two checkpoints of its last network, when the first of several has ended."""
+    """The run is stopped between two checkpoints of the second network."""
     data, own, networks = TRAINED[name]
     record = two_gateways if data == "spectra" else channels()
     ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}

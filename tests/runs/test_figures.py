@@ -32,7 +32,7 @@ def outlines_of(figure: Figure) -> list[FloatArray]:
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(90, 60), (0, 10), (200, 89), (359.5, 0)])
 def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elevation: float) -> None:
-    """Its angular radius is that of the scale seen from the receiver, low-pass included, seam and zenith or not."""
+    """The angular radius is the scale seen from the receiver with the low-pass added, also at seam and zenith."""
     seen = seen_from(azimuth, elevation, 4.0, [0.4, 0.4, 0.4])
     (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
     angle = np.arccos(outline @ unit_vectors(np.radians(azimuth), np.radians(elevation)))

@@ -126,7 +126,7 @@ def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch:
 
 
 def test_no_operator_option_splats(run: Path, tmp_path: Path) -> None:
-    """What was not asked for is not built."""
+    """The operator is not built."""
     (tmp_path / "tx.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
     own = tmp_path / "run"
     shutil.copytree(run, own)

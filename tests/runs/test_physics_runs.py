@@ -246,7 +246,7 @@ def test_mesh_alone_predicts_signal_strengths(
 
 
 def test_mesh_alone_predicts_spectra(tmp_path: Path) -> None:
-    """What a mesh without rows predicts depends on the mesh."""
+    """Predictions without training rows depend on the mesh."""
     record = wave_record(30, 10, receivers=1)
     middle = np.array([2.0, 2.0, 1.2])
     receiver = replace(record.receivers[0], position_m=np.array([4.4, 3.1, 0.8]))

@@ -83,7 +83,7 @@ def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -
 
 
 def test_resumed_run_is_bit_identical(folder: Path, tmp_path: Path) -> None:
-    """Stopped after a round of density control, and once more between two; parameters, moments, mean, scores."""
+    """Parameters, moments, running mean and scores, of a run stopped after a round of density control."""
     config = settings(*RESUMED, "deterministic=true")
     train(
         folder,
@@ -123,7 +123,7 @@ class PowerCut(BaseException):
 
 
 def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Path) -> None:
-    """Lines logged after that checkpoint are not there twice."""
+    """The log has no line twice."""
     config = settings("steps=40", "checkpoint_every=8", "deterministic=true")
 
     def kill(stage: str, share: float, progress: Progress) -> None:
@@ -144,7 +144,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
 def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The loss of one row is not a number; with that mended, the run goes on as if nothing had been."""
+    """The loss of one row is NaN; with finite losses the resumed run equals an uninterrupted run."""
     paper = Spectrum.loss
 
     def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, ssim_weight: float) -> Any:

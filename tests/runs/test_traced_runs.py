@@ -158,7 +158,7 @@ def test_headings_are_refused_where_unused_and_required_where_used(
 def test_calibrated_run_of_data_without_headings_predicts_without(
     flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its pattern is fitted in the frame of the world."""
+    """The pattern is fitted in the world frame."""
     record = replace(load(flat_folder), tx_heading_rad=None)
     monkeypatch.setattr("wrf_mi.synthetic.load_record", lambda name: record)
     run = train(record, tmp_path / "run", "ray-tracing", scene=room, settings=CALIBRATED).folder
@@ -208,7 +208,7 @@ def test_calibrated_planes_are_stored_as_a_scene(flat_folder: Path, room: Path, 
 def test_number_of_rays_is_searched_once_for_a_run(
     flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither single samples nor scoring again nor new positions search for another number."""
+    """Timed samples, evaluation and predictions at new positions use the stored number."""
     calls = []
     converged = solve.converged_rays
 
@@ -293,7 +293,7 @@ def test_comparison_shows_the_scene_while_it_exists(
 
 
 def test_spectra_without_array_are_refused(folder: Path, tmp_path: Path) -> None:
-    """A spectrum's instrument is known only where the data state carrier and array."""
+    """Ray tracing of spectra needs carrier and array of the data set."""
     with pytest.raises(InputError, match="carrier frequency unknown; state frequency_hz in its gateway_info"):
         train(folder, tmp_path / "run", "ray-tracing", scene="laboratory")
     assert not (tmp_path / "run").exists()
