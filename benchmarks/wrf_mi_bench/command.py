@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from wrf_mi.cli.train import print_json
+from wrf_mi.cli.output import print_json
 from wrf_mi.core import InputError
 
 TABLES = "tables"

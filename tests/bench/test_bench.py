@@ -1,4 +1,4 @@
-"""The benchmark's table, and that README and stored results say the same."""
+"""Tables of the benchmarks, and their agreement with the documents."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ON_PAGE = {
     "determinism": "numerics.md",
     "sentinels": "results.md",
 }
-"""Pages that show a check's table; those of physics models have their own, and all others are in the README."""
+"""Pages that show a check's table; those of physics models have their own, and all others are in `docs/results.md`."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -100,8 +100,8 @@ def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: 
     assert line == "| mesh: walls | **0.9** | 0.8 |"
 
 
-def test_readme_shows_the_stored_results() -> None:
-    readme = (CHECKOUT / "README.md").read_text()
+def test_documents_show_the_stored_results() -> None:
+    results = (CHECKOUT / "docs" / "results.md").read_text()
     trained, checked = read_results(RESULTS)
     physics = [one for one in checked if one["case"].startswith("physics-")]
     others = [one for one in checked if one not in physics and one["case"] not in ON_PAGE]
@@ -114,12 +114,12 @@ def test_readme_shows_the_stored_results() -> None:
             page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
             assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
-        assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+        assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
 
 
-def test_readme_shows_the_worst_of_each_stage() -> None:
+def test_documents_show_the_worst_of_each_stage() -> None:
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
-    shown = (CHECKOUT / "README.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
+    shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
     assert shown.strip() == summary_table(rows)
     stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
     assert set(stages) >= {words for words, _ in STAGES}

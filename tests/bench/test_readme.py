@@ -16,7 +16,7 @@ from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
 
-from wrf_mi.cli.main import _parser
+from wrf_mi.cli.main import build_parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder
@@ -67,6 +67,7 @@ def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatc
     for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
+    script += "\n".join(blocks(CHECKOUT / "docs" / "model.md", "python"))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(script, str(README), "exec"), names)
@@ -94,7 +95,7 @@ def test_commands_parse(path: Path) -> None:
             continue
         assert program == "wrf-mi", line
         try:
-            parsed: argparse.Namespace = _parser().parse_args(arguments)
+            parsed: argparse.Namespace = build_parser().parse_args(arguments)
         except SystemExit:
             pytest.fail(f"{path.name}: {line}")
         with_settings(TrainConfig(), getattr(parsed, "set", []))
