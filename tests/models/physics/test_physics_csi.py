@@ -13,10 +13,9 @@ from scipy.constants import speed_of_light
 from traced_rooms import write_xml
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics import csi
 from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi
-from wrf_mi.models.physics.csi_decode import decode
-from wrf_mi.models.physics.csi_paths import images_of, seen_from
+from wrf_mi.models.physics.csi_fit import decode
+from wrf_mi.models.physics.csi_paths import candidate_paths, images_of
 from wrf_mi.models.physics.csi_residual import fit_diffuse
 from wrf_mi.models.physics.csi_visibility import Learner
 from wrf_mi.tasks.scores import cea_db
@@ -129,7 +128,7 @@ def test_paths_are_those_of_the_tracer(right: Any, places: np.ndarray) -> None:
     paths = trace_paths(right, places, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16)).paths
     walls = walls_of(scene_surfaces(right))
     chains = [(-1, -1)] + [(i, j) for i in range(len(walls)) for j in range(-1, len(walls)) if i != j]
-    seen = seen_from(walls, images_of(walls, ACCESS_POINT.position_m, np.array(chains)), places)
+    seen = candidate_paths(walls, images_of(walls, ACCESS_POINT.position_m, np.array(chains)), places)
     there = (seen.inside_m > 0) & (seen.clear_m > 0)
     # A path through the very edge of a surface may be decided either way; Sionna RT drops segments below 1 cm.
     doubtful = np.minimum(np.abs(seen.inside_m), np.abs(seen.clear_m)) < 1e-4
@@ -168,7 +167,7 @@ def test_things_in_the_way_are_learned_from_paths(right: Any) -> None:
     walls = walls_of(scene_surfaces(right))
     chains = [(-1, -1)] + [(i, j) for i in range(len(walls)) for j in range(-1, len(walls)) if i != j]
     images = images_of(walls, ACCESS_POINT.position_m, np.array(chains))
-    seen = seen_from(walls, images, positions)
+    seen = candidate_paths(walls, images, positions)
     share = np.linspace(0, 1, 60)[:, None]
     through = np.zeros(len(seen), bool)
     for start, end in zip(seen.point_m[:, :-1].swapaxes(0, 1), seen.point_m[:, 1:].swapaxes(0, 1), strict=True):
@@ -207,7 +206,7 @@ def test_many_places_are_predicted_in_parts(
     fitted: CsiPhysics, measured: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = fitted.predict(measured.tx_pos_m[:30], 0)
-    monkeypatch.setattr(csi, "CHUNK_SIZE", 7)
+    monkeypatch.setattr(CsiPhysics, "chunk_size", 7)
     parts = fitted.predict(measured.tx_pos_m[:30], 0)
     for one, other in ((parts.mean, whole.mean), (parts.std, whole.std)):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
@@ -216,7 +215,7 @@ def test_many_places_are_predicted_in_parts(
 def test_arrays_hold_all_that_predicts(fitted: CsiPhysics, measured: Record, tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **fitted.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
-        again = CsiPhysics.from_arrays(dict(stored), None)
+        again = CsiPhysics.from_arrays(dict(stored))
     for name in ("mean", "std"):
         one, other = (getattr(model.predict(measured.tx_pos_m[:30], 0), name) for model in (fitted, again))
         np.testing.assert_array_equal(one, other)
@@ -265,7 +264,7 @@ def test_several_receivers_and_subcarriers(right: Any, wrong: Any, places: np.nd
         estimate = model.predict(places[test], number)
         assert estimate.mean.shape == estimate.std.shape == (60, 3)
         assert np.median(cea_db(estimate.mean, observed[number, test])) > 40  # as with one of both
-    again = CsiPhysics.from_arrays(model.arrays(), None)
+    again = CsiPhysics.from_arrays(model.arrays())
     np.testing.assert_array_equal(again.predict(places[test], 1).mean, model.predict(places[test], 1).mean)
 
 

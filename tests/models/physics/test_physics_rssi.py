@@ -14,9 +14,9 @@ from wrf_mi_scenes.build_laboratory import box, sheet
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.models.physics.gaussian_process import Part, fit_pooled
 from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
-from wrf_mi.models.physics.rssi_fit import Measured, shift_of, widening
+from wrf_mi.models.physics.rssi_fit import folds, shift_of, widening
 from wrf_mi.models.physics.rssi_map import PowerMap, trace_map
-from wrf_mi.models.physics.rssi_terms import Covariance, Places, stops_of
+from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, stops_of
 
 FREQUENCY_HZ = 2.44e9
 AT_1M_DBM = -40.2
@@ -62,37 +62,38 @@ def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
 def test_the_posterior_is_the_dense_one() -> None:
     """Shared coefficients and independent fields, against one covariance matrix of all receivers' rows."""
     rng = np.random.default_rng(1)
-    kernel = Covariance(3.0, 1.5, 1.0, 1.0, 1.0)
+    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0)
     prior = np.array([5.0, 1.0])
-    places = [Places(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
+    places = [Poses(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
     bases = [rng.normal(size=(len(p), 2)) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
     parts = [Part(*one) for one in zip(places, bases, values, noise, strict=True)]
-    process = fit_pooled(parts, kernel, prior, kernel.point(True))
+    process = fit_pooled(parts, kernel.covariance, prior, kernel.variance(True))
 
-    asked, basis = Places(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
+    asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
     mean, variance = process.predict(1, asked, basis)
 
     all_bases = np.concatenate(bases)
     dense = all_bases @ np.diag(prior**2) @ all_bases.T + np.diag(np.concatenate(noise))
-    dense[:7, :7] += kernel(places[0], places[0])
-    dense[7:, 7:] += kernel(places[1], places[1])
+    dense[:7, :7] += kernel.covariance(places[0], places[0])
+    dense[7:, 7:] += kernel.covariance(places[1], places[1])
     cross = basis @ np.diag(prior**2) @ all_bases.T
-    cross[:, 7:] += kernel(asked, places[1])
-    own = np.square(basis) @ prior**2 + kernel.point(True)
+    cross[:, 7:] += kernel.covariance(asked, places[1])
+    own = np.square(basis) @ prior**2 + kernel.variance(True)
     # Both are float64; the jitter on the diagonal is 1e-8 of the noise.
     np.testing.assert_allclose(mean, cross @ np.linalg.solve(dense, np.concatenate(values)), rtol=1e-6)
     np.testing.assert_allclose(variance, own - (cross @ np.linalg.solve(dense, cross.T)).diagonal(), rtol=1e-6)
 
 
 def test_heavy_tails_do_not_pull() -> None:
-    places = Places(np.zeros((21, 3)), None)
+    places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
     part = Part(places, np.ones((21, 1)), value, np.ones(21))
-    kernel = Covariance(1e-3, 1.0, 0.0, 1.0, 1.0)
+    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0)
     plain, robust = (
-        fit_pooled([part], kernel, np.array([10.0]), kernel.point(False), 4.0, rounds).beta[0] for rounds in (0, 3)
+        fit_pooled([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
+        for rounds in (0, 3)
     )
     assert plain == pytest.approx(40 / 21, rel=0.02)
     assert abs(robust) < 0.3
@@ -100,19 +101,19 @@ def test_heavy_tails_do_not_pull() -> None:
 
 def test_rows_of_one_stop_are_joined() -> None:
     x = np.array([0.0, 0.05, 0.1, 1.0, 1.0, 1.0, 1.0])
-    places = Places(np.column_stack([x, np.zeros((7, 2))]), np.array([3.1, -3.1, 3.1, 0, 0, 2.0, 2.0]))
+    places = Poses(np.column_stack([x, np.zeros((7, 2))]), np.array([3.1, -3.1, 3.1, 0, 0, 2.0, 2.0]))
     value = np.array([[1.0, 2.0, 9.0, np.nan, 4.0, np.nan, np.nan]])
-    stops = stops_of(places, value, np.array([0, 1, 2, 3, 4, 5, 90]), reach_m=0.2, turn_rad=0.5, most=20)
+    stops = stops_of(Measured(places, value, np.array([0, 1, 2, 3, 4, 5, 90])), reach_m=0.2, turn_rad=0.5, most=20)
     assert stops.count.tolist() == [[3, 1, 0, 0]]
     np.testing.assert_array_equal(stops.value_dbm, [[2.0, 4.0, np.nan, np.nan]])
     # Headings either side of the seam at pi have their mean at pi, not at 0.
-    np.testing.assert_allclose(np.cos(stops.places.heading_rad), np.cos([np.pi, 0, 2, 2]), atol=1e-3)
+    np.testing.assert_allclose(np.cos(stops.poses.heading_rad), np.cos([np.pi, 0, 2, 2]), atol=1e-3)
 
 
 def test_precise_rows_of_a_stop_weigh_more() -> None:
-    places = Places(np.zeros((4, 3)), None)
+    places = Poses(np.zeros((4, 3)), None)
     value, precision = np.array([[1.0, 2.0, np.nan, 9.0], [1.0, 2.0, 3.0, 4.0]]), np.array([[1, 1, 7, 3], [1, 1, 1, 3]])
-    stops = stops_of(places, value, np.arange(4), 0.2, 0.5, 20, precision=precision.astype(float))
+    stops = stops_of(Measured(places, value, np.arange(4), precision.astype(float)), 0.2, 0.5, 20)
     np.testing.assert_array_equal(stops.count, [[5], [6]])
     # The median of 1, 2, 9, 9, 9, and that of 1, 2, 3, 4, 4, 4.
     np.testing.assert_array_equal(stops.value_dbm, [[9.0], [3.5]])
@@ -185,7 +186,7 @@ def test_survives_its_arrays() -> None:
     record = made(80, noise_db=2.0)
     record.observation[1, ::3] = np.nan
     model = fit_rssi(record, np.arange(70), None, FAST)
-    again = RssiPhysics.from_arrays(model.arrays(), None)
+    again = RssiPhysics.from_arrays(model.arrays())
     assert record.tx_heading_rad is not None
     for k in range(3):
         ours, theirs = (m.predict(record.tx_pos_m, k, record.tx_heading_rad) for m in (model, again))
@@ -206,7 +207,7 @@ def test_search_lowers_the_held_out_error() -> None:
 def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
     record = made(240, noise_db=0.5)
     assert record.tx_heading_rad is not None
-    ahead = Places(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
+    ahead = Poses(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
     turn = record.tx_heading_rad[:, None]
     np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
     stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
@@ -216,9 +217,8 @@ def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
 
 def test_folds_leave_out_neighbours_in_time() -> None:
     count = 700
-    measured = Measured(Places(np.zeros((count, 3)), None), np.zeros((1, count)), np.arange(count))
     held = np.zeros(count, int)
-    for train, out in measured.folds():
+    for train, out in folds(count):
         held[out] += 1
         nearest = np.abs(train[:, None] - out[None]).min()
         assert nearest > 12  # a quarter of a stretch of 50

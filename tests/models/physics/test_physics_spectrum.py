@@ -14,15 +14,14 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.interpolation.kriging import Kriging
-from wrf_mi.models.physics import spectrum, spectrum_rays
-from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum
-from wrf_mi.models.physics.spectrum_few import groups
-from wrf_mi.models.physics.spectrum_fit import Constants, fit_constants, fit_maps, map_places, scan_offsets
-from wrf_mi.models.physics.spectrum_loss import Grid
-from wrf_mi.models.physics.spectrum_model import Chaining, Fit, Spectrometer, SpectrumModel, begin
-from wrf_mi.models.physics.spectrum_residual import RESIDUALS, Rest, RestKind
-from wrf_mi.models.physics.spectrum_search import Search
-from wrf_mi.models.physics.spectrum_sheets import Known
+from wrf_mi.models.physics import spectrum_rays
+from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum, groups
+from wrf_mi.models.physics.spectrum_fit import fit_constants, fit_maps, gain_slopes, map_centres, scan_offsets
+from wrf_mi.models.physics.spectrum_loss import Grid, Spectrometer
+from wrf_mi.models.physics.spectrum_model import Fit, SpectrumModel, begin
+from wrf_mi.models.physics.spectrum_rays import Chaining
+from wrf_mi.models.physics.spectrum_residual import RESIDUALS, ResidualField, ResidualKriging
+from wrf_mi.models.physics.spectrum_search import KnownPaths, Search
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6
@@ -69,12 +68,12 @@ def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any, rx: Antenna, tx
     instrument = replace(INSTRUMENT, receiver=receiver, tx_antenna=tx_antenna)
     model, tx = begin(instrument, scene, HOW), places(20, 0)
     waves = model.waves(tx)
-    gain, length = waves.gain(model.constants), np.linalg.norm(waves.met.image_m, axis=1)
+    gain, length = waves.gain(model.constants.slabs), np.linalg.norm(waves.paths.image_m, axis=1)
     options = TraceOptions(transmission=True, max_depth=3, max_reflections=2, rays=1 << 14)
     paths = trace_paths(scene, tx, receiver, options, tx_antenna=tx_antenna).paths
     paths = paths.select((paths.interactions == 4).sum(axis=1) <= 1)
     mine: dict[tuple[int, float], list[complex]] = {}
-    for row, far, value in zip(waves.met.tx, length, gain, strict=True):
+    for row, far, value in zip(waves.paths.tx, length, gain, strict=True):
         mine.setdefault((int(row), round(float(far), 3)), []).append(complex(value))
     apart = []
     for row, far, value in zip(paths.tx, paths.length_m, paths.gain, strict=True):
@@ -85,7 +84,7 @@ def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any, rx: Antenna, tx
     # Sionna RT computes in float32, whose error grows where a reflection nearly vanishes.
     assert max(apart) < 1e-4 * np.abs(gain).max()
     # It drops paths with a leg below 1 cm, in corners of the room.
-    assert 300 < len(paths) <= len(waves.met) < 1.02 * len(paths)
+    assert 300 < len(paths) <= len(waves.paths) < 1.02 * len(paths)
 
 
 def test_rays_by_hand_and_by_mitsuba_meet_the_same(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +94,7 @@ def test_rays_by_hand_and_by_mitsuba_meet_the_same(scene: Any, monkeypatch: pyte
         monkeypatch.setattr(spectrum_rays, "FEW_PAIRS", pairs)
         found.append(model.table(tx))
     assert len(found[0]) == len(found[1]) > 200
-    for name in ("tx", "chain", "thing", "plane"):
+    for name in ("tx", "chain", "objects", "plane"):
         assert np.array_equal(getattr(found[0], name), getattr(found[1], name))
     # A normal's sign is that of the face or of the plane: reflections and passages know none.
     assert np.allclose(np.abs(found[0].normal), np.abs(found[1].normal), atol=1e-6)
@@ -112,7 +111,7 @@ def test_a_displaced_plane_moves_images_as_a_displaced_mesh_does(bare: SpectrumM
     tx = places(5, 1)
     for a, b in ((bare.waves(tx), other.waves(tx)),):
         mine = np.sort(np.linalg.norm(a.image(offset), axis=1))
-        assert np.allclose(mine, np.sort(np.linalg.norm(b.met.image_m, axis=1)), atol=1e-5)  # float32 corners
+        assert np.allclose(mine, np.sort(np.linalg.norm(b.paths.image_m, axis=1)), atol=1e-5)  # float32 corners
 
 
 def test_loss_knows_no_scale_or_phase_and_has_the_right_slope() -> None:
@@ -134,8 +133,8 @@ def test_constants_are_found_again(bare: SpectrumModel) -> None:
     truth = bare.replaced(constants=replace(bare.constants, offset_m=offset))
     waves, grid = bare.waves(places(60, 2)), INSTRUMENT.grid
     shapes = grid.shapes(INSTRUMENT.report(truth.signals(waves)))
-    start = scan_offsets(waves, shapes, grid, bare.constants, 0.03)
-    found = fit_constants(waves, shapes, grid, start, bare.constants, 0.03, 25)
+    start = scan_offsets(waves, shapes, bare.constants, 0.03)
+    found = fit_constants(waves, shapes, start, bare.constants, 0.03, 25)
     # The prior pulls towards zero, and a wall's thickness changes the same phase: up to a fifth of the error is left.
     assert np.abs(found.offset_m - offset).max() < 0.005
     before, after = (grid.loss(bare.replaced(constants=c).signals(waves), shapes)[0] for c in (bare.constants, found))
@@ -144,9 +143,9 @@ def test_constants_are_found_again(bare: SpectrumModel) -> None:
 
 def test_slopes_by_constants_are_differences(bare: SpectrumModel) -> None:
     waves, constants = bare.waves(places(4, 3)), bare.constants
-    gain, vector = waves.gain(constants), constants.vector()
+    gain, vector = waves.gain(constants.slabs), constants.vector()
     for index in (0, 4, 7, 13, 20):
-        path, slope = waves.slopes(constants, gain)[index]
+        path, slope = gain_slopes(waves, constants, gain)[index]
         step = np.zeros_like(vector)
         step[index] = 1e-5
         both = []
@@ -154,7 +153,7 @@ def test_slopes_by_constants_are_differences(bare: SpectrumModel) -> None:
             other = constants.with_vector(vector + sign * step)
             turn = waves.image(other.offset_m), waves.image(constants.offset_m)
             longer = np.subtract(*(np.linalg.norm(image, axis=1) for image in turn))
-            both.append(waves.gain(other) * np.exp(-1j * waves.wavenumber * longer))
+            both.append(waves.gain(other.slabs) * np.exp(-1j * INSTRUMENT.wavenumber * longer))
         expected = (both[0] - both[1]) / 2e-5
         assert len(path)
         # One-sided differences of 1e-4 in the logarithm of a constant.
@@ -167,11 +166,8 @@ def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> 
     tx = places(120, 4)
     shapes = INSTRUMENT.grid.shapes(INSTRUMENT.report(room.signals(room.waves(tx))))
     waves, frames = bare.waves(tx), bare.frames(tx)
-    known = Known.of(bare.table, waves, bare.constants, bare.factor(waves.met), tx)
-    search = Search(
-        frames, tx, RECEIVER.position_m, INSTRUMENT.elements_m, INSTRUMENT.antennas, HZ, shapes, INSTRUMENT.grid,
-        known,
-    )  # fmt: skip
+    known = KnownPaths.of(bare.table, waves.paths, bare.path_waves(waves), tx)
+    search = Search(frames, INSTRUMENT, tx, shapes, known)
     (found,) = search(waves.sum @ known.wave, most=1, least_gain=30.0)
     corners = found.corners(frames)
     assert found.kind == 0
@@ -186,13 +182,13 @@ def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> 
 
 def test_amplitudes_learn_a_chain_that_is_too_weak(bare: SpectrumModel) -> None:
     waves, grid = bare.waves(places(80, 5)), INSTRUMENT.grid
-    maps = map_places(waves.met, bare.table.length, 1.0, 0)
+    maps = map_centres(waves.paths, bare.table.length, 1.0, 0)
     strong = np.flatnonzero(maps.chain == 0)[:1]  # the constant of the direct path
     weight = np.zeros(len(maps.chain), complex)
     weight[strong] = 0.5
     truth = bare.replaced(maps=replace(maps, weight=weight))
     shapes = grid.shapes(INSTRUMENT.report(truth.signals(waves)))
-    found = bare.replaced(maps=fit_maps(waves, shapes, grid, bare.constants, maps, 0.2, 60))
+    found = bare.replaced(maps=fit_maps(waves, shapes, bare.constants, maps, 0.2, 60))
     before, after = (grid.loss(m.signals(waves), shapes)[0].mean() for m in (bare, found))
     assert after < before / 3
 
@@ -224,7 +220,7 @@ def test_many_transmitters_are_predicted_in_parts(
     """Sums of some waves in another order; the deviation, the same for all, is held once."""
     record, physics = fitted
     whole = physics.predict(record.tx_pos_m[:20], 0)
-    monkeypatch.setattr(spectrum, "CHUNK_SIZE", 7)
+    monkeypatch.setattr(SpectrumPhysics, "chunk_size", 7)
     parts = physics.predict(record.tx_pos_m[:20], 0)
     np.testing.assert_allclose(parts.mean, whole.mean, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(parts.std, whole.std)
@@ -262,7 +258,7 @@ def test_without_a_mesh_there_is_the_direct_path(bare: SpectrumModel) -> None:
     record = record_of(bare, places(10, 7))
     physics = fit_spectrum(record, np.zeros(0, np.int64), None)
     waves = physics.models[0].waves(record.tx_pos_m)
-    assert len(waves.met) == 10
+    assert len(waves.paths) == 10
     direct = record.tx_pos_m - RECEIVER.position_m
     assert np.allclose(waves.image(np.zeros(0)), direct)
 
@@ -274,7 +270,7 @@ def test_bad_input_is_refused(bare: SpectrumModel) -> None:
     with pytest.raises(InputError, match="array or carrier"):
         fit_spectrum(record.with_array(None), np.arange(3), None)
     physics = fit_spectrum(record, np.zeros(0, np.int64), None)
-    for wrong in ([1.0, 2.0, 3.0], [[np.nan, 0, 0]]):
+    for wrong in ([[1.0, 2.0]], [[np.nan, 0, 0]]):
         with pytest.raises(InputError, match="transmitters"):
             physics.predict(wrong, 0)
     for unknown in ("sensor10", 1, -1):
@@ -298,10 +294,10 @@ def test_rows_of_one_object_stay_in_its_grid() -> None:
 def test_choices_need_validation_rows_to_gain(bare: SpectrumModel) -> None:
     tx = places(60, 9)
     spectra = INSTRUMENT.report(bare.signals(bare.waves(tx)))
-    fit = Fit(bare, tx, spectra, np.arange(45), np.arange(45, 60), 0.03, 5)
+    settings = SpectrumSettings(surfaces=2, steps=5)
+    fit = Fit(INSTRUMENT, tx, spectra, np.arange(45), np.arange(45, 60), settings)
     # The mesh explains everything: no surface is needed, and none is taken.
-    assert fit.surfaces(bare, 2, 30.0, HOW).learned == 0
-    assert isinstance(bare.constants, Constants)
+    assert fit.surfaces(bare, HOW).learned == 0
 
 
 def test_a_rest_is_carried_over_to_near_places_only() -> None:
@@ -312,7 +308,7 @@ def test_a_rest_is_carried_over_to_near_places_only() -> None:
     rest = np.tensordot(value, pattern, axes=1).astype(np.float32)
     rest *= np.float32(0.05)  # so that spectra lie within 0..1
     room = np.full_like(rest, 0.5)
-    kriged = Rest.of(tx[:50], room[:50] + rest[:50], room[:50], RestKind(1.0, 2.0, NOISE, False), 0.5)
+    kriged = ResidualKriging.of(tx[:50], room[:50] + rest[:50], room[:50], ResidualField(1.0, 2.0, NOISE, False), 0.5)
     near = kriged(tx[50:], room[50:]) - room[50:]
     assert np.square(near - rest[50:]).mean() < 0.3 * np.square(rest[50:]).mean()
     far = kriged(np.array([[30.0, 0, 0]]), room[:1])
@@ -330,7 +326,7 @@ def test_kriging_of_spectra_needs_no_room() -> None:
     rng = np.random.default_rng(1)
     tx, spectra = rng.uniform(0, 2, (12, 3)), rng.uniform(0.3, 0.7, (12, 5, 6)).astype(np.float32)
     room = rng.uniform(0, 1, (12, 5, 6)).astype(np.float32)
-    kriged = Rest.of(tx[:9], spectra[:9], room[:9], RestKind(0.0, 3.0, 0.1, True), 0.5)
+    kriged = ResidualKriging.of(tx[:9], spectra[:9], room[:9], ResidualField(0.0, 3.0, 0.1, True), 0.5)
     covariance = np.exp(-np.linalg.norm(tx[:9, None] - tx[None, :9], axis=-1) / 1.5) + 0.1 * np.eye(9)
     across = np.exp(-np.linalg.norm(tx[9:, None] - tx[None, :9], axis=-1) / 1.5)
     # Unknown mean: the weights of the rows add up to one.

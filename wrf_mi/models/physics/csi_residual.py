@@ -1,39 +1,36 @@
-"""What image sources leave of channels: a diffuse field, kriged where measurements lie close together."""
+"""Residuals of channels that image sources leave: a diffuse field, kriged where measurements lie close together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...core.angles import FloatArray
 from ..interpolation.kriging_equations import simple_weights
+from .csi_repair import Complex
 
 NEIGHBOURS = 32
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
-"""Shares of the power that may be a field, the rest being noise; what predicts rows left out best is taken."""
-
+"""Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
 CERTAIN = 3.0
-"""Standard errors by which a field must predict better than none."""
-
-Complex = NDArray[np.complex128]
+"""Standard errors by which predictions with the field must be better than without."""
 
 
 @dataclass(frozen=True)
-class Diffuse:
+class DiffuseField:
     """Complex Gaussian field with covariance sin(k d) / (k d): waves from all directions with equal power.
 
     Source: Cook et al., "Measurement of correlation coefficients in reverberant sound fields" (1955), J. Acoust. Soc.
     Am. 27; the same holds for scalar waves of any kind.
 
     Attributes:
-        position_m: of the rows [n, 3].
-        value: what is left there [n, subcarriers].
+        position_m: positions of the rows [n, 3].
+        value: residual channels there [n, subcarriers].
         k: mean wave number, rad/m.
         power: mean of abs(value)^2.
-        share: of the power that is a field, the rest is noise of each row.
+        share: share of the field in the power; the rest is noise of each row.
     """
 
     position_m: FloatArray
@@ -42,11 +39,11 @@ class Diffuse:
     power: float
     share: float
 
-    def predict(self, position_m: FloatArray) -> tuple[Complex, FloatArray]:
-        """Mean [m, subcarriers] and variance [m] of the field at positions [m, 3] and of what is no field there."""
-        return self._krige(position_m, 0)
+    def predict(self, position_m: FloatArray, skip: int = 0) -> tuple[Complex, FloatArray]:
+        """Mean [m, subcarriers] and variance [m] of residuals, noise included, at positions [m, 3] in metres.
 
-    def _krige(self, position_m: FloatArray, skip: int) -> tuple[Complex, FloatArray]:
+        The ``skip`` nearest rows are not used: 1 leaves out the row at the position itself.
+        """
         count = len(position_m)
         if self.share == 0 or len(self.position_m) <= skip:
             return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
@@ -60,29 +57,28 @@ class Diffuse:
         return mean, self.power * np.maximum(1 - known, 1e-6)
 
 
-def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> Diffuse:
-    """The share of a field that predicts best, each row from the others (logarithmic score).
+def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:
+    """The field whose share predicts each row best from the others (logarithmic score).
 
-    Args:
-        position_m: of the rows [n, 3].
-        value: what is left of the channels there [n, subcarriers].
-        k: mean wave number, rad/m.
+    ``value`` [n, subcarriers] holds residual channels at positions [n, 3] in metres, ``k`` the mean wave number, rad/m.
     """
     power = float(np.square(np.abs(value)).mean()) if len(value) else 0.0
-    found = Diffuse(position_m, value, k, power, 0.0)
-    best = _scores(found) if power > 0 and len(value) > 2 else np.zeros(0)
-    for share in SHARES if len(best) else ():
-        field = Diffuse(position_m, value, k, power, share)
+    best = DiffuseField(position_m, value, k, power, 0.0)
+    if power == 0 or len(value) <= 2:
+        return best
+    lowest = _scores(best)
+    for share in SHARES:
+        field = replace(best, share=share)
         scores = _scores(field)
-        gain = best - scores
-        # A field that is none adds its neighbours' errors to what was right: only one that is certain is taken.
+        gain = lowest - scores
+        # A spurious field adds its neighbours' errors to correct predictions: only a certain gain is accepted.
         if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
-            best, found = scores, field
-    return found
+            lowest, best = scores, field
+    return best
 
 
-def _scores(field: Diffuse) -> FloatArray:
-    """Of each row from the others [n]; robust: one that lacks a path is no reason to give up the field elsewhere."""
-    mean, variance = field._krige(field.position_m, 1)
+def _scores(field: DiffuseField) -> FloatArray:
+    """Score of each row predicted from the others [n]; robust to rows that lack a path."""
+    mean, variance = field.predict(field.position_m, skip=1)
     error = np.square(np.abs(field.value - mean)).mean(axis=1)
     return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
