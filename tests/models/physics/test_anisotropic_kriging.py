@@ -65,7 +65,7 @@ def test_prediction_is_ordinary_kriging() -> None:
     np.testing.assert_allclose(process.std(where), np.sqrt(variance)[:, None, None] * process.scale, atol=SINGLE)
 
 
-def test_constant_is_predicted_as_it_is() -> None:
+def test_constant_field_is_reproduced() -> None:
     """Weights sum to one, near and far, for any row left out."""
     process = some()
     process.observed[:] = 0.25
@@ -126,7 +126,7 @@ def drawn(length_m: np.ndarray, noise: float, count: int, pixels: int) -> tuple[
 
 
 @pytest.mark.parametrize("most", [400, 90])
-def test_lengths_and_noise_are_found_again(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_recovers_lengths_and_noise(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """300 draws at 120 places tell a length to some per cent; all rows predict, even if fewer are fitted to."""
     monkeypatch.setattr(nearby, "MOST_ROWS", most)
     where, observed = drawn(LENGTH_M, NOISE, 120, 300)
@@ -137,7 +137,7 @@ def test_lengths_and_noise_are_found_again(most: int, monkeypatch: pytest.Monkey
     assert fitted.observed.shape == observed.shape
 
 
-def test_rows_that_tell_nothing_break_nothing() -> None:
+def test_equal_spectra_and_coincident_rows_can_be_fitted() -> None:
     """All spectra the same, and all at one place."""
     where = positions(10)
     same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
@@ -148,7 +148,7 @@ def test_rows_that_tell_nothing_break_nothing() -> None:
     np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
-def test_kriging_is_stored_and_read(tmp_path: Path) -> None:
+def test_kriging_is_restored_from_arrays(tmp_path: Path) -> None:
     process, where = some(), positions(3, seed=5)
     np.savez(tmp_path / "nearby.npz", **field_arrays(process, ""))
     with np.load(tmp_path / "nearby.npz") as stored:
@@ -166,21 +166,22 @@ def record() -> Record:
 
 
 @pytest.fixture(scope="module")
-def heard() -> list[tuple[str, float]]:
+def progress() -> list[tuple[str, float]]:
     return []
 
 
 @pytest.fixture(scope="module")
-def physics(record: Record, heard: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
+def physics(record: Record, progress: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
     assert record.official is not None
     kind = kind_of(record, with_scene=False)
-    model = kind.fit(record, record.official[0], None, kind.settings(), 0, lambda *told: heard.append(told))
+    settings = MeasuredSpectrumSettings(directions=60)
+    model = kind.fit(record, record.official[0], None, settings, 0, lambda *stage: progress.append(stage))
     assert isinstance(model, MeasuredSpectrumPhysics)
     return model
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
-def test_physics_beats_both_of_its_parts_and_knows_how_far_it_is_off(
+def test_mixture_beats_kriging_and_states_its_error(
     record: Record, physics: MeasuredSpectrumPhysics, receiver: int
 ) -> None:
     assert record.official is not None
@@ -212,21 +213,19 @@ def test_deviation_is_that_of_the_grey_values_far_away(record: Record, physics: 
     assert np.abs(near.mean - known).mean() < 0.02
 
 
-def test_fit_says_what_it_does_and_what_it_found(
-    physics: MeasuredSpectrumPhysics, heard: list[tuple[str, float]]
-) -> None:
-    assert heard[0][0] == "one: element signals of spectra"
-    assert {what for what, _ in heard} >= {"one: signals", "one: weights", "two: weights"}
-    assert all(0 <= share <= 1 for _, share in heard)
-    assert heard[-1] == ("two: weights", 1.0)
+def test_fit_reports_progress_and_summary(physics: MeasuredSpectrumPhysics, progress: list[tuple[str, float]]) -> None:
+    assert progress[0][0] == "one: element signals of spectra"
+    assert {stage for stage, _ in progress} >= {"one: signals", "one: weights", "two: weights"}
+    assert all(0 <= share <= 1 for _, share in progress)
+    assert progress[-1] == ("two: weights", 1.0)
     found = physics.summary()
     assert sum(found["coherent_share"]) == pytest.approx(1, abs=1e-3)
     assert 0 < found["turned_share"] <= 1
 
 
-def test_physics_is_stored_and_read(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
-    np.savez(tmp_path / "hybrid.npz", **physics.arrays())
-    with np.load(tmp_path / "hybrid.npz", allow_pickle=False) as stored:
+def test_model_is_restored_from_arrays(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
+    np.savez(tmp_path / "model.npz", **physics.arrays())
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
         again = kind_of(record, with_scene=False).load(dict(stored))
     assert [r.name for r in again.receivers] == ["one", "two"]
     for receiver in (0, 1):
@@ -289,7 +288,7 @@ def test_rows_that_one_receiver_missed_are_left_out_there(record: Record) -> Non
         fit_measured_spectrum(replace(record, observation=observed), rows, quick)
 
 
-def test_rows_too_close_together_tell_no_gap(record: Record) -> None:
+def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
     """Nothing is held out, so nothing is known of how far to trust either part; and no gap is wider than the rows."""
     quick = MeasuredSpectrumSettings(directions=20, lengths=2)
     one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
@@ -304,7 +303,7 @@ def test_rows_too_close_together_tell_no_gap(record: Record) -> None:
     assert 0.3 < close.spread < 1.5
 
 
-def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many at once as memory bears: the parts are joined in order."""
     assert record.official is not None
     sizes = []
@@ -334,9 +333,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
         ({"array_m": np.outer(np.arange(9), [0.1, 0, 0])}, 20, "on a line"),
     ],
 )
-def test_data_that_tell_too_little_are_refused(
-    change: dict[str, Any], count: int, message: str, record: Record
-) -> None:
+def test_insufficient_data_are_refused(change: dict[str, Any], count: int, message: str, record: Record) -> None:
     broken = record.with_array(change["array_m"]) if "array_m" in change else replace(record, **change)
     with pytest.raises(InputError, match=message):
         fit_measured_spectrum(broken, np.arange(count))
@@ -360,6 +357,6 @@ def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) 
 
 
 @pytest.mark.parametrize("where", [[[0.0, 0.0]], [[0.0, np.nan, 0.0]]])
-def test_positions_that_are_none_are_refused(where: list[list[float]], physics: MeasuredSpectrumPhysics) -> None:
+def test_invalid_positions_are_refused(where: list[list[float]], physics: MeasuredSpectrumPhysics) -> None:
     with pytest.raises(InputError, match="give finite positions"):
         physics.predict(where)
