@@ -13,10 +13,9 @@ from scipy.constants import speed_of_light
 from traced_rooms import write_xml
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi
+from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi, fit_diffuse
 from wrf_mi.models.physics.csi_fit import decode
 from wrf_mi.models.physics.csi_paths import candidate_paths, images_of
-from wrf_mi.models.physics.csi_residual import fit_diffuse
 from wrf_mi.models.physics.csi_visibility import Learner
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -175,7 +174,7 @@ def test_learner_predicts_hidden_paths_of_held_out_rows(right: Any) -> None:
         through |= (np.linalg.norm(way - [2.6, 2.2, 1.3], axis=2) < 0.5).any(axis=1)
     scene_says = (seen.inside_m > 0) & (seen.clear_m > 0)
     there = scene_says & ~through
-    learner = Learner(walls, images, seen, outline_sd_m=0.02, ridge=1.0, seed=0, folds=3)
+    learner = Learner(walls, images, seen, sd_m=0.02, ridge=1.0, seed=0, folds=2)
     _, odds = learner.fit(there.astype(float), np.ones(len(seen)))
     wrong_before, wrong_after = (scene_says != there).sum(), ((odds > 0) != there).sum()
     assert wrong_before > 100

@@ -12,9 +12,8 @@ import trimesh
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics.gaussian_process import Part, fit_pooled
 from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
-from wrf_mi.models.physics.rssi_fit import folds, shift_of, widening
+from wrf_mi.models.physics.rssi_fit import Part, fit_pooled, folds, shift_of, widening
 from wrf_mi.models.physics.rssi_map import PowerMap, trace_map
 from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, stops_of
 

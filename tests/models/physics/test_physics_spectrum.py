@@ -16,11 +16,19 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.interpolation.kriging import Kriging
 from wrf_mi.models.physics import spectrum_rays
 from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum, groups
-from wrf_mi.models.physics.spectrum_fit import fit_constants, fit_maps, gain_slopes, map_centres, scan_offsets
+from wrf_mi.models.physics.spectrum_fit import (
+    RESIDUALS,
+    ResidualField,
+    ResidualKriging,
+    fit_constants,
+    fit_maps,
+    gain_slopes,
+    map_centres,
+    scan_offsets,
+)
 from wrf_mi.models.physics.spectrum_loss import Grid, Spectrometer
 from wrf_mi.models.physics.spectrum_model import Fit, SpectrumModel, begin
 from wrf_mi.models.physics.spectrum_rays import Chaining
-from wrf_mi.models.physics.spectrum_residual import RESIDUALS, ResidualField, ResidualKriging
 from wrf_mi.models.physics.spectrum_search import KnownPaths, Search
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 

@@ -211,6 +211,7 @@ def test_fit_resolves_phases_and_mirror_images(
 ) -> None:
     """Whatever phase and mirror image each row comes with; where rows are many, shares are fitted to some of them."""
     monkeypatch.setattr(module, "MOST_ROWS", most)
+    monkeypatch.setattr(module, "STEPS", 10)
     rng = np.random.default_rng(0)
     where = positions(80, seed=2)
     truth = signals(where, TOWARDS, elements_m)
@@ -238,6 +239,7 @@ def test_fit_resolves_phases_and_mirror_images(
 
 def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the alignment of neighbours got wrong: a mirror image, and a phase."""
+    monkeypatch.setattr(module, "STEPS", 10)
     where, opposite = positions(60, seed=2), mirror_order(ELEMENTS_M)
     assert opposite is not None
     truth = signals(where, TOWARDS)

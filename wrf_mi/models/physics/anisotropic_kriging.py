@@ -1,9 +1,8 @@
 """Kriging of spectra whose correlation falls at different rates along and across the line of sight.
 
-Waves that reach one receiver leave the transmitter within a cone around the line of sight, so a step along it changes
-their relative phases less than a step across it (`wrf_mi.models.physics.signals`): on measured spectra half as
-fast as across it horizontally. Grey values have an exponential correlation over the position, with a length for each of
-three axes, and one unknown mean; lengths and noise are those of greatest restricted likelihood.
+Waves that reach one receiver leave the transmitter within a cone around the line of sight (`signals`), so a step along
+it changes their relative phases less than a step across it: on measured spectra half as fast. Grey values have an
+exponential correlation over the position, with a length for each of three axes, and one unknown mean.
 
 Source: `wrf_mi.models.interpolation.kriging_equations`.
 """
@@ -63,14 +62,9 @@ def chosen_rows(count: int, most: int, seed: int) -> IntArray:
 
 @dataclass(eq=False)
 class AnisotropicKriging:
-    """Ordinary kriging of observations of any shape with a correlation length for each axis.
+    """Ordinary kriging of observations [n, ...], float32, at positions [n, 3], with a correlation length for each axis.
 
-    Attributes:
-        tx_pos_m: positions of the rows, [n, 3], metres.
-        observed: [n, ...], float32.
-        axes: in rows, [3, 3].
-        length_m: along each, [3].
-        noise: share of the variance.
+    ``length_m`` [3] belongs to the rows of ``axes`` [3, 3]; ``noise`` is a share of the variance.
     """
 
     tx_pos_m: FloatArray
@@ -128,14 +122,10 @@ class AnisotropicKriging:
 def fit_anisotropic(
     tx_pos_m: FloatArray, observed: NDArray[np.float32], receiver_m: FloatArray, wavelength_m: float, seed: int = 0
 ) -> AnisotropicKriging:
-    """Kriging with lengths and noise of greatest restricted likelihood.
+    """Kriging of observations [n, ...] with lengths and noise of greatest restricted likelihood.
 
-    Args:
-        tx_pos_m: [n, 3], metres.
-        observed: [n, ...].
-        receiver_m: position [3], metres.
-        wavelength_m: metres.
-        seed: seed of the choice of rows where there are more than `MOST_ROWS`.
+    Positions [n, 3], the receiver's position [3] and the wavelength are in metres; ``seed`` chooses rows where there
+    are more than `MOST_ROWS`.
     """
     axes = sight_axes(tx_pos_m, receiver_m)
     chosen = chosen_rows(len(tx_pos_m), MOST_ROWS, seed)

@@ -1,18 +1,12 @@
 """Complex channels: image sources in a scene's planes, corrected by measurements.
 
 A mesh from LiDAR gives planes to millimetres or centimetres, and rough outlines. Phases need tenths of millimetres, and
-the error is mostly decided by which paths exist. So, with measured channels:
+the error is mostly decided by which paths exist. So, with measured channels, three steps alternate: the probability of
+each path is inferred from a row's channel (`csi_fit`), planes are shifted and tilted until all phases fit
+(`csi_repair`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
+elsewhere (`csi_visibility`). The residual is a diffuse field, useful within half a wavelength of measurements.
 
-1. the probability of each path of a row is inferred from its channel (`csi_fit`): gains differ in amplitude and
-   phase;
-2. planes are shifted and tilted until all phases fit (`csi_repair`), in turn with step 1, the noise being a mixture of
-   scales that narrows by itself;
-3. outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility elsewhere
-   (`csi_visibility`), in turn with steps 1 and 2;
-4. the residual is a diffuse field (`csi_residual`), useful within half a wavelength of measurements.
-
-Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field, which
-interpolates over fractions of a wavelength.
+Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field.
 """
 
 from __future__ import annotations
@@ -24,23 +18,93 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
+from scipy.spatial import KDTree
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
+from ..interpolation.kriging_equations import simple_weights
 from ..method import OnProgress
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Complex, Model
-from .csi_residual import DiffuseField, fit_diffuse
 from .csi_visibility import Visibility
 from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
 
 DEFAULTS = CsiSettings()
+NEIGHBOURS = 32
+SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
+"""Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
+CERTAIN = 3.0
+"""Standard errors by which predictions with the field must be better than without."""
 CLEAR_M = 0.05
 """Distance from a wall with an antenna mounted on it at which the search by rays begins."""
+
+
+@dataclass(frozen=True)
+class DiffuseField:
+    """Complex Gaussian field with covariance sin(k d) / (k d): waves from all directions with equal power.
+
+    Source: Cook et al., "Measurement of correlation coefficients in reverberant sound fields" (1955), J. Acoust. Soc.
+    Am. 27; the same holds for scalar waves of any kind.
+
+    Attributes:
+        position_m, value: residual channels [n, subcarriers] at positions [n, 3].
+        k: mean wave number, rad/m.
+        power, share: mean of abs(value)^2, and the field's share of it; the rest is noise of each row.
+    """
+
+    position_m: FloatArray
+    value: Complex
+    k: float
+    power: float
+    share: float
+
+    def predict(self, position_m: FloatArray, skip: int = 0) -> tuple[Complex, FloatArray]:
+        """Mean [m, subcarriers] and variance [m] of residuals, noise included, at positions [m, 3] in metres.
+
+        The ``skip`` nearest rows are not used: 1 leaves out the row at the position itself.
+        """
+        count = len(position_m)
+        if self.share == 0 or len(self.position_m) <= skip:
+            return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
+        near = min(NEIGHBOURS, len(self.position_m) - skip)
+        distance, index = KDTree(self.position_m).query(position_m, k=list(range(1 + skip, near + skip + 1)))
+        between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
+        matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
+        across = self.share * np.sinc(self.k * distance / np.pi)
+        weight, known = simple_weights(matrix, across)
+        mean = np.einsum("mn,mnf->mf", weight, self.value[index])
+        return mean, self.power * np.maximum(1 - known, 1e-6)
+
+
+def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:
+    """The field whose share predicts each row best from the others (logarithmic score).
+
+    ``value`` [n, subcarriers] holds residual channels at positions [n, 3] in metres, ``k`` the mean wave number, rad/m.
+    """
+    power = float(np.square(np.abs(value)).mean()) if len(value) else 0.0
+    best = DiffuseField(position_m, value, k, power, 0.0)
+    if power == 0 or len(value) <= 2:
+        return best
+    lowest = _scores(best)
+    for share in SHARES:
+        field = replace(best, share=share)
+        scores = _scores(field)
+        gain = lowest - scores
+        # A spurious field adds its neighbours' errors to correct predictions: only a certain gain is accepted.
+        if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
+            lowest, best = scores, field
+    return best
+
+
+def _scores(field: DiffuseField) -> FloatArray:
+    """Score of each row predicted from the others [n]; robust to rows that lack a path."""
+    mean, variance = field.predict(field.position_m, skip=1)
+    error = np.square(np.abs(field.value - mean)).mean(axis=1)
+    return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
 
 
 @dataclass(eq=False, repr=False)
@@ -83,12 +147,8 @@ class CsiPhysics(PhysicsModel):
         model = self.model
         arrays = {
             **receiver_arrays(self.receivers),
-            "change": model.change,
+            **{name: getattr(model, name) for name in ("change", "source", "k", "reflection", "gain")},
             "chain": model.images.plane,
-            "source": model.source,
-            "k": model.k,
-            "reflection": model.reflection,
-            "gain": model.gain,
             "sharpness": self.sharpness,
             "covariance": self.covariance,
             "fact.name": np.array(list(self.fit_facts)),

@@ -68,11 +68,7 @@ class CsiSettings:
     fit_gain: bool = False
 
     def __post_init__(self) -> None:
-        """Reject settings out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Reject settings out of range (`InputError`)."""
         whole = {"reflections": 0, "rays": 1, "repair_rounds": 0, "visibility_rounds": 0, "folds": 2}
         for name, least in whole.items():
             if getattr(self, name) < least:
@@ -229,10 +225,9 @@ class Fit:
         """Learn visibility, infer which paths exist, and correct the planes."""
         probability, trust = self._decode()
         if self._learner is None:
-            s = self._settings
-            how = {"outline_sd_m": s.outline_sd_m, "ridge": s.ridge}
-            images = self.model.images
-            self._learner = Learner(self.model.walls, images, self._paths, **how, seed=self._seed, folds=s.folds)
+            model, s = self.model, self._settings
+            how = s.outline_sd_m, s.ridge, self._seed, s.folds
+            self._learner = Learner(model.walls, model.images, self._paths, *how)
         self.visibility, self._odds = self._learner.fit(probability, trust[self._paths.row])
         # Planes move by little now: the same paths are kept, so that the odds stay theirs.
         self._solve()

@@ -27,13 +27,10 @@ MOUNTED_M = 0.01
 
 @dataclass(frozen=True)
 class Images:
-    """Chains of planes from one antenna; c chains of at most b reflections.
+    """Chains of planes [c, b] from one antenna, -1 beyond the last plane.
 
-    Attributes:
-        plane: planes in their order from the antenna [c, b], -1 beyond the last.
-        image_m: images after 0, 1, ... reflections [c, b + 1, 3]; the last repeated.
-        slope: derivative of the last image by the change (`Walls.moved`) of each plane [c, b, 3, 3]: level, component
-            of the change, coordinate.
+    ``image_m`` [c, b + 1, 3] are images after 0, 1, ... reflections, the last repeated; ``slope`` [c, b, 3, 3] is the
+    derivative of the last image by the change (`Walls.moved`) of each plane: level, component, coordinate.
     """
 
     plane: IntArray

@@ -24,12 +24,10 @@ class Model:
     """Image sources with all parameters that are fitted to channels.
 
     Attributes:
-        scan: planes as given.
+        scan, walls: planes as given, and with their changes.
         change: parameters of each plane [q, NUMBERS].
-        walls: planes with their changes.
         images: images of all antennas, antenna by antenna.
-        source: antenna of each chain [c].
-        source_m: antennas [r, 3].
+        source, source_m: antenna of each chain [c], and antennas [r, 3].
         k: wave numbers [subcarriers], rad/m.
         reflection: coefficient of an unchanged plane.
         gain: complex factor of each antenna [r].
@@ -85,10 +83,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Explained:
-    """Measured channels [n, subcarriers], the paths [p] that explain them, and precisions of the residuals [n].
-
-    Each path has a row, a chain, the position of its moving end [p, 3] and the probability that it exists.
-    """
+    """Channels [n, subcarriers], the paths [p] that explain them, and precisions of the residuals [n]."""
 
     channel: Complex
     row: IntArray
@@ -109,15 +104,10 @@ class Explained:
 
 
 def refit(model: Model, explained: Explained, prior_sd: FloatArray) -> tuple[Model, FloatArray]:
-    """A few steps of Levenberg and Marquardt for the planes' parameters, from a model and with fixed paths.
+    """A few steps of Levenberg and Marquardt for the planes' parameters, with fixed paths.
 
-    Args:
-        model: start.
-        explained: channels and paths.
-        prior_sd: standard deviation of each plane's parameters about zero [q, NUMBERS]; 0 fixes one.
-
-    Returns:
-        The model, and the covariance of all parameters [NUMBERS q, NUMBERS q].
+    ``prior_sd`` [q, NUMBERS] are standard deviations of each plane's parameters about zero; 0 fixes one. Returns the
+    model, and the covariance of all parameters [NUMBERS q, NUMBERS q].
     """
     sd = np.maximum(prior_sd.reshape(-1), 1e-12)
     damping = 1e-6

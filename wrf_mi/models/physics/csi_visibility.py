@@ -53,10 +53,8 @@ class Visibility:
     Attributes:
         edge_m: outward displacement of each edge of an outline [e].
         margin: weights of the functions of the margins [1 + 2 * scales].
-        key: keys of the cells, ascending [c].
-        weight: weight of each cell [c].
-        outline_sd_m: standard deviation of the outlines, metres.
-        seed: seed of the grids' shifts.
+        key, weight: ascending keys and weights of the cells [c].
+        outline_sd_m, seed: standard deviation of the outlines, and seed of the grids' shifts.
     """
 
     edge_m: FloatArray
@@ -79,9 +77,8 @@ class Visibility:
         if len(self.key):
             index = np.minimum(np.searchsorted(self.key, cell), len(self.key) - 1)
             known = self.key[index] == cell
-            odds = np.bincount(path[known], value[known] * self.weight[index[known]], minlength=len(paths)).astype(
-                float
-            )
+            value = value[known] * self.weight[index[known]]
+            odds = np.bincount(path[known], value, minlength=len(paths)).astype(float)
         moved = _with_edges(paths, self.edge_m)
         return prior_odds(moved, self.outline_sd_m) + _margins(moved) @ self.margin + odds
 
@@ -100,15 +97,7 @@ class Learner:
     """
 
     def __init__(
-        self,
-        walls: Walls,
-        images: Images,
-        paths: CandidatePaths,
-        *,
-        outline_sd_m: float,
-        ridge: float,
-        seed: int,
-        folds: int,
+        self, walls: Walls, images: Images, paths: CandidatePaths, sd_m: float, ridge: float, seed: int, folds: int
     ) -> None:
         path, cell, value = path_cells(walls, images, paths, seed)
         self._key, column = np.unique(cell, return_inverse=True)
@@ -116,7 +105,7 @@ class Learner:
         self._matrix = sparse.csr_matrix((value, (path, column.reshape(-1))), shape=shape)
         self._across = self._matrix.T.tocsr()
         self._paths, self._edges = paths, len(walls.edge_m)
-        self._outline_sd_m, self._ridge, self._seed = outline_sd_m, ridge, seed
+        self._outline_sd_m, self._ridge, self._seed = sd_m, ridge, seed
         count = int(paths.row.max(initial=-1)) + 1
         self._fold = np.random.default_rng([seed, 7]).integers(folds, size=count)[paths.row]
         # Weights without each fold, and last those of all paths.

@@ -35,6 +35,7 @@ from ...receivers.array import array_response
 from ...receivers.lags import Lags
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
+from ...tasks.scores import REAL_90
 from ..method import OnProgress
 from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
@@ -44,8 +45,8 @@ GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Radii in wavelengths around a held-out row within which no row is used while the weights are fitted."""
 HELD_OUT = 80
 """Held-out training rows at most."""
-INTERVAL, NORMAL = 0.9, 1.6449
-"""Share of a normal distribution within so many standard deviations."""
+INTERVAL = 0.9
+"""Share of errors that calibrated intervals cover."""
 UNSCALED_PER_CHUNK = 256
 """Spectra whose element signals are retrieved together."""
 LEAST_ROWS = 8
@@ -81,11 +82,7 @@ class MeasuredSpectrumSettings:
     starts: int = 60
 
     def __post_init__(self) -> None:
-        """Reject settings out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Reject settings out of range (`InputError`)."""
         for name in ("directions", "lengths", "starts"):
             if getattr(self, name) < 1:
                 raise InputError(f"setting {name}: {getattr(self, name)}; choose 1 or more")
@@ -152,9 +149,7 @@ class Side:
     """Fitted model of one receiver.
 
     Attributes:
-        signals: process of the element signals.
-        nearby: kriging of the spectra.
-        report: expected spectrum of element signals.
+        signals, nearby, report: process of the signals, kriging of the spectra, and expected spectrum of signals.
         half: c, the share of unknown variance at which the signals have half of the weight.
         spread: factor on predicted standard deviations that fits held-out rows.
     """
@@ -354,4 +349,4 @@ def _fit_weights(
         mean, std = side.mixed(posterior, nearby, nearby_std)
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))
-    side.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / NORMAL)
+    side.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / REAL_90)

@@ -1,13 +1,10 @@
 """Received signal strength: expectation by mesh and physics, corrected by measurements.
 
-1. The expected value is the traced power, averaged over a neighbourhood (`rssi_map`), or free space without a mesh.
-2. It is corrected by an offset of each receiver, the exponent of the distance, the transmitter's pattern in its body
-   and each receiver's pattern; parts common to the receivers are learned from all of them (`rssi_terms`).
-3. Shadowing and the body's effect at a position are a Gaussian process (`gaussian_process`).
-4. Its hyperparameters, the noise of each receiver, and the calibration of predictions come from held-out stretches of
-   the training rows (`rssi_fit`).
-
-With few rows the priors dominate, with none the mesh, and the standard deviation is correspondingly large.
+The expected value is the traced power, averaged over a neighbourhood (`rssi_map`), or free space without a mesh. It is
+corrected by an offset of each receiver, the exponent of the distance, and patterns, whose common parts are learned from
+all receivers (`rssi_terms`); shadowing and the body's effect at a position are a Gaussian process. Hyperparameters, the
+noise of each receiver, and the calibration of predictions come from held-out stretches of the training rows
+(`rssi_fit`). With few rows the priors dominate, with none the mesh, and the standard deviation is accordingly large.
 """
 
 from __future__ import annotations
@@ -99,11 +96,7 @@ class RssiSettings:
     max_reflections: int = 2
 
     def __post_init__(self) -> None:
-        """Reject settings out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Reject settings out of range (`InputError`)."""
         for name, value in asdict(self).items():
             if not np.isfinite(value) or (name in POSITIVE and value <= 0):
                 raise InputError(f"{name} {value}: give a positive number")
@@ -163,9 +156,7 @@ class RssiPhysics(PhysicsModel):
         arrays: dict[str, Any] = {
             **receiver_arrays(self.receivers),
             "stop.position_m": stops.poses.position_m,
-            "stop.value_dbm": stops.value_dbm,
-            "stop.count": stops.count,
-            "stop.row": stops.row,
+            **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
             "base": np.array([prior.transmit_dbm, prior.frequency_hz]),
             "prior.shared": prior.sd,
             "prior.rx": prior.rx_sd_db,

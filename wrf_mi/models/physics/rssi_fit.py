@@ -1,27 +1,48 @@
-"""Fit of an RSSI physics model: folds, choice of hyperparameters, calibration of predictions."""
+"""Fit of an RSSI physics model: Gaussian processes, folds, choice of hyperparameters, calibration of predictions.
+
+The processes of the receivers share part of their mean:
+
+    y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
+
+beta is common to all receivers and learned from all of them; the fields f_r are independent, so that the exact
+posterior needs one Cholesky factor for each receiver (`wrf_mi.models.interpolation.kriging_equations`). The noise's
+heavy tails are reached by reweighting: a row with a large residual has a larger variance.
+
+Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with
+explicit basis functions); Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989),
+JASA 84 (the weights).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .gaussian_process import Part, fit_pooled
+from ...tasks.scores import REAL_90
+from ..interpolation.kriging_equations import KrigingSystem
 from .rssi_map import PowerMap
 from .rssi_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
 
+Kernel = Callable[[Any, Any], FloatArray]
+"""Covariance [n, m] of the field between two sets of inputs."""
+
+JITTER = 1e-9
+"""Noise added to coincident inputs, as a share of the field's variance."""
+DEGREES = 4.0
+"""Degrees of freedom of the noise's Student-t distribution: fades are deep."""
 FREE_SPACE = 2.0
 """Exponent of the distance in free space."""
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 BUFFER = 0.25
-"""Share of a stretch that is left out on either side of it: consecutive rows share noise that a second visit does not
-repeat."""
+"""Share of a stretch that is left out on either side of it, as consecutive rows share noise."""
 LEAST_GAIN_DB = 0.005
 """Least reduction of the held-out error by which the search changes a parameter."""
 MOST_STEPS = 5
@@ -33,20 +54,75 @@ SKEW_TRUST = 2000.0
 RATIO = (0.5, 2.0)
 """Bounds of the ratio of a receiver's noise to that of all."""
 COVERED = 0.9
-NORMAL_90 = 1.6449
-"""Half the width of the normal distribution's 90 % interval, in standard deviations."""
+"""Share of residuals that calibrated intervals cover."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
+
+    inputs: Any
+    basis: FloatArray
+    value: FloatArray
+    variance: FloatArray
+
+
+class PooledProcess:
+    """The posterior of all receivers.
+
+    ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
+    beta, above zero; ``point_variance`` is k(x, x); ``beta`` [k] the posterior mean of the shared coefficients.
+
+    Raises:
+        numpy.linalg.LinAlgError: a covariance that is not positive definite.
+    """
+
+    def __init__(self, parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float) -> None:
+        self._parts, self._kernel, self._point_variance = parts, kernel, point_variance
+        jitter = JITTER * point_variance
+        self._systems = [KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis) for p in parts]
+        pairs = list(zip(self._systems, parts, strict=True))
+        self._information = np.diag(1 / np.square(prior_sd)) + sum(system.information for system in self._systems)
+        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
+        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
+
+    def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
+        cross = self._kernel(inputs, self._parts[receiver].inputs)
+        mean = basis @ self.beta + cross @ self._weights[receiver]
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
+
+    def reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
+        """Parts with the noise variances that their residuals imply for Student-t noise.
+
+        The expected squared residual, posterior variance of the field included, is compared with the squared scale
+        ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
+        """
+        parts = []
+        for part, system, weights, scale in zip(self._parts, self._systems, self._weights, variance, strict=True):
+            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
+            residual = part.variance * weights
+            square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
+            parts.append(replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1)))
+        return parts
+
+
+def fit_pooled(
+    parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float, rounds: int = 0
+) -> PooledProcess:
+    """`PooledProcess` of the same arguments after ``rounds`` of reweighting for Student-t noise."""
+    process = PooledProcess(parts, kernel, prior_sd, point_variance)
+    scale = [part.variance for part in parts]
+    for _ in range(rounds):
+        process = PooledProcess(process.reweighted(scale), kernel, prior_sd, point_variance)
+    return process
 
 
 @dataclass(frozen=True)
 class PriorMean:
-    """Expected signal strength before anything is measured.
+    """Expected signal strength before anything is measured: traced power, or free space where ``traced`` is None.
 
-    Attributes:
-        receivers_m: [n_rx, 3].
-        transmit_dbm: transmit power, gains of both antennas included.
-        frequency_hz: carrier frequency.
-        traced: map of the traced power, or None: free space.
-        sd, rx_sd_db: standard deviations of the corrections, see `basis`.
+    ``transmit_dbm`` includes the gains of both antennas; ``sd`` and ``rx_sd_db`` are those of `basis`.
     """
 
     receivers_m: FloatArray
@@ -176,10 +252,8 @@ class Fit:
 def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:
     """Shift of predictions that minimises the median absolute residual (measured minus predicted), dB.
 
-    Fades reach deeper than peaks, so the narrowest half of the residuals lies above their mean (the shorth). With few
-    residuals the prior dominates.
-
-    Source: Andrews et al., "Robust Estimates of Location" (1972) (the shorth).
+    Fades reach deeper than peaks, so the narrowest half of the residuals lies above their mean (the shorth, Andrews et
+    al., "Robust Estimates of Location" (1972)). With few residuals the prior dominates.
     """
     values = np.sort(residual_db[np.isfinite(residual_db)])
     half = len(values) // 2
@@ -198,7 +272,7 @@ def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
 
     The factor of a receiver with few residuals tends to that of all, and that of few residuals in all to 1.
     """
-    score = np.abs(residual_db) / std_db / NORMAL_90
+    score = np.abs(residual_db) / std_db / REAL_90
     known = np.isfinite(score)
 
     def quantile(values: FloatArray, prior: float) -> float:

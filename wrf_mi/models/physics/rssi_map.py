@@ -28,14 +28,7 @@ LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class PowerMap:
-    """Local mean of traced power on a grid.
-
-    Attributes:
-        x_m: coordinates of the grid's columns, ascending.
-        y_m: coordinates of its rows.
-        z_m: heights of its layers; one layer serves all heights.
-        power_dbm: for a transmit power of 0 dBm, [n_rx, x, y, z].
-    """
+    """Local mean of traced power on a grid [n_rx, x, y, z], dBm for 0 dBm sent; one layer serves all heights."""
 
     x_m: FloatArray
     y_m: FloatArray
@@ -67,7 +60,7 @@ def trace_map(
         max_reflections: reflections of a path at most.
 
     Raises:
-        InputError: no path to a receiver from anywhere.
+        InputError: no path to a receiver from anywhere, or a scene filled by a solid.
     """
     from ...receivers import rssi_dbm
     from ...tracing import TraceOptions, trace_paths

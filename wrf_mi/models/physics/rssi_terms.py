@@ -25,8 +25,7 @@ from ...core.types import IntArray
 NEAREST_M = 0.05
 """Least distance between antennas in the law of distance."""
 HARMONICS = 3
-"""Harmonics of the transmitter's pattern over psi; more changed the error on held-out stretches of flat-ble by under
-0.005 dB."""
+"""Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
 RX_HARMONICS = 2
 GAP = 5
 """A stop ends where so many rows of the record are not among the given rows."""
@@ -112,19 +111,12 @@ class Hyperparameters:
 def basis(
     poses: Poses, receiver: int, receivers_m: FloatArray, traced_dbm: FloatArray | None, sd: FloatArray, rx_sd_db: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Columns of the mean and the prior standard deviations of their coefficients.
+    """Columns of the mean [n, k] for n poses, and the prior standard deviations of their coefficients [k], above 0.
 
-    Args:
-        poses: n poses.
-        receiver: receiver whose columns are computed; those of the other receivers' parts are zero.
-        receivers_m: positions of all [n_rx, 3].
-        traced_dbm: local mean of the traced power at the poses [n], less a typical level; None without a scene.
-        sd: standard deviations [4, 2] of the part common to all receivers and of each receiver's part: offset in dB,
-            exponent of distance, factor of the traced power, first harmonic over psi in dB (the k-th has 1 / k of it).
-        rx_sd_db: standard deviation of the first harmonic over phi of each receiver.
-
-    Returns:
-        Columns [n, k] and standard deviations [k] above 0; k is the same for all receivers.
+    Columns of the other receivers' parts are zero, so that k is the same for all receivers. ``traced_dbm`` [n] is the
+    local mean of the traced power less a typical level, None without a scene. ``sd`` [4, 2] holds the deviations of the
+    part common to all receivers and of each receiver's part: offset in dB, exponent of distance, factor of the traced
+    power, first harmonic over psi in dB (the k-th has 1 / k of it); ``rx_sd_db`` that of the first harmonic over phi.
     """
     away = receivers_m[receiver] - poses.position_m
     distance = np.maximum(np.linalg.norm(away, axis=1), NEAREST_M)
@@ -154,13 +146,9 @@ def basis(
 
 @dataclass(frozen=True)
 class Measured:
-    """Training rows; n rows.
+    """Training rows: poses, dBm [n_rx, n] (NaN where nothing was received), ascending numbers in the record [n].
 
-    Attributes:
-        poses: pose of each row.
-        value_dbm: [n_rx, n], NaN where nothing was received.
-        rows: numbers in the record, ascending.
-        precision: relative to a single report [n_rx, n], see `wrf_mi.core.Record.precision`; None: 1.
+    ``precision`` [n_rx, n] is relative to a single report, see `wrf_mi.core.Record.precision`; None: 1.
     """
 
     poses: Poses
@@ -178,11 +166,8 @@ class Measured:
 class Stops:
     """Consecutive rows at one pose, joined; s stops.
 
-    Attributes:
-        poses: mean positions and headings.
-        value_dbm: median over each receiver's reports, weighted by precision, [n_rx, s]; NaN where it received nothing.
-        count: sum of the reports' precisions, [n_rx, s]; without stated noise the number of reports.
-        row: the middle row, as a number in the record's order, [s].
+    ``value_dbm`` [n_rx, s] is the median of each receiver's reports, weighted by precision (NaN where it received
+    nothing), ``count`` [n_rx, s] the sum of these precisions, and ``row`` [s] the middle row in the record's order.
     """
 
     poses: Poses

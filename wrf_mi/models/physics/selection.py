@@ -74,7 +74,7 @@ class PhysicsModel(ABC):
             mean[rows] = values
             if not shared:
                 std[rows] = deviation
-        return Prediction(mean, np.broadcast_to(std, mean.shape))
+        return Prediction(mean, std if std.shape == mean.shape else np.broadcast_to(std, mean.shape))
 
     @abstractmethod
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
@@ -122,11 +122,7 @@ MODULES = {"spectrum": ("measured_spectrum", "spectrum"), "rssi": ("rssi", "rssi
 
 
 def kind_of(record: Record, with_scene: bool) -> PhysicsKind:
-    """The physics model for a record.
-
-    Args:
-        record: measurements.
-        with_scene: whether a mesh of the surroundings is given.
+    """The physics model for a record, with or without a mesh of the surroundings.
 
     Raises:
         InputError: a task without physics model, or channels of receivers with several antennas.
@@ -144,11 +140,7 @@ def kind_of_task(task: str, with_scene: bool) -> PhysicsKind:
 
 
 def check_antennas(record: Record) -> None:
-    """Refuse channels of receivers with several antennas.
-
-    Raises:
-        InputError: naming their number.
-    """
+    """Refuse channels of receivers with several antennas (`InputError`)."""
     if record.task == "csi" and record.observation.ndim != 3:
         antennas = record.observation.shape[2]
         raise InputError(f"{record.name}: channels of {antennas} antennas; the physics model serves receivers with one")

@@ -58,11 +58,9 @@ STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
 
 @dataclass(frozen=True)
 class Covariances:
-    """Dictionary of covariances: each length with each turn.
+    """Dictionary of covariances: each length of coherence [s] (metres) with each turn [t, 3].
 
-    Attributes:
-        lengths_m: lengths of coherence, [s], metres.
-        turns: phase gradients k (q - q0), [t, 3], rad/m; the first one is zero.
+    Turns are phase gradients k (q - q0), rad/m; the first is zero.
     """
 
     lengths_m: FloatArray
@@ -99,13 +97,9 @@ class Covariances:
 
 
 def departures(towards: FloatArray, wavenumber: float, cone_deg: float, count: int) -> FloatArray:
-    """Turns [t, 3] of waves that leave within a cone around the line of sight; the first is zero.
+    """Turns [t, 3], rad/m, of waves that leave within a cone around the line of sight; the first is zero.
 
-    Args:
-        towards: unit vector from the transmitters to the receiver, [3].
-        wavenumber: 2 pi over the wavelength, rad/m.
-        cone_deg: half angle.
-        count: directions on the whole sphere of which those in the cone are taken.
+    ``towards`` [3] is the unit vector to the receiver; the cone's directions are those of ``count`` on the sphere.
     """
     directions = fibonacci_sphere(count)
     inside = directions[directions @ towards > np.cos(np.radians(cone_deg))]
@@ -145,13 +139,9 @@ def fit_shares(
 
 @dataclass(frozen=True)
 class Posterior:
-    """Element signals at q positions: independent complex Gaussian components.
+    """Element signals at q positions: independent complex Gaussian components, the columns of ``basis`` [m, m].
 
-    Attributes:
-        mean: element signals [q, m].
-        variance: variance of each component, [q, m].
-        basis: components in columns, [m, m].
-        prior: variance of each component far from all measurements, [m].
+    ``mean`` [q, m] is in elements, ``variance`` [q, m] and, far from all measurements, ``prior`` [m] in components.
     """
 
     mean: ComplexArray
@@ -167,15 +157,11 @@ class Posterior:
 
 @dataclass(eq=False)
 class SignalProcess:
-    """Gaussian process of element signals, conditioned on training rows.
+    """Gaussian process of element signals, conditioned on aligned signals [n, m] of training rows at positions [n, 3].
 
     Attributes:
-        tx_pos_m: positions of the rows, [n, 3], metres.
-        signals: aligned, [n, m].
-        covariances: the dictionary.
         basis: principal components in its columns, [m, m].
-        weight: shares, [m, c].
-        noise: variance of each component's noise, [m].
+        weight, noise: shares of the dictionary [m, c] and variance of the noise [m] of each component.
         precision: inverse covariance of the rows for each component, [m, n, n].
     """
 

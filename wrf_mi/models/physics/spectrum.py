@@ -1,17 +1,14 @@
 """The physics model for spatial spectra: a traced room with kriging of its residuals.
 
 Element signals are a coherent sum of specular paths: those of the given mesh, with displaced planes and fitted
-materials (`wrf_mi.models.physics.spectrum_fit`), and those of surfaces that the mesh lacks
-(`wrf_mi.models.physics.spectrum_search`), which also obstruct; each times a learned complex amplitude that varies
-slowly with the transmitter's image. All phases come from path lengths, so the fit extrapolates between and beyond the
-training rows. Residuals near a transmitter are kriged, or kriging of the spectra replaces the room
-(`wrf_mi.models.physics.spectrum_residual`). Every step must lower the loss of validation rows, which are taken from the
-training rows; the last fit uses all of these.
+materials (`spectrum_fit`), and those of surfaces that the mesh lacks (`spectrum_search`), which also obstruct; each
+times a learned complex amplitude that varies slowly with the transmitter's image. All phases come from path lengths, so
+the fit extrapolates between and beyond the training rows. Residuals near a transmitter are kriged, or kriging of the
+spectra replaces the room. Every step must lower the loss of validation rows, which are taken from the training rows.
 
-A few rows suffice for planes and materials of the given mesh, which have priors, but not for further surfaces or
-amplitudes, and leave none for validation. Then all candidates are fitted anew without each of some groups of rows: the
-room as given, the room with fitted planes and materials, kriging of the spectra, and mixes of the last two. The best
-one on held-out rows is fitted to all rows.
+Few rows leave none for validation, and suffice only for planes and materials of the given mesh, which have priors. Then
+all candidates (room as given, fitted room, kriging of the spectra, mixes) are fitted without each of some groups of
+rows, and the best one on held-out rows is fitted to all rows.
 """
 
 from __future__ import annotations
@@ -32,11 +29,10 @@ from ...core.types import IntArray
 from ...tasks import require
 from ..method import OnProgress
 from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
-from .spectrum_fit import Constants, Maps
+from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_loss import Spectrometer
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin
 from .spectrum_rays import Room
-from .spectrum_residual import MIXES, ResidualKriging
 
 logger = logging.getLogger(__name__)
 

@@ -1,8 +1,13 @@
-"""Fits of a traced spectrum: planes' displacements, materials, and amplitudes that vary with the position.
+"""Fits of a traced spectrum: displacements, materials, amplitudes that vary with the position, residual kriging.
 
 All fits minimise the sum of the rows' losses (`wrf_mi.models.physics.spectrum_loss`) plus half the squared distance
 from the prior in standard deviations: a maximum a posteriori estimate. They use L-BFGS (Nocedal and Wright, "Numerical
 Optimization" (2006), section 7.2) with exact derivatives by signals, and differences by constants of materials.
+
+Spectra minus predictions correlate over a wavelength or so: small objects, diffraction and scattering that no surface
+explains. Their posterior mean (simple kriging, exponential covariance) is added to a prediction. Where the room
+explains spectra badly, the field may also be the residual of a share of the prediction about an unknown mean (ordinary
+kriging): share 0 is kriging of the spectra, share 1 kriging of residuals. Held-out rows choose.
 """
 
 from __future__ import annotations
@@ -12,10 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ..interpolation.kriging_equations import KrigingSystem, correlation
 from .spectrum_gains import Waves
 from .spectrum_loss import ComplexArray
 from .spectrum_rays import ChainPaths
@@ -27,18 +34,15 @@ STEP = 1e-4
 """Step of differences by logarithms."""
 LEAST_ROWS = 5
 """Least number of transmitters that see a chain whose amplitude is learned."""
+COMPONENTS = 64
+"""Principal images of the residuals at most: the square of a 4 x 4 array's spectrum has 49 degrees of freedom."""
 LEAST_VALUE = 0.01
 """Smaller values of a Gaussian are dropped."""
 
 
 @dataclass(frozen=True)
 class Constants:
-    """Fitted constants of a room; q planes, b objects.
-
-    Attributes:
-        offset_m: displacement of each plane along its normal, shape [q].
-        slabs: materials of the objects [3, b], see `wrf_mi.models.physics.spectrum_rays.Room`.
-    """
+    """Fitted displacements [q] of a room's planes along their normals, and materials [3, b] of its objects (`Room`)."""
 
     offset_m: FloatArray
     slabs: FloatArray
@@ -104,16 +108,10 @@ def fit_constants(
     steps: int,
     factor: ComplexArray | float = 1.0,
 ) -> Constants:
-    """Displacements of planes and materials of greatest posterior probability.
+    """Displacements of planes and materials of greatest posterior probability, from ``start``.
 
-    Args:
-        waves: waves of the training rows.
-        shapes: their spectra, see `Grid.shapes`.
-        start: start of the search.
-        prior: mean of the prior.
-        offset_sd_m: standard deviation of displacements, metres.
-        steps: steps of L-BFGS at most.
-        factor: factor of each path [p].
+    The waves and shapes (see `Grid.shapes`) are those of the training rows; the prior has the mean ``prior`` and, for
+    displacements, the standard deviation ``offset_sd_m``; ``factor`` [p] multiplies each path.
     """
     centre, deviation = prior.vector(), prior.deviation(offset_sd_m)
 
@@ -147,11 +145,8 @@ def scan_offsets(
 class Maps:
     """Amplitude of each chain as a smooth function of the transmitter's image: 1 + sum of k Gaussians.
 
-    Attributes:
-        chain: chain of each Gaussian, shape [k].
-        centre_m: its centre, an image less the array's origin [k, 3]; NaN: a constant.
-        scale_m: standard deviation of the Gaussians.
-        weight: complex, shape [k].
+    Each Gaussian has a chain [k], a complex weight [k] and a centre [k, 3] (an image less the array's origin; NaN: a
+    constant); ``scale_m`` is the standard deviation of all.
     """
 
     chain: IntArray
@@ -215,3 +210,76 @@ def fit_maps(waves: Waves, shapes: FloatArray, constants: Constants, maps: Maps,
     start = np.concatenate([maps.weight.real, maps.weight.imag]) / deviation
     found = _minimised(loss, start, steps, 20)
     return replace(maps, weight=np.asarray((found[:k] + 1j * found[k:]) * deviation, complex))
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """The field that is kriged: residual of a share of the room's prediction, of zero or unknown mean (``centred``).
+
+    Its correlation length is in wavelengths; ``noise`` is the variance by which two spectra at one position differ, as
+    a share of the field's.
+    """
+
+    share: float
+    wavelengths: float
+    noise: float
+    centred: bool
+
+
+RESIDUALS = tuple(ResidualField(1.0, length, 0.5, False) for length in (0.6, 1.2, 2.4))
+"""Fields for a room that explains most."""
+MIXES = {
+    "kriging of spectra": ResidualField(0.0, 10.0, 0.1, True),
+    "half of room, kriging of what it leaves": ResidualField(0.5, 10.0, 0.1, True),
+    "room, kriging of what it leaves": ResidualField(1.0, 10.0, 0.1, True),
+}
+"""Fields where the room explains less, by name. With a length of whole rooms interpolation is nearly linear, and a few
+rows suffice."""
+
+
+@dataclass(frozen=True)
+class ResidualKriging:
+    """Kriging of the residuals of n training rows at positions ``place_m`` [n, 3].
+
+    ``weight`` [n, k] is the inverse covariance times principal values less their mean; ``image`` [k, height, width] and
+    ``mean`` [k] are principal images and mean; the residual is added to ``share`` of the room's prediction.
+    """
+
+    place_m: FloatArray
+    length_m: float
+    weight: FloatArray
+    image: NDArray[np.float32]
+    mean: FloatArray
+    share: float
+
+    @classmethod
+    def of(
+        cls,
+        position_m: FloatArray,
+        spectra: NDArray[np.float32],
+        predicted: NDArray[np.float32],
+        field: ResidualField,
+        wavelength_m: float,
+    ) -> ResidualKriging:
+        """Fit to training spectra and the room's predictions of them, [n, height, width] each."""
+        residual = spectra - field.share * predicted
+        flat = residual.reshape(len(residual), -1)
+        # Principal images by the rows' Gram matrix, as there are fewer rows than pixels.
+        value, vector = np.linalg.eigh(flat.astype(float) @ flat.T.astype(float))
+        kept = np.flatnonzero(value > value[-1] * 1e-9)[::-1][:COMPONENTS]
+        scale = np.sqrt(value[kept])
+        image = (vector[:, kept] / scale).T @ flat
+        length_m = field.wavelengths * wavelength_m
+        scaled, values = position_m / length_m, vector[:, kept] * scale
+        trend = np.ones((len(position_m), int(field.centred)))
+        system = KrigingSystem(correlation(scaled, scaled), field.noise, trend)
+        mean = system.coefficients(values)
+        images = image.reshape(-1, *residual.shape[1:]).astype(np.float32)
+        return cls(position_m, length_m, system.weights(values, mean), images, mean.sum(axis=0), field.share)
+
+    def __call__(self, position_m: FloatArray, predicted: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Spectra [m, height, width] in 0..1 at positions [m, 3], given the room's predictions of them."""
+        alike = correlation(position_m / self.length_m, self.place_m / self.length_m)
+        value = (alike @ self.weight + self.mean).astype(np.float32)
+        added = np.tensordot(value, self.image, axes=1)
+        return np.asarray(np.clip(np.float32(self.share) * predicted + added, 0, 1))

@@ -69,9 +69,8 @@ class Waves:
     """Waves of transmitters [n, 3] at each element of an array.
 
     Attributes:
-        paths: the transmitters' paths, p in all.
+        paths, sum: the transmitters' paths, p in all, and the sparse matrix [n, p] that sums over them.
         moved: displacement of each path's image by a unit displacement of each plane, [q, p, 3].
-        sum: sparse matrix [n, p] that sums over the paths of each transmitter.
     """
 
     def __init__(self, table: ChainTable, tx_pos_m: FloatArray, instrument: Spectrometer) -> None:

@@ -2,9 +2,8 @@
 
 An instrument scales each spectrum to its extremes, so only the shape counts: with s the observed and b the predicted
 magnitudes on a grid of directions, both as vectors of unit length, 1 - (s . b)^2 is about the share of the power that
-is predicted wrongly. It varies from row to row by a factor of a hundred (a transmitter behind a shelf, or in plain
-sight). With an unknown variance for each row the logarithm of the likelihood falls by half the degrees of freedom times
-the logarithm of that share, which is the loss. Structural similarity falls nearly linearly with the same logarithm.
+is predicted wrongly. With an unknown variance for each row the logarithm of the likelihood falls by half the degrees of
+freedom times the logarithm of that share, which is the loss; structural similarity falls nearly linearly with it.
 """
 
 from __future__ import annotations
@@ -72,15 +71,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Spectrometer:
-    """An array that reports spectra.
-
-    Attributes:
-        receiver: its pose and array.
-        frequency_hz: carrier frequency.
-        height: rows of a spectrum.
-        width: columns of a spectrum.
-        tx_antenna: antenna of the transmitters.
-    """
+    """A receiver's array that reports spectra [height, width] at a carrier frequency, and the transmitters' antenna."""
 
     receiver: Receiver
     frequency_hz: float

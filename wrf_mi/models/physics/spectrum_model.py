@@ -13,11 +13,21 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.walls import plane_centres
-from .spectrum_fit import Constants, Maps, fit_constants, fit_maps, map_centres, scan_offsets
+from .spectrum_fit import (
+    MIXES,
+    RESIDUALS,
+    Constants,
+    Maps,
+    ResidualField,
+    ResidualKriging,
+    fit_constants,
+    fit_maps,
+    map_centres,
+    scan_offsets,
+)
 from .spectrum_gains import Waves
 from .spectrum_loss import ComplexArray, Spectrometer
 from .spectrum_rays import Chaining, ChainTable, Room, find_chains
-from .spectrum_residual import MIXES, RESIDUALS, ResidualField, ResidualKriging
 from .spectrum_search import KINDS, Frame, KnownPaths, Search, Sheet, frames_of
 
 SEARCHED_ROWS = 300
@@ -61,11 +71,7 @@ class SpectrumSettings:
     validation: float = 0.15
 
     def __post_init__(self) -> None:
-        """Reject settings out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Reject settings out of range (`InputError`)."""
         for name in ("reflections", "passed", "surfaces", "rounds", "steps", "chains", "rays"):
             if getattr(self, name) < 0:
                 raise InputError(f"setting {name}: {getattr(self, name)}; choose 0 or more")
@@ -88,11 +94,9 @@ class SpectrumModel:
         instrument: array that reports the spectra.
         room: its objects, the learned ones last, and their materials as given.
         learned: number of learned objects.
-        chain: chains of planes, [c, reflections].
-        passed: surfaces that a path may pass through at most.
+        chain, passed: chains of planes [c, reflections], and surfaces that a path may pass through at most.
         constants: fitted displacements and materials.
-        maps: learned amplitudes, or None.
-        residual: residual kriging, or None.
+        maps, residual: learned amplitudes and residual kriging, or None.
         error: root mean square error of predictions of validation rows [height, width], or None.
     """
 
@@ -186,15 +190,10 @@ class SpectrumModel:
 
 
 class Fit:
-    """Fits a `SpectrumModel` to some rows.
+    """Fits a `SpectrumModel` to rows [n, 3] with spectra [n, height, width].
 
-    Args:
-        instrument: array that reported the spectra.
-        tx_pos_m: all rows that may be used [n, 3].
-        spectra: their spectra [n, height, width].
-        rows: training rows among these.
-        validation: validation rows among these.
-        settings: ``steps`` are those of the constants; amplitudes take four times as many.
+    ``rows`` train and ``validation`` chooses among these; ``settings.steps`` are those of the constants, and amplitudes
+    take four times as many.
     """
 
     def __init__(

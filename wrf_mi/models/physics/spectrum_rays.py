@@ -8,7 +8,7 @@ the legs of the remaining paths, all transmitters and chains together.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -42,10 +42,8 @@ Hit = tuple[IntArray, FloatArray, IntArray, FloatArray]
 class Room:
     """Objects of triangles and their materials; b objects. Without objects: free space.
 
-    Attributes:
-        names: names of the objects.
-        corners: each object's triangles, [f, 3, 3] in metres.
-        slabs: relative permittivity, conductivity (S/m) and thickness (m) of each object, [3, b].
+    ``corners`` are each object's triangles [f, 3, 3] in metres; ``slabs`` [3, b] relative permittivity, conductivity
+    (S/m) and thickness (m) of each object.
     """
 
     names: tuple[str, ...]
@@ -69,12 +67,8 @@ class Room:
         """The room with further rectangles, four corners in order each [s, 4, 3] in metres, of ``slabs`` [3, s]."""
         corners = (np.stack([sheet[[0, 1, 2]], sheet[[0, 2, 3]]]) for sheet in sheets)
         names = (f"learned {len(self.names) + i}" for i in range(len(sheets)))
-        return replace(
-            self,
-            names=(*self.names, *names),
-            corners=(*self.corners, *corners),
-            slabs=np.concatenate([self.slabs, slabs], axis=1),
-        )
+        joined = np.concatenate([self.slabs, slabs], axis=1)
+        return Room((*self.names, *names), (*self.corners, *corners), joined)
 
     def open(self) -> tuple[Any, Surfaces] | None:
         """A Mitsuba scene of the objects (as ``.mi_scene``) and their planes; None for free space."""
@@ -149,13 +143,9 @@ def find_chains(opened_room: tuple[Any, Surfaces], receiver_m: FloatArray, how: 
 
 
 class ChainTable:
-    """Chains of reflecting planes seen from one receiver, and the scene that blocks them.
+    """Chains of reflecting planes (`find_chains`) seen from a receiver [3], and the scene that blocks them.
 
-    Args:
-        opened_room: from `Room.open`, or None: the direct path alone, unobstructed.
-        receiver_m: position [3], metres.
-        chain: from `find_chains`.
-        passed: surfaces that a path may pass through at most.
+    ``opened_room`` is from `Room.open`; None: the direct path alone, unobstructed.
     """
 
     def __init__(

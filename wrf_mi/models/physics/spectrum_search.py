@@ -71,13 +71,9 @@ def frames_of(normals: FloatArray, areas: FloatArray, points_m: FloatArray) -> l
 
 @dataclass(frozen=True)
 class Sheet:
-    """A rectangle that reflects.
+    """A rectangle that reflects, in a plane of a family at an offset along the family's normal, of a kind of `KINDS`.
 
-    Attributes:
-        frame: index of its family of planes.
-        offset_m: along the family's normal.
-        edges_m: low and high along the first axis, then along the second, shape [4].
-        kind: column of `KINDS`.
+    Its edges [4] are low and high along the first axis, then along the second, metres.
     """
 
     frame: int
@@ -99,12 +95,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class KnownPaths:
-    """Paths of the present model as straight legs; g legs of p paths.
-
-    Attributes:
-        wave, tx: wave at the elements [p, m] and transmitter of each path [p].
-        path, start_m, end_m: path [g] and ends [g, 3] of each leg.
-    """
+    """Paths [p] of the present model with waves at the elements [p, m], and their straight legs [g]."""
 
     wave: ComplexArray
     tx: IntArray
@@ -145,13 +136,7 @@ class KnownPaths:
 
 @dataclass(frozen=True)
 class Plane:
-    """Effect of an infinite plane on n rows.
-
-    Attributes:
-        wave: reflected waves of each kind [kinds, n, m].
-        point, fine: points of reflection along the plane's axes [n, 2], and whether they exist [n].
-        path, crossing: see `KnownPaths.crossings`.
-    """
+    """Reflected waves [kinds, n, m] of an infinite plane, points of reflection [n, 2] where ``fine``, and crossings."""
 
     wave: ComplexArray
     point: FloatArray
@@ -315,12 +300,8 @@ class Growth:
             return self.best
         best = self._edged(self.best, 0.4)
         # Planes half a wavelength apart look alike in phase: the likeliest gets edges of its own.
-        others = [
-            self._swept(
-                self._judged(best[1].offset_m + shift * self._half, best[1].edges_m), np.linspace(-0.04, 0.04, 9)
-            )
-            for shift in (-2, -1, 1, 2)
-        ]
+        judged = (self._judged(best[1].offset_m + shift * self._half, best[1].edges_m) for shift in (-2, -1, 1, 2))
+        others = [self._swept(each, np.linspace(-0.04, 0.04, 9)) for each in judged]
         other = max(others, key=itemgetter(0))
         if other[0] > 0.6 * best[0]:
             best = max(best, self._edged(other, 0.2), key=itemgetter(0))
