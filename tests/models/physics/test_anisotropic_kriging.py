@@ -14,15 +14,16 @@ from scipy.spatial.distance import cdist
 from wrf_mi.core import InputError, Record
 from wrf_mi.models.physics import anisotropic_kriging as nearby
 from wrf_mi.models.physics import measured_spectrum
-from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_nearby, line_of_sight, sight_axes
+from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
 from wrf_mi.models.physics.measured_spectrum import (
     GAPS,
     LEAST_ROWS,
     MeasuredSpectrumPhysics,
     MeasuredSpectrumSettings,
     fit_measured_spectrum,
+    signal_weight,
 )
-from wrf_mi.models.physics.selection import kind_of
+from wrf_mi.models.physics.selection import field_arrays, from_field_arrays, kind_of
 from wrf_mi.receivers.lags import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
 
@@ -61,10 +62,10 @@ def test_prediction_is_ordinary_kriging() -> None:
     weights, variance = kriged(process, np.arange(25), where)
     assert weights.sum(axis=1) == pytest.approx(np.ones(6))
     np.testing.assert_allclose(process.predict(where), np.tensordot(weights, process.observed, 1), atol=SINGLE)
-    np.testing.assert_allclose(process.std(where), np.sqrt(variance)[:, None, None] * process._scale, atol=SINGLE)
+    np.testing.assert_allclose(process.std(where), np.sqrt(variance)[:, None, None] * process.scale, atol=SINGLE)
 
 
-def test_constant_is_predicted_as_it_is() -> None:
+def test_constant_field_is_reproduced() -> None:
     """Weights sum to one, near and far, for any row left out."""
     process = some()
     process.observed[:] = 0.25
@@ -84,14 +85,14 @@ def test_held_out_is_kriging_without_those_rows(radius_m: float) -> None:
         assert 0 < len(kept) < 25
         weights, variance = kriged(process, kept, here)
         np.testing.assert_allclose(mean[number], np.tensordot(weights[0], process.observed[kept], 1), atol=SINGLE)
-        np.testing.assert_allclose(deviation[number], np.sqrt(variance[0]) * process._scale, atol=SINGLE)
+        np.testing.assert_allclose(deviation[number], np.sqrt(variance[0]) * process.scale, atol=SINGLE)
 
 
 def test_held_out_without_any_other_row_is_the_mean() -> None:
     process = some()
     mean, deviation = process.held_out(100.0, np.array([3]))
     np.testing.assert_allclose(mean[0], process.observed.mean(axis=0), atol=SINGLE)
-    np.testing.assert_allclose(deviation[0], np.sqrt(1 + NOISE) * process._scale, atol=SINGLE)
+    np.testing.assert_allclose(deviation[0], np.sqrt(1 + NOISE) * process.scale, atol=SINGLE)
 
 
 def test_far_away_is_the_mean_by_generalised_least_squares() -> None:
@@ -101,7 +102,7 @@ def test_far_away_is_the_mean_by_generalised_least_squares() -> None:
     inverse = np.linalg.inv(np.exp(-cdist(local, local)) + NOISE * np.eye(25))
     mean = np.tensordot(inverse.sum(axis=0) / inverse.sum(), process.observed, 1)
     np.testing.assert_allclose(process.predict(away)[0], mean, atol=SINGLE)
-    expected = np.sqrt(1 + NOISE + 1 / inverse.sum()) * process._scale
+    expected = np.sqrt(1 + NOISE + 1 / inverse.sum()) * process.scale
     np.testing.assert_allclose(process.std(away)[0], expected, atol=SINGLE)
 
 
@@ -125,33 +126,33 @@ def drawn(length_m: np.ndarray, noise: float, count: int, pixels: int) -> tuple[
 
 
 @pytest.mark.parametrize("most", [400, 90])
-def test_lengths_and_noise_are_found_again(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_recovers_lengths_and_noise(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """300 draws at 120 places tell a length to some per cent; all rows predict, even if fewer are fitted to."""
     monkeypatch.setattr(nearby, "MOST_ROWS", most)
     where, observed = drawn(LENGTH_M, NOISE, 120, 300)
-    fitted = fit_nearby(where, observed, RECEIVER_M, WAVELENGTH_M)
+    fitted = fit_anisotropic(where, observed, RECEIVER_M, WAVELENGTH_M)
     assert fitted.length_m == pytest.approx(LENGTH_M, rel=0.15)
     assert fitted.noise == pytest.approx(NOISE, rel=0.3)
-    assert np.mean(fitted._scale) == pytest.approx(0.1, rel=0.05)
+    assert np.mean(fitted.scale) == pytest.approx(0.1, rel=0.05)
     assert fitted.observed.shape == observed.shape
 
 
-def test_rows_that_tell_nothing_break_nothing() -> None:
+def test_equal_spectra_and_coincident_rows_can_be_fitted() -> None:
     """All spectra the same, and all at one place."""
     where = positions(10)
-    same = fit_nearby(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
+    same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
     np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
     one_place = np.repeat(where[:1], 10, axis=0)
     observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
-    found = fit_nearby(one_place, observed, RECEIVER_M, WAVELENGTH_M)
+    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
     np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
-def test_kriging_is_stored_and_read(tmp_path: Path) -> None:
+def test_kriging_is_restored_from_arrays(tmp_path: Path) -> None:
     process, where = some(), positions(3, seed=5)
-    np.savez(tmp_path / "nearby.npz", **process.arrays())
+    np.savez(tmp_path / "nearby.npz", **field_arrays(process, ""))
     with np.load(tmp_path / "nearby.npz") as stored:
-        again = AnisotropicKriging.from_arrays(dict(stored))
+        again = from_field_arrays(AnisotropicKriging, stored, "")
     np.testing.assert_array_equal(again.predict(where), process.predict(where))
     np.testing.assert_array_equal(again.std(where), process.std(where))
 
@@ -165,21 +166,22 @@ def record() -> Record:
 
 
 @pytest.fixture(scope="module")
-def heard() -> list[tuple[str, float]]:
+def progress() -> list[tuple[str, float]]:
     return []
 
 
 @pytest.fixture(scope="module")
-def physics(record: Record, heard: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
+def physics(record: Record, progress: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
     assert record.official is not None
     kind = kind_of(record, with_scene=False)
-    model = kind.fit(record, record.official[0], None, kind.settings(), 0, lambda *told: heard.append(told))
+    settings = MeasuredSpectrumSettings(directions=60)
+    model = kind.fit(record, record.official[0], None, settings, 0, lambda *stage: progress.append(stage))
     assert isinstance(model, MeasuredSpectrumPhysics)
     return model
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
-def test_physics_beats_both_of_its_parts_and_knows_how_far_it_is_off(
+def test_mixture_beats_kriging_and_states_its_error(
     record: Record, physics: MeasuredSpectrumPhysics, receiver: int
 ) -> None:
     assert record.official is not None
@@ -211,22 +213,20 @@ def test_deviation_is_that_of_the_grey_values_far_away(record: Record, physics: 
     assert np.abs(near.mean - known).mean() < 0.02
 
 
-def test_fit_says_what_it_does_and_what_it_found(
-    physics: MeasuredSpectrumPhysics, heard: list[tuple[str, float]]
-) -> None:
-    assert heard[0][0] == "one: element signals of spectra"
-    assert {what for what, _ in heard} >= {"one: signals", "one: weights", "two: weights"}
-    assert all(0 <= share <= 1 for _, share in heard)
-    assert heard[-1] == ("two: weights", 1.0)
+def test_fit_reports_progress_and_summary(physics: MeasuredSpectrumPhysics, progress: list[tuple[str, float]]) -> None:
+    assert progress[0][0] == "one: element signals of spectra"
+    assert {stage for stage, _ in progress} >= {"one: signals", "one: weights", "two: weights"}
+    assert all(0 <= share <= 1 for _, share in progress)
+    assert progress[-1] == ("two: weights", 1.0)
     found = physics.summary()
     assert sum(found["coherent_share"]) == pytest.approx(1, abs=1e-3)
     assert 0 < found["turned_share"] <= 1
 
 
-def test_physics_is_stored_and_read(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
-    np.savez(tmp_path / "hybrid.npz", **physics.arrays())
-    with np.load(tmp_path / "hybrid.npz", allow_pickle=False) as stored:
-        again = kind_of(record, with_scene=False).load(dict(stored), None)
+def test_model_is_restored_from_arrays(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
+    np.savez(tmp_path / "model.npz", **physics.arrays())
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
+        again = kind_of(record, with_scene=False).load(dict(stored))
     assert [r.name for r in again.receivers] == ["one", "two"]
     for receiver in (0, 1):
         before, after = (model.predict(record.tx_pos_m[:5], receiver) for model in (physics, again))
@@ -236,7 +236,7 @@ def test_physics_is_stored_and_read(record: Record, physics: MeasuredSpectrumPhy
 
 
 def test_weight_of_signals_falls_with_their_ignorance() -> None:
-    weight = measured_spectrum._weight(np.array([0.0, 0.1, 0.5, 1.0]), 0.1)
+    weight = signal_weight(np.array([0.0, 0.1, 0.5, 1.0]), 0.1)
     assert weight[0] == 0  # then neighbours know as much
     assert weight[1] == pytest.approx(0.5 * 0.9)
     assert weight[3] == 0
@@ -258,7 +258,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, phys
         errors = []
         for posterior, kriged, _ in by_gap:
             weight = posterior.ignorance**2 / (posterior.ignorance**2 + half**2)
-            mixed = kriged + weight[:, None, None] * (physics._reports[0](posterior)[0] - kriged)
+            mixed = kriged + weight[:, None, None] * (fitted.report(posterior)[0] - kriged)
             errors.append(np.square(mixed - observed).mean())
         return float(np.mean(errors))
 
@@ -267,7 +267,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, phys
     assert left(fitted.half) <= min(left(half) for half in others)
     inside = []
     for posterior, kriged, deviation in by_gap:
-        mean, std = measured_spectrum._mixed(posterior, physics._reports[0], kriged, deviation, fitted)
+        mean, std = fitted.mixed(posterior, kriged, deviation)
         inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 
@@ -288,7 +288,7 @@ def test_rows_that_one_receiver_missed_are_left_out_there(record: Record) -> Non
         fit_measured_spectrum(replace(record, observation=observed), rows, quick)
 
 
-def test_rows_too_close_together_tell_no_gap(record: Record) -> None:
+def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
     """Nothing is held out, so nothing is known of how far to trust either part; and no gap is wider than the rows."""
     quick = MeasuredSpectrumSettings(directions=20, lengths=2)
     one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
@@ -303,7 +303,7 @@ def test_rows_too_close_together_tell_no_gap(record: Record) -> None:
     assert 0.3 < close.spread < 1.5
 
 
-def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many at once as memory bears: the parts are joined in order."""
     assert record.official is not None
     sizes = []
@@ -318,7 +318,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
     one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
     model = fit_measured_spectrum(one, record.official[0][:20], MeasuredSpectrumSettings(directions=20, lengths=2))
     assert sizes == [9, 9, 2]
-    near = model._reports[0](model.sides[0].signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
+    near = model.sides[0].report(model.sides[0].signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
     assert np.median(ssim(near, record.observation[0, record.official[0][:20]])) > 0.9
 
 
@@ -333,9 +333,7 @@ def test_spectra_are_read_in_parts(record: Record, monkeypatch: pytest.MonkeyPat
         ({"array_m": np.outer(np.arange(9), [0.1, 0, 0])}, 20, "on a line"),
     ],
 )
-def test_data_that_tell_too_little_are_refused(
-    change: dict[str, Any], count: int, message: str, record: Record
-) -> None:
+def test_insufficient_data_are_refused(change: dict[str, Any], count: int, message: str, record: Record) -> None:
     broken = record.with_array(change["array_m"]) if "array_m" in change else replace(record, **change)
     with pytest.raises(InputError, match=message):
         fit_measured_spectrum(broken, np.arange(count))
@@ -359,6 +357,6 @@ def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) 
 
 
 @pytest.mark.parametrize("where", [[[0.0, 0.0]], [[0.0, np.nan, 0.0]]])
-def test_positions_that_are_none_are_refused(where: list[list[float]], physics: MeasuredSpectrumPhysics) -> None:
+def test_invalid_positions_are_refused(where: list[list[float]], physics: MeasuredSpectrumPhysics) -> None:
     with pytest.raises(InputError, match="give finite positions"):
         physics.predict(where)

@@ -13,11 +13,9 @@ from scipy.constants import speed_of_light
 from traced_rooms import write_xml
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics import csi
-from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi
-from wrf_mi.models.physics.csi_decode import decode
-from wrf_mi.models.physics.csi_paths import images_of, seen_from
-from wrf_mi.models.physics.csi_residual import fit_diffuse
+from wrf_mi.models.physics.csi import CsiPhysics, CsiSettings, fit_csi, fit_diffuse
+from wrf_mi.models.physics.csi_fit import decode
+from wrf_mi.models.physics.csi_paths import candidate_paths, images_of
 from wrf_mi.models.physics.csi_visibility import Learner
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -114,7 +112,7 @@ def test_margins_are_distances_to_the_outline(right: Any) -> None:
     np.testing.assert_allclose(inside, [0.1, -0.1, 0.2], atol=1e-6)  # float32 corners
 
 
-def test_images_follow_their_planes(right: Any) -> None:
+def test_image_slopes_equal_finite_differences(right: Any) -> None:
     walls = walls_of(scene_surfaces(right))
     plane = np.array([[0, -1], [2, 5], [4, 1], [3, 2]])
     images = images_of(walls, ACCESS_POINT.position_m, plane)
@@ -129,7 +127,7 @@ def test_paths_are_those_of_the_tracer(right: Any, places: np.ndarray) -> None:
     paths = trace_paths(right, places, ACCESS_POINT, TraceOptions(max_depth=2, rays=1 << 16)).paths
     walls = walls_of(scene_surfaces(right))
     chains = [(-1, -1)] + [(i, j) for i in range(len(walls)) for j in range(-1, len(walls)) if i != j]
-    seen = seen_from(walls, images_of(walls, ACCESS_POINT.position_m, np.array(chains)), places)
+    seen = candidate_paths(walls, images_of(walls, ACCESS_POINT.position_m, np.array(chains)), places)
     there = (seen.inside_m > 0) & (seen.clear_m > 0)
     # A path through the very edge of a surface may be decided either way; Sionna RT drops segments below 1 cm.
     doubtful = np.minimum(np.abs(seen.inside_m), np.abs(seen.clear_m)) < 1e-4
@@ -142,7 +140,7 @@ def test_paths_are_those_of_the_tracer(right: Any, places: np.ndarray) -> None:
         np.testing.assert_allclose(ours, np.sort(paths.length_m[paths.tx == row]), atol=1e-6)
 
 
-def test_decoding_tells_which_paths_are_there() -> None:
+def test_decoding_infers_existing_paths() -> None:
     rng = np.random.default_rng(5)
     rows, each = 40, 16
     row = np.repeat(np.arange(rows), each)
@@ -161,14 +159,14 @@ def test_decoding_tells_which_paths_are_there() -> None:
     assert np.median(np.abs(residual)) < 1e-9
 
 
-def test_things_in_the_way_are_learned_from_paths(right: Any) -> None:
-    """A ball that the scene lacks hides paths; rows left out are told better by the others than by the scene."""
+def test_learner_predicts_hidden_paths_of_held_out_rows(right: Any) -> None:
+    """A ball that the scene lacks hides paths; held-out rows are predicted better by the others than by the scene."""
     rng = np.random.default_rng(4)
-    positions = rng.uniform([0.2, 0.2, 0.2], [LENGTH - 0.2, WIDTH - 0.2, HEIGHT - 0.2], (400, 3))
+    positions = rng.uniform([0.2, 0.2, 0.2], [LENGTH - 0.2, WIDTH - 0.2, HEIGHT - 0.2], (250, 3))
     walls = walls_of(scene_surfaces(right))
     chains = [(-1, -1)] + [(i, j) for i in range(len(walls)) for j in range(-1, len(walls)) if i != j]
     images = images_of(walls, ACCESS_POINT.position_m, np.array(chains))
-    seen = seen_from(walls, images, positions)
+    seen = candidate_paths(walls, images, positions)
     share = np.linspace(0, 1, 60)[:, None]
     through = np.zeros(len(seen), bool)
     for start, end in zip(seen.point_m[:, :-1].swapaxes(0, 1), seen.point_m[:, 1:].swapaxes(0, 1), strict=True):
@@ -176,14 +174,14 @@ def test_things_in_the_way_are_learned_from_paths(right: Any) -> None:
         through |= (np.linalg.norm(way - [2.6, 2.2, 1.3], axis=2) < 0.5).any(axis=1)
     scene_says = (seen.inside_m > 0) & (seen.clear_m > 0)
     there = scene_says & ~through
-    learner = Learner(walls, images, seen, outline_sd_m=0.02, ridge=1.0, seed=0, folds=4)
+    learner = Learner(walls, images, seen, sd_m=0.02, ridge=1.0, seed=0, folds=2)
     _, odds = learner.fit(there.astype(float), np.ones(len(seen)))
     wrong_before, wrong_after = (scene_says != there).sum(), ((odds > 0) != there).sum()
     assert wrong_before > 100
     assert wrong_after < 0.6 * wrong_before  # what no other path crosses cannot be known
 
 
-def test_measurements_set_the_planes_right(fitted: CsiPhysics, wrong: Any, measured: Record) -> None:
+def test_fit_corrects_displaced_planes(fitted: CsiPhysics, wrong: Any, measured: Record) -> None:
     test = np.arange(140, 200)
     truth = measured.observation[0, test]
     physics = fit_csi(measured, test[:0], wrong, QUICK).predict(measured.tx_pos_m[test], 0)
@@ -195,7 +193,7 @@ def test_measurements_set_the_planes_right(fitted: CsiPhysics, wrong: Any, measu
     assert fitted.model.walls.offset_m[west] == pytest.approx(0, abs=2e-4)
 
 
-def test_errors_are_as_large_as_stated(fitted: CsiPhysics, measured: Record) -> None:
+def test_errors_match_the_standard_deviations(fitted: CsiPhysics, measured: Record) -> None:
     test = np.arange(140, 200)
     estimate = fitted.predict(measured.tx_pos_m[test], 0)
     error = np.abs(estimate.mean - measured.observation[0, test])
@@ -203,27 +201,27 @@ def test_errors_are_as_large_as_stated(fitted: CsiPhysics, measured: Record) -> 
     assert (estimate.std > 0).all()
 
 
-def test_many_places_are_predicted_in_parts(
+def test_prediction_in_chunks_equals_prediction_at_once(
     fitted: CsiPhysics, measured: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = fitted.predict(measured.tx_pos_m[:30], 0)
-    monkeypatch.setattr(csi, "CHUNK_SIZE", 7)
+    monkeypatch.setattr(CsiPhysics, "chunk_size", 7)
     parts = fitted.predict(measured.tx_pos_m[:30], 0)
     for one, other in ((parts.mean, whole.mean), (parts.std, whole.std)):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
 
 
-def test_arrays_hold_all_that_predicts(fitted: CsiPhysics, measured: Record, tmp_path: Path) -> None:
+def test_model_is_restored_from_arrays(fitted: CsiPhysics, measured: Record, tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **fitted.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
-        again = CsiPhysics.from_arrays(dict(stored), None)
+        again = CsiPhysics.from_arrays(dict(stored))
     for name in ("mean", "std"):
         one, other = (getattr(model.predict(measured.tx_pos_m[:30], 0), name) for model in (fitted, again))
         np.testing.assert_array_equal(one, other)
     assert again.summary() == fitted.summary()
 
 
-def test_without_rows_it_is_the_image_method(right: Any, measured: Record) -> None:
+def test_model_without_rows_is_the_image_method(right: Any, measured: Record) -> None:
     model = fit_csi(measured, np.zeros(0, np.int64), right, QUICK)
     accuracy = cea_db(model.predict(measured.tx_pos_m, 0).mean, measured.observation[0])
     assert np.median(accuracy) > 60  # single-precision corners of the mesh and channels
@@ -260,12 +258,12 @@ def test_several_receivers_and_subcarriers(right: Any, wrong: Any, places: np.nd
         frequencies_hz=frequencies,
     )
     test = np.arange(140, 200)
-    model = fit_csi(both, np.arange(140), wrong, QUICK, seed=1)
+    model = fit_csi(both, np.arange(80), wrong, replace(QUICK, repair_rounds=4), seed=1)
     for number in range(2):
         estimate = model.predict(places[test], number)
         assert estimate.mean.shape == estimate.std.shape == (60, 3)
         assert np.median(cea_db(estimate.mean, observed[number, test])) > 40  # as with one of both
-    again = CsiPhysics.from_arrays(model.arrays(), None)
+    again = CsiPhysics.from_arrays(model.arrays())
     np.testing.assert_array_equal(again.predict(places[test], 1).mean, model.predict(places[test], 1).mean)
 
 
@@ -282,7 +280,7 @@ def test_an_unknown_factor_of_the_instrument_is_found(right: Any, measured: Reco
     assert model.model.gain[0] == pytest.approx(factor, rel=1e-3)
 
 
-def test_what_cannot_be_fitted_is_refused(measured: Record, fitted: CsiPhysics) -> None:
+def test_invalid_arguments_are_refused(measured: Record, fitted: CsiPhysics) -> None:
     with pytest.raises(InputError, match="neither training rows nor a scene"):
         fit_csi(measured, np.zeros(0, np.int64), None)
     with pytest.raises(InputError, match="holds rssi; this physics model predicts channels"):

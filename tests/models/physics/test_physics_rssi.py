@@ -12,11 +12,10 @@ import trimesh
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics.gaussian_process import Part, fit_pooled
 from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
-from wrf_mi.models.physics.rssi_fit import Measured, shift_of, widening
+from wrf_mi.models.physics.rssi_fit import Part, fit_pooled, folds, shift_of, widening
 from wrf_mi.models.physics.rssi_map import PowerMap, trace_map
-from wrf_mi.models.physics.rssi_terms import Covariance, Places, stops_of
+from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, stops_of
 
 FREQUENCY_HZ = 2.44e9
 AT_1M_DBM = -40.2
@@ -59,40 +58,41 @@ def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
     return np.array(predicted) - record.observation[:, rows]
 
 
-def test_the_posterior_is_the_dense_one() -> None:
+def test_posterior_equals_dense_gaussian_conditioning() -> None:
     """Shared coefficients and independent fields, against one covariance matrix of all receivers' rows."""
     rng = np.random.default_rng(1)
-    kernel = Covariance(3.0, 1.5, 1.0, 1.0, 1.0)
+    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0)
     prior = np.array([5.0, 1.0])
-    places = [Places(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
+    places = [Poses(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
     bases = [rng.normal(size=(len(p), 2)) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
     parts = [Part(*one) for one in zip(places, bases, values, noise, strict=True)]
-    process = fit_pooled(parts, kernel, prior, kernel.point(True))
+    process = fit_pooled(parts, kernel.covariance, prior, kernel.variance(True))
 
-    asked, basis = Places(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
+    asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
     mean, variance = process.predict(1, asked, basis)
 
     all_bases = np.concatenate(bases)
     dense = all_bases @ np.diag(prior**2) @ all_bases.T + np.diag(np.concatenate(noise))
-    dense[:7, :7] += kernel(places[0], places[0])
-    dense[7:, 7:] += kernel(places[1], places[1])
+    dense[:7, :7] += kernel.covariance(places[0], places[0])
+    dense[7:, 7:] += kernel.covariance(places[1], places[1])
     cross = basis @ np.diag(prior**2) @ all_bases.T
-    cross[:, 7:] += kernel(asked, places[1])
-    own = np.square(basis) @ prior**2 + kernel.point(True)
+    cross[:, 7:] += kernel.covariance(asked, places[1])
+    own = np.square(basis) @ prior**2 + kernel.variance(True)
     # Both are float64; the jitter on the diagonal is 1e-8 of the noise.
     np.testing.assert_allclose(mean, cross @ np.linalg.solve(dense, np.concatenate(values)), rtol=1e-6)
     np.testing.assert_allclose(variance, own - (cross @ np.linalg.solve(dense, cross.T)).diagonal(), rtol=1e-6)
 
 
-def test_heavy_tails_do_not_pull() -> None:
-    places = Places(np.zeros((21, 3)), None)
+def test_reweighting_is_robust_to_outliers() -> None:
+    places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
     part = Part(places, np.ones((21, 1)), value, np.ones(21))
-    kernel = Covariance(1e-3, 1.0, 0.0, 1.0, 1.0)
+    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0)
     plain, robust = (
-        fit_pooled([part], kernel, np.array([10.0]), kernel.point(False), 4.0, rounds).beta[0] for rounds in (0, 3)
+        fit_pooled([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
+        for rounds in (0, 3)
     )
     assert plain == pytest.approx(40 / 21, rel=0.02)
     assert abs(robust) < 0.3
@@ -100,19 +100,19 @@ def test_heavy_tails_do_not_pull() -> None:
 
 def test_rows_of_one_stop_are_joined() -> None:
     x = np.array([0.0, 0.05, 0.1, 1.0, 1.0, 1.0, 1.0])
-    places = Places(np.column_stack([x, np.zeros((7, 2))]), np.array([3.1, -3.1, 3.1, 0, 0, 2.0, 2.0]))
+    places = Poses(np.column_stack([x, np.zeros((7, 2))]), np.array([3.1, -3.1, 3.1, 0, 0, 2.0, 2.0]))
     value = np.array([[1.0, 2.0, 9.0, np.nan, 4.0, np.nan, np.nan]])
-    stops = stops_of(places, value, np.array([0, 1, 2, 3, 4, 5, 90]), reach_m=0.2, turn_rad=0.5, most=20)
+    stops = stops_of(Measured(places, value, np.array([0, 1, 2, 3, 4, 5, 90])), reach_m=0.2, turn_rad=0.5, most=20)
     assert stops.count.tolist() == [[3, 1, 0, 0]]
     np.testing.assert_array_equal(stops.value_dbm, [[2.0, 4.0, np.nan, np.nan]])
     # Headings either side of the seam at pi have their mean at pi, not at 0.
-    np.testing.assert_allclose(np.cos(stops.places.heading_rad), np.cos([np.pi, 0, 2, 2]), atol=1e-3)
+    np.testing.assert_allclose(np.cos(stops.poses.heading_rad), np.cos([np.pi, 0, 2, 2]), atol=1e-3)
 
 
 def test_precise_rows_of_a_stop_weigh_more() -> None:
-    places = Places(np.zeros((4, 3)), None)
+    places = Poses(np.zeros((4, 3)), None)
     value, precision = np.array([[1.0, 2.0, np.nan, 9.0], [1.0, 2.0, 3.0, 4.0]]), np.array([[1, 1, 7, 3], [1, 1, 1, 3]])
-    stops = stops_of(places, value, np.arange(4), 0.2, 0.5, 20, precision=precision.astype(float))
+    stops = stops_of(Measured(places, value, np.arange(4), precision.astype(float)), 0.2, 0.5, 20)
     np.testing.assert_array_equal(stops.count, [[5], [6]])
     # The median of 1, 2, 9, 9, 9, and that of 1, 2, 3, 4, 4, 4.
     np.testing.assert_array_equal(stops.value_dbm, [[9.0], [3.5]])
@@ -123,9 +123,9 @@ def test_stated_noise_lowers_the_error() -> None:
     std = rng.choice([0.5, 9.0], record.observation.shape)
     noisy = replace(record, observation=(record.observation + std * rng.normal(size=std.shape)).astype(np.float32))
     train, test = np.arange(200), np.arange(200, 300)
-    blind, told = (fit_rssi(one, train, None, FAST) for one in (noisy, replace(noisy, std=std)))
-    # Half of the rows are of little use: what is known of the rest is to count.
-    assert np.median(np.abs(errors(told, record, test))) < 0.75 * np.median(np.abs(errors(blind, record, test)))
+    plain, weighted = (fit_rssi(one, train, None, FAST) for one in (noisy, replace(noisy, std=std)))
+    # Half of the rows have a noise of 9 dB.
+    assert np.median(np.abs(errors(weighted, record, test))) < 0.75 * np.median(np.abs(errors(plain, record, test)))
 
 
 def test_learns_offsets_exponent_and_pattern() -> None:
@@ -139,7 +139,7 @@ def test_learns_offsets_exponent_and_pattern() -> None:
     assert np.median(np.abs(without)) > 1.5
 
 
-def test_one_receivers_rows_teach_the_others_pattern() -> None:
+def test_receivers_share_the_transmitters_pattern() -> None:
     """The third receiver has four rows: the pattern that it shares must come from the other two."""
     record = made(300, noise_db=0.5, body_db=6.0)
     observation = record.observation.copy()
@@ -150,7 +150,7 @@ def test_one_receivers_rows_teach_the_others_pattern() -> None:
     assert np.median(np.abs(record_errors)) < 2.0
 
 
-def test_interval_holds_nine_of_ten() -> None:
+def test_interval_covers_90_percent() -> None:
     record = made(400, noise_db=3.0)
     model = fit_rssi(record, np.arange(250), None, FAST)
     test = np.arange(250, 400)
@@ -181,11 +181,11 @@ def test_unknown_heading_is_averaged_over() -> None:
     assert (average.std > turns[0].std + 1).all()
 
 
-def test_survives_its_arrays() -> None:
+def test_model_is_restored_from_arrays() -> None:
     record = made(80, noise_db=2.0)
     record.observation[1, ::3] = np.nan
     model = fit_rssi(record, np.arange(70), None, FAST)
-    again = RssiPhysics.from_arrays(model.arrays(), None)
+    again = RssiPhysics.from_arrays(model.arrays())
     assert record.tx_heading_rad is not None
     for k in range(3):
         ours, theirs = (m.predict(record.tx_pos_m, k, record.tx_heading_rad) for m in (model, again))
@@ -204,21 +204,20 @@ def test_search_lowers_the_held_out_error() -> None:
 
 
 def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
-    record = made(240, noise_db=0.5)
+    record = made(120, noise_db=0.5)
     assert record.tx_heading_rad is not None
-    ahead = Places(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
+    ahead = Poses(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
     turn = record.tx_heading_rad[:, None]
     np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
     stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
-    model = fit_rssi(stated, np.arange(240), None, replace(FAST, search_rows=50, search_rounds=3, noise_db=1.0))
+    model = fit_rssi(stated, np.arange(120), None, replace(FAST, search_rows=50, search_rounds=2, noise_db=1.0))
     assert model.summary()["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
 
 
-def test_folds_leave_out_neighbours_in_time() -> None:
+def test_folds_exclude_neighbours_in_time() -> None:
     count = 700
-    measured = Measured(Places(np.zeros((count, 3)), None), np.zeros((1, count)), np.arange(count))
     held = np.zeros(count, int)
-    for train, out in measured.folds():
+    for train, out in folds(count):
         held[out] += 1
         nearest = np.abs(train[:, None] - out[None]).min()
         assert nearest > 12  # a quarter of a stretch of 50
@@ -251,7 +250,7 @@ def test_settings_are_checked(change: dict[str, float], message: str) -> None:
         RssiSettings(**change)  # type: ignore[arg-type]
 
 
-def test_bad_input() -> None:
+def test_invalid_arguments_are_refused() -> None:
     record = made(10, noise_db=1.0)
     with pytest.raises(InputError, match="nor a scene"):
         fit_rssi(record, np.array([], int), None)
@@ -264,8 +263,8 @@ def test_bad_input() -> None:
         model.predict(record.tx_pos_m, 0, np.zeros(3))
 
 
-def test_a_wall_is_seen_without_a_measurement(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    """A room with a metal wall across it: the mesh alone tells that behind it less arrives."""
+def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """A room with a metal wall across it: without measurements less power is predicted behind it."""
     from wrf_mi.tracing import open_scene
 
     wall = trimesh.creation.box((0.1, 6.0, 3.0), trimesh.transformations.translation_matrix((3.0, 3.0, 1.5)))
@@ -284,7 +283,7 @@ def test_a_wall_is_seen_without_a_measurement(tmp_path) -> None:  # type: ignore
     np.testing.assert_array_equal(again.predict(record.tx_pos_m, 0).mean, model.predict(record.tx_pos_m, 0).mean)
 
 
-def test_a_map_leaves_out_what_is_inside_a_closed_solid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A column of 0.9 m holds points of the map's grid, whose antennas nobody has stated: no error and no warning."""
     from wrf_mi.tracing import open_scene
 
@@ -313,10 +312,10 @@ def test_beats_the_law_of_distance_in_a_real_flat() -> None:
     (split,) = make_splits(record, "official", seed=1, n_train=64)
     assert record.official is not None
     assert record.tx_heading_rad is not None
-    rest = np.setdiff1d(record.official[0], split.all_train)[::4]
+    out = np.setdiff1d(record.official[0], split.all_train)[::4]
     model = fit_rssi(record, split.all_train, None)
     miss = [
-        model.predict(record.tx_pos_m[rest], k, record.tx_heading_rad[rest]).mean - record.observation[k, rest]
+        model.predict(record.tx_pos_m[out], k, record.tx_heading_rad[out]).mean - record.observation[k, out]
         for k in range(len(record.receivers))
     ]
     assert np.nanmedian(np.abs(miss)) < 3.5

@@ -1,17 +1,16 @@
 """Kriging of spectra whose correlation falls at different rates along and across the line of sight.
 
-Waves that reach one receiver leave the transmitter within a cone around the line of sight, so a step along it turns
-their phases against each other less than a step across it (`wrf_mi.models.physics.signal_kernels`): on measured
-spectra half as fast as across it horizontally. Grey values are exponentially correlated over the position in lengths
-of its own on each of three axes, with one unknown mean; all of it of most likelihood.
+Waves that reach one receiver leave the transmitter within a cone around the line of sight (`signals`), so a step along
+it changes their relative phases less than a step across it: on measured spectra half as fast. Grey values have an
+exponential correlation over the position, with a length for each of three axes, and one unknown mean.
 
 Source: `wrf_mi.models.interpolation.kriging_equations`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,24 +18,25 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray
+from ...core.types import IntArray
 from ..interpolation.kriging_equations import KrigingSystem, component_root, correlation, left_out
 
 LENGTH = (0.03, 30.0)
-"""Where the likelihood looks, in wavelengths."""
+"""Bounds of the lengths in wavelengths."""
 NOISE = (1e-3, 1.0)
-"""The same, as a share of the variance; at least what 8 bits leave."""
+"""Bounds of the noise as a share of the variance, at least that of 8 bits."""
 START = (0.3, 0.3, 0.3, 0.01)
-"""Three lengths and noise from which it sets out."""
+"""Three lengths and noise from which the search starts."""
 PIXELS = 4700
-"""About so many tell the lengths: neighbours say the same."""
+"""Approximate number of pixels in the likelihood: neighbouring pixels are redundant."""
 VARIANCE = 1e-12
-"""Of grey values, at least: spectra that are all the same have none."""
+"""Least variance of grey values, for equal spectra."""
 MOST_ROWS = 400
-"""Lengths are fitted to at most so many rows."""
+"""Rows in the likelihood at most."""
 
 
 def line_of_sight(tx_pos_m: FloatArray, receiver_m: FloatArray) -> FloatArray:
-    """Unit vector [3] from the middle of transmitters [n, 3] to the receiver [3]; up where that is in their middle."""
+    """Unit vector [3] from the centre of transmitters [n, 3] to the receiver [3]; up for a receiver at the centre."""
     way = receiver_m - tx_pos_m.mean(axis=0)
     distance = float(np.linalg.norm(way))
     around = distance < 1e-6 * max(float(np.ptp(tx_pos_m, axis=0).max()), 1e-6)
@@ -47,40 +47,48 @@ def sight_axes(tx_pos_m: FloatArray, receiver_m: FloatArray) -> FloatArray:
     """Axes [3, 3] in rows: along the mean line of sight, horizontally across it, and across both."""
     along = line_of_sight(tx_pos_m, receiver_m)
     level = np.cross([0.0, 0.0, 1.0], along)
-    if np.linalg.norm(level) < 1e-6:  # straight up or down: any level axis will do
+    if np.linalg.norm(level) < 1e-6:  # straight up or down: any level axis serves
         level = np.array([1.0, 0.0, 0.0])
     level /= np.linalg.norm(level)
     return np.stack([along, level, np.cross(along, level)])
 
 
-class AnisotropicKriging:
-    """The interpolation, of observations of any shape.
+def chosen_rows(count: int, most: int, seed: int) -> IntArray:
+    """At most ``most`` of ``count`` rows, drawn at random, ascending."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(seed).choice(count, most, replace=False))
 
-    Args:
-        tx_pos_m: of the rows, [n, 3], metres.
-        observed: [n, ...], float32.
-        axes: in rows, [3, 3].
-        length_m: along each, [3].
-        noise: share of the variance.
+
+@dataclass(eq=False)
+class AnisotropicKriging:
+    """Ordinary kriging of observations [n, ...], float32, at positions [n, 3], with a correlation length for each axis.
+
+    ``length_m`` [3] belongs to the rows of ``axes`` [3, 3]; ``noise`` is a share of the variance.
     """
 
-    def __init__(
-        self, tx_pos_m: FloatArray, observed: NDArray[np.float32], axes: FloatArray, length_m: FloatArray, noise: float
-    ) -> None:
-        self.tx_pos_m, self.observed = tx_pos_m, observed
-        self.axes, self.length_m, self.noise = axes, length_m, noise
-        n = len(tx_pos_m)
-        self._system = KrigingSystem(self._correlation(tx_pos_m), noise, np.ones((n, 1)))
+    tx_pos_m: FloatArray
+    observed: NDArray[np.float32]
+    axes: FloatArray
+    length_m: FloatArray
+    noise: float
+
+    def __post_init__(self) -> None:
+        """Factor the covariance."""
+        n = len(self.tx_pos_m)
+        self._system = KrigingSystem(self._correlation(self.tx_pos_m), self.noise, np.ones((n, 1)))
         self._precision, self._mean = self._system.precision, self._system.coefficients(np.eye(n))[0]
 
     def _correlation(self, tx_pos_m: FloatArray) -> FloatArray:
         here, there = (positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m))
         return correlation(here, there)
 
+    def _weighted(self, weights: FloatArray) -> NDArray[np.float32]:
+        return np.tensordot(weights.astype(np.float32), self.observed, 1)
+
     def predict(self, tx_pos_m: ArrayLike) -> NDArray[np.float32]:
         """Expected observations at positions [q, 3], metres."""
-        weights = self._correlation(np.asarray(tx_pos_m, float)) @ self._precision + self._mean
-        return np.tensordot(weights.astype(np.float32), self.observed, 1)
+        return self._weighted(self._correlation(np.asarray(tx_pos_m, float)) @ self._precision + self._mean)
 
     def std(self, tx_pos_m: ArrayLike) -> NDArray[np.float32]:
         """Standard deviation of observations at positions [q, 3], metres, about `predict`."""
@@ -89,67 +97,38 @@ class AnisotropicKriging:
 
     def _deviation(self, unknown: FloatArray) -> NDArray[np.float32]:
         share = np.sqrt(unknown).reshape(-1, *[1] * (self.observed.ndim - 1))
-        return (share * self._scale).astype(np.float32)
+        return (share * self.scale).astype(np.float32)
 
     @cached_property
-    def _scale(self) -> FloatArray:
-        """Standard deviation of the field, shape of an observation; of most restricted likelihood."""
+    def scale(self) -> FloatArray:
+        """Standard deviation of the field, shape of an observation; of greatest restricted likelihood."""
         flat = self.observed.reshape(len(self.observed), -1)
         centred = flat - self._mean.astype(np.float32) @ flat
         squares = np.einsum("np,np->p", self._precision.astype(np.float32) @ centred, centred)
         variance = squares / max(len(centred) - 1, 1)
         return np.sqrt(np.maximum(variance, 0)).reshape(self.observed.shape[1:])
 
-    def held_out(self, radius_m: float, rows: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Both at training rows [q], from those further away than ``radius_m``; the mean of all where none is."""
+    def held_out(self, radius_m: float, rows: IntArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Prediction and deviation at rows [q] from rows beyond ``radius_m``; without any, the mean of all."""
         distance = cdist(self.tx_pos_m[rows], self.tx_pos_m)
         weights = np.full(distance.shape, 1 / distance.shape[1])
         unknown = np.full(len(rows), 1 + self.noise)
         for number, (row, near) in enumerate(zip(rows, distance <= radius_m, strict=True)):
-            block = np.flatnonzero(near)
-            if len(block) == len(near):
-                continue
-            weights[number], unknown[number] = left_out(self._precision, block, row)
-        return np.tensordot(weights.astype(np.float32), self.observed, 1), self._deviation(unknown)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """For `from_arrays`. Observations are kept as they are."""
-        return {
-            "tx_pos_m": self.tx_pos_m,
-            "observed": self.observed,
-            "axes": self.axes,
-            "length_m": self.length_m,
-            "noise": np.array(self.noise),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> AnisotropicKriging:
-        """An interpolation as `arrays` gave it."""
-        names = ("tx_pos_m", "observed", "axes", "length_m")
-        positions, observed, axes, length = (arrays[name] for name in names)
-        return cls(positions, observed, axes, length, float(arrays["noise"]))
+            if not near.all():
+                weights[number], unknown[number] = left_out(self._precision, np.flatnonzero(near), row)
+        return self._weighted(weights), self._deviation(unknown)
 
 
-def fit_nearby(
-    tx_pos_m: FloatArray,
-    observed: NDArray[np.float32],
-    receiver_m: FloatArray,
-    wavelength_m: float,
-    seed: int = 0,
+def fit_anisotropic(
+    tx_pos_m: FloatArray, observed: NDArray[np.float32], receiver_m: FloatArray, wavelength_m: float, seed: int = 0
 ) -> AnisotropicKriging:
-    """Lengths and noise of most restricted likelihood.
+    """Kriging of observations [n, ...] with lengths and noise of greatest restricted likelihood.
 
-    Args:
-        tx_pos_m: [n, 3], metres.
-        observed: [n, ...].
-        receiver_m: position [3], metres.
-        wavelength_m: metres.
-        seed: chooses rows where there are more than `MOST_ROWS`.
+    Positions [n, 3], the receiver's position [3] and the wavelength are in metres; ``seed`` chooses rows where there
+    are more than `MOST_ROWS`.
     """
     axes = sight_axes(tx_pos_m, receiver_m)
-    chosen = np.arange(len(tx_pos_m))
-    if len(chosen) > MOST_ROWS:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(chosen), MOST_ROWS, replace=False))
+    chosen = chosen_rows(len(tx_pos_m), MOST_ROWS, seed)
     local = tx_pos_m[chosen] @ axes.T / wavelength_m
     flat = observed[chosen].reshape(len(chosen), -1)
     flat = flat[:, :: max(round(flat.shape[1] / PIXELS), 1)].astype(float)

@@ -1,156 +1,180 @@
-"""Complex channels: image sources in a scene's planes, which measurements set right.
+"""Complex channels: image sources in a scene's planes, corrected by measurements.
 
-A mesh from LiDAR tells which planes there are to millimetres or centimetres, and roughly how far they reach. Phases
-need tenths of millimetres, and whether a path is there decides more than all else. So, with measured channels:
+A mesh from LiDAR gives planes to millimetres or centimetres, and rough outlines. Phases need tenths of millimetres, and
+the error is mostly decided by which paths exist. So, with measured channels, three steps alternate: the probability of
+each path is inferred from a row's channel (`csi_fit`), planes are shifted and tilted until all phases fit
+(`csi_repair`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
+elsewhere (`csi_visibility`). The residual is a diffuse field, useful within half a wavelength of measurements.
 
-1. each row tells which of its paths are there (`csi_decode`): gains differ in amplitude and phase;
-2. planes are shifted and tilted until all phases fit (`csi_repair`); both in turn, the noise being a mixture of scales
-   that narrows by itself;
-3. what the known paths show of the room, outlines that are further out or in, things that hide and parts that do not
-   mirror, is learned and predicts which paths are there elsewhere (`csi_visible`); 1 to 3 in turn;
-4. what is left is a diffuse field (`csi_rest`), of use where measurements are within half a wavelength.
-
-Without measurements it is the image method on the mesh; without a mesh the line of sight and the diffuse field, which
-interpolates over fractions of a wavelength and no further.
+Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
+from scipy.spatial import KDTree
 
-from ...core import InputError, Prediction, Receiver, Record, receiver_arrays, stored_receivers
+from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
-from ...core.receivers import receiver_index
 from ...core.types import IntArray
 from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
-from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, prior_sd, seen_by_rows
+from ..interpolation.kriging_equations import simple_weights
+from ..method import OnProgress
+from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, images_of
-from .csi_repair import NUMBERS, Model
-from .csi_residual import Diffuse, fit_diffuse
+from .csi_repair import NUMBERS, Complex, Model
 from .csi_visibility import Visibility
-
-Complex = NDArray[np.complex128]
-OnProgress = Callable[[str, float], None]
+from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
 
 DEFAULTS = CsiSettings()
-CHUNK_SIZE = 1024
-"""Positions that are predicted together: each has hundreds of candidates for paths."""
+NEIGHBOURS = 32
+SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
+"""Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
+CERTAIN = 3.0
+"""Standard errors by which predictions with the field must be better than without."""
 CLEAR_M = 0.05
-"""Rays search from so far off a wall that the antenna is mounted on."""
+"""Distance from a wall with an antenna mounted on it at which the search by rays begins."""
 
 
-class CsiPhysics:
-    """A fitted CSI physics model; made by `fit_csi`.
+@dataclass(frozen=True)
+class DiffuseField:
+    """Complex Gaussian field with covariance sin(k d) / (k d): waves from all directions with equal power.
+
+    Source: Cook et al., "Measurement of correlation coefficients in reverberant sound fields" (1955), J. Acoust. Soc.
+    Am. 27; the same holds for scalar waves of any kind.
 
     Attributes:
-        task: ``"csi"``.
-        receivers: in the record's order.
-        model: image sources.
-        visibility: what tells which are seen.
-        rest: the diffuse field of each receiver.
-        sharpness: factor of the log odds in the mean that is predicted.
-        covariance: of all planes' parameters.
+        position_m, value: residual channels [n, subcarriers] at positions [n, 3].
+        k: mean wave number, rad/m.
+        power, share: mean of abs(value)^2, and the field's share of it; the rest is noise of each row.
     """
 
-    task: ClassVar[str] = "csi"
-    uses_heading: ClassVar[bool] = False
+    position_m: FloatArray
+    value: Complex
+    k: float
+    power: float
+    share: float
 
-    def __init__(
-        self,
-        receivers: tuple[Receiver, ...],
-        model: Model,
-        visibility: Visibility,
-        rest: tuple[Diffuse, ...],
-        sharpness: float,
-        covariance: FloatArray,
-        facts: Mapping[str, float],
-    ) -> None:
-        self.receivers, self.model, self.visibility, self.rest = receivers, model, visibility, rest
-        self.sharpness, self.covariance, self._facts = sharpness, covariance, dict(facts)
+    def predict(self, position_m: FloatArray, skip: int = 0) -> tuple[Complex, FloatArray]:
+        """Mean [m, subcarriers] and variance [m] of residuals, noise included, at positions [m, 3] in metres.
 
-    def predict(self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None = None) -> Prediction:
-        """Channels [m, subcarriers] from transmitters [m, 3] to one receiver; antennas are isotropic: no heading.
-
-        The receiver is given by its name, or by its number from 0.
-
-        Raises:
-            InputError: positions of another shape, or no such receiver.
+        The ``skip`` nearest rows are not used: 1 leaves out the row at the position itself.
         """
-        position = np.atleast_2d(np.asarray(tx_pos_m, float))
-        if position.ndim != 2 or position.shape[1] != 3 or not np.isfinite(position).all():
-            raise InputError(f"predict: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [m, 3]")
-        index = receiver_index(self.receivers, receiver)
-        first = range(0, max(len(position), 1), CHUNK_SIZE)
-        mean, std = zip(*(self._part(position[begin : begin + CHUNK_SIZE], index) for begin in first), strict=True)
-        return Prediction(np.concatenate(mean), np.concatenate(std))
+        count = len(position_m)
+        if self.share == 0 or len(self.position_m) <= skip:
+            return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
+        near = min(NEIGHBOURS, len(self.position_m) - skip)
+        distance, index = KDTree(self.position_m).query(position_m, k=list(range(1 + skip, near + skip + 1)))
+        between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
+        matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
+        across = self.share * np.sinc(self.k * distance / np.pi)
+        weight, known = simple_weights(matrix, across)
+        mean = np.einsum("mn,mnf->mf", weight, self.value[index])
+        return mean, self.power * np.maximum(1 - known, 1e-6)
 
-    def _part(self, position: FloatArray, receiver: int) -> tuple[Complex, FloatArray]:
-        rows = Rows(np.zeros((len(position), 0), complex), position, np.full(len(position), receiver))
-        seen = seen_by_rows(self.model, rows)
-        odds = self.visibility.log_odds(self.model.walls, self.model.images, seen)
-        mean, variance = mixed(self.model, rows, seen, odds, self.sharpness, self.covariance)
-        more, left = self.rest[receiver].predict(position)
-        return mean + more, np.sqrt(variance + left[:, None])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that is needed to predict again, as plain arrays."""
-        model, visibility = self.model, self.visibility
-        scan = {f"scan.{name}": getattr(model.scan, name) for name in Walls.__dataclass_fields__}
-        fitted = {f"visibility.{name}": getattr(visibility, name) for name in Visibility.__dataclass_fields__}
-        rest = {
-            f"rest.{index}.{name}": getattr(one, name)
-            for index, one in enumerate(self.rest)
-            for name in Diffuse.__dataclass_fields__
-        }
+def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:
+    """The field whose share predicts each row best from the others (logarithmic score).
+
+    ``value`` [n, subcarriers] holds residual channels at positions [n, 3] in metres, ``k`` the mean wave number, rad/m.
+    """
+    power = float(np.square(np.abs(value)).mean()) if len(value) else 0.0
+    best = DiffuseField(position_m, value, k, power, 0.0)
+    if power == 0 or len(value) <= 2:
+        return best
+    lowest = _scores(best)
+    for share in SHARES:
+        field = replace(best, share=share)
+        scores = _scores(field)
+        gain = lowest - scores
+        # A spurious field adds its neighbours' errors to correct predictions: only a certain gain is accepted.
+        if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
+            lowest, best = scores, field
+    return best
+
+
+def _scores(field: DiffuseField) -> FloatArray:
+    """Score of each row predicted from the others [n]; robust to rows that lack a path."""
+    mean, variance = field.predict(field.position_m, skip=1)
+    error = np.square(np.abs(field.value - mean)).mean(axis=1)
+    return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
+
+
+@dataclass(eq=False, repr=False)
+class CsiPhysics(PhysicsModel):
+    """A fitted CSI physics model; made by `fit_csi`.
+
+    Antennas are isotropic, so headings change nothing.
+
+    Attributes:
+        receivers: in the record's order.
+        model: image sources.
+        visibility: predicts which of their paths exist.
+        residual: the diffuse field of each receiver.
+        sharpness: factor of the log odds in the predicted mean.
+        covariance: of all planes' parameters.
+        fit_facts: entries of `summary` about the fit.
+    """
+
+    receivers: tuple[Receiver, ...]
+    model: Model
+    visibility: Visibility
+    residual: tuple[DiffuseField, ...]
+    sharpness: float
+    covariance: FloatArray
+    fit_facts: dict[str, float]
+    task: ClassVar[str] = "csi"
+
+    def _predict(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
+    ) -> tuple[Complex, FloatArray]:
+        rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))
+        paths = paths_of_rows(self.model, rows)
+        odds = self.visibility.log_odds(self.model.walls, self.model.images, paths)
+        mean, variance = mixed(self.model, rows, paths, odds, self.sharpness, self.covariance)
+        field, field_variance = self.residual[receiver].predict(tx_pos_m)
+        return mean + field, np.sqrt(variance + field_variance[:, None])
+
+    def arrays(self) -> Arrays:
+        """Arrays for `from_arrays`."""
+        model = self.model
         arrays = {
             **receiver_arrays(self.receivers),
-            "change": model.change,
+            **{name: getattr(model, name) for name in ("change", "source", "k", "reflection", "gain")},
             "chain": model.images.plane,
-            "source": model.source,
-            "k": model.k,
-            "reflection": model.reflection,
-            "gain": model.gain,
             "sharpness": self.sharpness,
             "covariance": self.covariance,
-            "fact.name": np.array(list(self._facts)),
-            "fact.value": np.array(list(self._facts.values()), float),
+            "fact.name": np.array(list(self.fit_facts)),
+            "fact.value": np.array(list(self.fit_facts.values()), float),
+            **field_arrays(model.scan, "scan."),
+            **field_arrays(self.visibility, "visibility."),
         }
-        return {name: np.asarray(value) for name, value in {**arrays, **scan, **fitted, **rest}.items()}
+        for index, field in enumerate(self.residual):
+            arrays |= field_arrays(field, f"rest.{index}.")
+        return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], scene: Any | None = None) -> CsiPhysics:
-        """What `arrays` returned; the scene is not needed."""
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> CsiPhysics:
+        """The model that `arrays` stored."""
         receivers = stored_receivers(arrays)
-        scan = Walls(*(arrays[f"scan.{name}"] for name in Walls.__dataclass_fields__))
-        model = _model(
-            scan,
-            arrays["chain"],
-            arrays["source"],
-            arrays["receiver_position_m"],
-            arrays["k"],
-            complex(arrays["reflection"]),
-        )
+        scan = from_field_arrays(Walls, arrays, "scan.")
+        plane, source, source_m, k = (arrays[name] for name in ("chain", "source", "receiver_position_m", "k"))
+        model = _model(scan, plane, source, source_m, k, complex(arrays["reflection"]))
         model = replace(model, gain=arrays["gain"]).changed(arrays["change"])
-        own = {name: arrays[f"visibility.{name}"] for name in Visibility.__dataclass_fields__}
-        sd_m, seed = float(own["outline_sd_m"]), int(own["seed"])
-        visibility = Visibility(own["edge_m"], own["margin"], own["key"], own["weight"], sd_m, seed)
-        rest = []
-        for index in range(len(receivers)):
-            values = [arrays[f"rest.{index}.{name}"] for name in Diffuse.__dataclass_fields__]
-            rest.append(Diffuse(values[0], values[1], *(float(value) for value in values[2:])))
+        visibility = from_field_arrays(Visibility, arrays, "visibility.")
+        residual = tuple(from_field_arrays(DiffuseField, arrays, f"rest.{index}.") for index in range(len(receivers)))
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
-        sharpness = float(arrays["sharpness"])
-        return cls(receivers, model, visibility, tuple(rest), sharpness, arrays["covariance"], facts)
+        return cls(receivers, model, visibility, residual, float(arrays["sharpness"]), arrays["covariance"], facts)
 
     def summary(self) -> dict[str, Any]:
-        """What was fitted, in plain numbers."""
+        """Numbers of planes and chains, their largest changes, and accuracy on held-out rows."""
         change = self.model.change
         return {
             "planes": len(self.model.scan),
@@ -158,11 +182,11 @@ class CsiPhysics:
             "largest_shift_m": float(np.abs(change[:, 0]).max(initial=0)),
             "largest_tilt_rad": float(np.abs(change[:, 1:3]).max(initial=0)),
             "sharpness": self.sharpness,
-            "gain_db": [float(20 * np.log10(np.abs(one))) for one in self.model.gain],
-            "gain_phase_rad": [float(np.angle(one)) for one in self.model.gain],
-            "diffuse_share": [one.share for one in self.rest],
-            "rest_power_db": [float(10 * np.log10(max(one.power, 1e-300))) for one in self.rest],
-            **self._facts,
+            "gain_db": [float(20 * np.log10(np.abs(gain))) for gain in self.model.gain],
+            "gain_phase_rad": [float(np.angle(gain)) for gain in self.model.gain],
+            "diffuse_share": [field.share for field in self.residual],
+            "rest_power_db": [float(10 * np.log10(max(field.power, 1e-300))) for field in self.residual],
+            **self.fit_facts,
         }
 
 
@@ -172,17 +196,17 @@ def fit_csi(
     scene: Any | None,
     settings: CsiSettings = DEFAULTS,
     seed: int = 0,
-    on_progress: OnProgress = lambda what, share: None,
+    on_progress: OnProgress = lambda stage, share: None,
 ) -> CsiPhysics:
     """Fit a CSI physics model.
 
     Args:
-        record: of complex channels.
-        rows: training rows; none: the image method on the scene as it is.
+        record: complex channels.
+        rows: training rows; none: the image method on the scene as given.
         scene: from `wrf_mi.tracing.open_scene`, or None: the line of sight and a diffuse field.
-        settings: see `CsiSettings`.
-        seed: of the rays, and of folds and cells.
-        on_progress: hears what is being done, and how far it is from 0 to 1.
+        settings: settings of the fit.
+        seed: seed of rays, folds and grids of cells.
+        on_progress: progress callback: stage and fraction done.
 
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.
@@ -196,46 +220,38 @@ def fit_csi(
     on_progress("searching for paths", 0.0)
     model = _start(record, scene, settings, seed)
     measured = _measured(record, rows)
-    visibility = Visibility.of_scene(len(model.scan.edge_m), settings.outline_sd_m, seed)
-    covariance = np.diag(np.square(prior_sd(model, settings)).reshape(-1))
-    sharpness, facts, left = SHARPNESS[-1], {"rows": float(len(measured.channel))}, measured.channel
-    if len(measured.channel):
-        fit = Fit(model, measured, settings, seed)
-        total = settings.repair_rounds + settings.visibility_rounds
-        for number in range(settings.repair_rounds):
-            on_progress("repairing planes", number / total)
-            fit.repair()
-        for number in range(settings.visibility_rounds):
-            on_progress("learning what is seen", (settings.repair_rounds + number) / total)
-            fit.learn()
-        model, visibility, covariance = fit.model, fit.visibility, fit.covariance
-        sharpness, left = fit.finish()
-        facts |= fit.facts
-    on_progress("kriging the rest", 1.0)
+    fit = Fit(model, measured, settings, seed)
+    sharpness, residual = SHARPNESS[-1], measured.channel
+    if len(residual):
+        stages = [("repairing planes", fit.repair)] * settings.repair_rounds
+        stages += [("learning visibility", fit.learn)] * settings.visibility_rounds
+        for number, (stage, step) in enumerate(stages):
+            on_progress(stage, number / len(stages))
+            step()
+        sharpness, residual = fit.finish()
+    on_progress("kriging of residuals", 1.0)
     k = float(model.k.mean())
-    rest = tuple(
-        fit_diffuse(measured.position_m[own], left[own], k)
-        for own in (measured.source == index for index in range(len(record.receivers)))
+    fields = tuple(
+        fit_diffuse(measured.position_m[chosen], residual[chosen], k)
+        for chosen in (measured.source == index for index in range(len(record.receivers)))
     )
-    return CsiPhysics(record.receivers, model, visibility, rest, sharpness, covariance, facts)
+    return CsiPhysics(record.receivers, fit.model, fit.visibility, fields, sharpness, fit.covariance, fit.facts)
+
+
+KIND = PhysicsKind(CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
 
 
 def _measured(record: Record, rows: IntArray) -> Rows:
-    """What was received, receivers one after the other."""
-    channel, position, source = [], [], []
-    for index in range(len(record.receivers)):
-        values = np.asarray(record.observation[index, rows], complex)
-        known = np.isfinite(values).all(axis=1)
-        channel.append(values[known])
-        position.append(record.tx_pos_m[rows[known]])
-        source.append(np.full(np.count_nonzero(known), index))
-    return Rows(np.concatenate(channel), np.concatenate(position), np.concatenate(source))
+    """Received channels, receiver by receiver."""
+    values = np.asarray(record.observation[:, rows], complex)
+    source, row = np.nonzero(np.isfinite(values).all(axis=2))
+    return Rows(values[source, row], record.tx_pos_m[rows[row]], source)
 
 
 def _start(record: Record, scene: Any | None, settings: CsiSettings, seed: int) -> Model:
-    """Planes as the scene has them, and the chains that rays from each receiver find."""
+    """Planes of the scene as given, and the chains that rays from each receiver find."""
     assert record.frequencies_hz is not None
-    source_m = np.stack([one.position_m for one in record.receivers]).astype(float)
+    source_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     depth = settings.reflections
     line_of_sight = np.full((1, depth), -1)
     walls, chains = no_walls(), [line_of_sight] * len(source_m)
@@ -245,17 +261,17 @@ def _start(record: Record, scene: Any | None, settings: CsiSettings, seed: int) 
 
         surfaces = scene_surfaces(scene)
         walls = walls_of(surfaces)
-        for index, place in enumerate(source_m):
-            found = shoot(scene, surfaces, _off_walls(walls, place), settings.rays, depth, depth, seed)
+        for index, antenna_m in enumerate(source_m):
+            found = shoot(scene, surfaces, _off_walls(walls, antenna_m), settings.rays, depth, depth, seed)
             found = found.reshape(len(found), depth)
-            chains[index] = np.concatenate([line_of_sight, found[~_mounted(walls, place, found)]])
-    plane = np.concatenate(chains)
-    source = np.repeat(np.arange(len(source_m)), [len(part) for part in chains])
+            chains[index] = np.concatenate([line_of_sight, found[~_mounted(walls, antenna_m, found)]])
+    source = np.repeat(np.arange(len(source_m)), [len(chain) for chain in chains])
     k = 2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light
     subcarriers = record.observation.shape[2]
     if len(k) not in (1, subcarriers):
         raise InputError(f"{record.name}: {len(k)} frequencies for {subcarriers} subcarriers; give one for each")
-    return _model(walls, plane, source, source_m, np.broadcast_to(k, subcarriers).copy(), settings.reflection)
+    k = np.broadcast_to(k, subcarriers).copy()
+    return _model(walls, np.concatenate(chains), source, source_m, k, settings.reflection)
 
 
 def _model(
@@ -266,19 +282,19 @@ def _model(
     return Model(scan, change, scan, images, source, source_m, k, reflection, np.ones(len(source_m), complex))
 
 
-def _mounted(walls: Walls, place: FloatArray, plane: IntArray) -> NDArray[np.bool_]:
-    """Chains [c, b] that begin at a plane that the antenna is mounted on: it mirrors nothing of it."""
+def _mounted(walls: Walls, antenna_m: FloatArray, plane: IntArray) -> NDArray[np.bool_]:
+    """Chains [c, b] that begin at a plane on which the antenna is mounted: it does not mirror the antenna."""
     if not plane.shape[1] or not len(walls):
         return np.zeros(len(plane), bool)
-    near = np.abs(walls.normal @ place - walls.offset_m) < MOUNTED_M
+    near = np.abs(walls.normal @ antenna_m - walls.offset_m) < MOUNTED_M
     return np.asarray(near[plane[:, 0]] & (plane[:, 0] >= 0))
 
 
-def _off_walls(walls: Walls, place: FloatArray) -> FloatArray:
-    """A place [3], moved into the room where it is nearer than `CLEAR_M` to planes."""
-    middle = np.average(walls.centre_m, axis=0, weights=np.maximum(walls.area_m2, 1e-12)) if len(walls) else place
+def _off_walls(walls: Walls, antenna_m: FloatArray) -> FloatArray:
+    """Position [3], moved into the room to `CLEAR_M` from planes on which the antenna is mounted."""
+    centre = np.average(walls.centre_m, axis=0, weights=np.maximum(walls.area_m2, 1e-12)) if len(walls) else antenna_m
     for n, d in zip(walls.normal, walls.offset_m, strict=True):
-        if abs(n @ place - d) < MOUNTED_M:
-            side = np.sign(n @ middle - d) or 1.0
-            place = place + (side * CLEAR_M - (n @ place - d)) * n
-    return place
+        if abs(n @ antenna_m - d) < MOUNTED_M:
+            side = np.sign(n @ centre - d) or 1.0
+            antenna_m = antenna_m + (side * CLEAR_M - (n @ antenna_m - d)) * n
+    return antenna_m

@@ -1,53 +1,58 @@
-"""The fit of a CSI physics model: paths, planes and visibility in turn."""
+"""Fit of a CSI physics model: paths, planes and visibility in turn.
+
+Which paths exist is inferred from a channel, the sum of their gains, by a sum over hypotheses: gains differ in
+amplitude and phase, so usually only one choice of a few uncertain paths explains the measured channel.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .csi_decode import decode
-from .csi_paths import Seen, seen_from
-from .csi_repair import Explained, Model, refit
+from .csi_paths import CandidatePaths, candidate_paths
+from .csi_repair import Complex, Explained, Model, refit
 from .csi_visibility import Learner, Visibility, prior_odds
 
-Complex = NDArray[np.complex128]
-
+FLIPS = (24, 24, 14, 9)
+"""Hypotheses flip 1, 2, 3 or 4 of so many most uncertain paths of a row against their likelier prior state."""
+NUMBERS_PER_CHUNK = 1 << 21
 SCALES = np.array([1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0])
-"""Standard deviations of the noise's parts, of the median path's amplitude."""
+"""Standard deviations of the noise's components in units of the median path's amplitude."""
 FLOOR = 0.03
-"""Share of the noise that is spread over all parts, so that none dies out."""
+"""Share of the noise that is spread over all components, so that none vanishes."""
 TRUSTED = 0.2
-"""Parts of the noise up to this one mean that the paths explain the row."""
+"""The paths explain a row whose noise is of a component below this scale."""
 WIDEST_RAD = 0.6
-"""A phase less certain than that is as good as unknown; the fit has to begin somewhere."""
+"""Upper limit of phases' standard deviations, from which the fit starts."""
 LIKELY = 0.01
-"""Paths less likely than that do not take part in the repair."""
+"""Least probability of paths that take part in the repair."""
 SHARPNESS = (1.0, 2.0, 4.0, 16.0)
-"""Factors of the log odds: from the mean over what may be there to what is likeliest."""
+"""Candidate factors of the log odds: from the mean over possible paths to the likeliest choice."""
 
 
 @dataclass(frozen=True)
 class CsiSettings:
-    """How a CSI physics model is fitted.
+    """Settings of the fit of a CSI physics model.
 
     Attributes:
         reflections: of a path at most.
-        rays: that search for chains of planes from each receiver.
-        reflection: what a plane reflects of the amplitude before anything is measured; negative turns the phase round.
-        reflection_sd: standard deviation of its logarithm, and of its phase in rad, from plane to plane; 0 holds it.
-        shift_sd_m: standard deviation of a plane's offset from the scan's, metres, and of its edges' by tilting.
+        rays: rays from each receiver that search for chains of planes.
+        reflection: amplitude reflection coefficient of planes a priori; negative: with a phase of pi.
+        reflection_sd: standard deviation of its logarithm and of its phase (rad) from plane to plane; 0 fixes it.
+        shift_sd_m: standard deviation of a plane's offset from the scan's, and of its edges' by tilting, metres.
         outline_sd_m: standard deviation of an outline, metres.
-        ridge: penalty of what is learned about visibility.
-        repair_rounds: of planes and paths in turn.
-        visibility_rounds: of visibility, paths and planes in turn.
-        folds: of the training rows, by which visibility is predicted without a row's own measurement.
-        fit_gain: fit one complex factor for each receiver; False: channels are calibrated.
+        ridge: penalty of the learned weights of visibility.
+        repair_rounds: rounds of planes and paths.
+        visibility_rounds: rounds of visibility, paths and planes.
+        folds: folds of the training rows, which predict each row's visibility without its measurement.
+        fit_gain: fit a complex factor for each receiver; False: channels are calibrated.
     """
 
     reflections: int = 2
@@ -63,11 +68,7 @@ class CsiSettings:
     fit_gain: bool = False
 
     def __post_init__(self) -> None:
-        """Reject what cannot be fitted.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Reject settings out of range (`InputError`)."""
         whole = {"reflections": 0, "rays": 1, "repair_rounds": 0, "visibility_rounds": 0, "folds": 2}
         for name, least in whole.items():
             if getattr(self, name) < least:
@@ -82,51 +83,104 @@ class CsiSettings:
 
 @dataclass(frozen=True)
 class Rows:
-    """Measurements, or places to predict for, of all receivers, one after the other; m in all.
-
-    Attributes:
-        channel: [m, subcarriers]; no subcarriers where nothing was measured.
-        position_m: of the moving end [m, 3].
-        source: number of the receiver [m].
-    """
+    """Channels [m, subcarriers] (none where nothing was measured) from positions [m, 3] to receivers [m]."""
 
     channel: Complex
     position_m: FloatArray
     source: IntArray
 
 
-def seen_by_rows(model: Model, rows: Rows) -> Seen:
-    """Paths of all rows, each to its own receiver; sorted by row."""
+def paths_of_rows(model: Model, rows: Rows) -> CandidatePaths:
+    """Candidate paths of all rows, each to its receiver; sorted by row."""
     parts = []
     for index in range(len(model.source_m)):
-        chains, own = np.flatnonzero(model.source == index), np.flatnonzero(rows.source == index)
-        if not len(own):
-            continue
+        chains, chosen = np.flatnonzero(model.source == index), np.flatnonzero(rows.source == index)
         every = model.images
         images = replace(every, plane=every.plane[chains], image_m=every.image_m[chains], slope=every.slope[chains])
-        seen = seen_from(model.walls, images, rows.position_m[own])
-        parts.append(replace(seen, row=own[seen.row], chain=chains[seen.chain]))
-    if len(parts) == 1:
-        return parts[0]
-    return Seen(*(np.concatenate([getattr(part, name) for part in parts]) for name in Seen.__dataclass_fields__))
+        paths = candidate_paths(model.walls, images, rows.position_m[chosen])
+        parts.append(replace(paths, row=chosen[paths.row], chain=chains[paths.chain]))
+    columns = ([getattr(part, field.name) for part in parts] for field in fields(CandidatePaths))
+    return CandidatePaths(*(np.concatenate(column) for column in columns))
 
 
 def mixed(
-    model: Model, rows: Rows, seen: Seen, odds: FloatArray, sharpness: float, covariance: FloatArray
+    model: Model, rows: Rows, paths: CandidatePaths, odds: FloatArray, sharpness: float, covariance: FloatArray
 ) -> tuple[Complex, FloatArray]:
-    """Mean over paths that may be there, and the mean square of its error [m, subcarriers]."""
-    count, carriers = len(rows.position_m), len(model.k)
-    position = rows.position_m[seen.row]
-    gain = model.path_gain(seen.chain, position)
+    """Mean over paths that may exist, and the mean square of its error [m, subcarriers]."""
+    position = rows.position_m[paths.row]
+    gain = model.path_gain(paths.chain, position)
     p, taken = expit(odds), expit(np.clip(sharpness * odds, -500, 500))
-    mean, bias = np.zeros((2, count, carriers), complex)
-    variance = np.zeros((count, carriers))
-    np.add.at(mean, seen.row, taken[:, None] * gain)
-    np.add.at(bias, seen.row, (p - taken)[:, None] * gain)
-    phase = model.phase_sd(seen.chain, position, covariance)
+    mean, bias = np.zeros((2, len(rows.position_m), len(model.k)), complex)
+    variance = np.zeros(mean.shape)
+    np.add.at(mean, paths.row, taken[:, None] * gain)
+    np.add.at(bias, paths.row, (p - taken)[:, None] * gain)
+    phase = model.phase_sd(paths.chain, position, covariance)
     each = p * (1 - p) + p * np.square(np.minimum(phase, 1))
-    np.add.at(variance, seen.row, each[:, None] * np.square(np.abs(gain)))
+    np.add.at(variance, paths.row, each[:, None] * np.square(np.abs(gain)))
     return mean, variance + np.square(np.abs(bias))
+
+
+@cache
+def _flips() -> FloatArray:
+    """Flips of the most uncertain paths [hypotheses, FLIPS[0]]."""
+    chosen = [()] + [flip for count, among in enumerate(FLIPS, start=1) for flip in combinations(range(among), count)]
+    return np.stack([np.isin(np.arange(FLIPS[0]), flip) for flip in chosen]).astype(float)
+
+
+def decode(
+    channel: Complex,
+    row: IntArray,
+    gain: Complex,
+    log_odds: FloatArray,
+    phase_sd_rad: FloatArray,
+    noise: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, Complex, FloatArray]:
+    """Posterior probabilities of p paths in measured channels [n, subcarriers].
+
+    ``row`` (ascending), ``gain`` [p, subcarriers], prior ``log_odds`` and ``phase_sd_rad`` are those of each path [p];
+    ``noise`` holds weights and standard deviations of a mixture of circular Gaussians.
+
+    Returns:
+        Probability of each path [p]; residual of the likeliest hypothesis [n, subcarriers]; probability of each
+        component of the noise [n, components].
+    """
+    count, carriers = channel.shape
+    flips, (weight, sd) = _flips(), noise
+    probability = 1 / (1 + np.exp(-log_odds))
+    residual, share = channel.astype(complex), np.zeros((count, len(weight)))
+    if not len(row):
+        log = np.log(weight) - carriers * np.log(sd * sd) - np.square(np.abs(residual)).sum(axis=1)[:, None] / (sd * sd)
+        share = np.exp(log - log.max(axis=1, keepdims=True))
+        return probability, residual, share / share.sum(axis=1, keepdims=True)
+    first = np.searchsorted(row, np.arange(count + 1))
+    likely = log_odds > 0
+    blur = np.square(np.abs(gain)).mean(axis=1) * np.square(phase_sd_rad)
+    step = max(1, NUMBERS_PER_CHUNK // (len(flips) * max(carriers, len(sd))))
+    order = np.lexsort((np.abs(log_odds), row))
+    for start in range(0, count, step):
+        rows = np.arange(start, min(start + step, count))
+        entry = first[rows, None] + np.arange(FLIPS[0])
+        known = entry < first[rows + 1, None]
+        path = order[np.where(known, entry, 0)]
+        chunk = slice(first[rows[0]], first[rows[-1] + 1])
+        base, spread = np.zeros((len(rows), carriers), complex), np.zeros(len(rows))
+        np.add.at(base, row[chunk][likely[chunk]] - start, gain[chunk][likely[chunk]])
+        np.add.at(spread, row[chunk][likely[chunk]] - start, blur[chunk][likely[chunk]])
+        sign = known * np.where(likely[path], -1.0, 1.0)
+        change, more = sign[..., None] * gain[path], sign * blur[path]
+        prior = np.where(known, -np.abs(log_odds[path]), -1e9) @ flips.T
+        left = (channel[rows] - base)[:, None] - np.einsum("hm,rmf->rhf", flips, change)
+        error = np.square(np.abs(left)).sum(axis=2)
+        total = np.maximum(spread[:, None] + more @ flips.T, 0)[..., None] + sd * sd
+        joint = prior[..., None] + np.log(weight) - carriers * np.log(total) - error[..., None] / total
+        joint = np.exp(joint - joint.max(axis=(1, 2), keepdims=True))
+        joint /= joint.sum(axis=(1, 2), keepdims=True)
+        hypothesis = joint.sum(axis=2)
+        flipped = hypothesis @ flips
+        probability[path[known]] = np.where(likely[path], 1 - flipped, flipped)[known]
+        residual[rows] = left[np.arange(len(rows)), hypothesis.argmax(axis=1)]
+        share[rows] = joint.sum(axis=1)
+    return probability, residual, share
 
 
 def prior_sd(model: Model, settings: CsiSettings) -> FloatArray:
@@ -139,109 +193,96 @@ def prior_sd(model: Model, settings: CsiSettings) -> FloatArray:
 
 
 class Fit:
-    """A fit in progress.
-
-    Args:
-        model: to begin with.
-        rows: what was measured; one at least.
-        settings: see `CsiSettings`.
-        seed: of folds and cells.
+    """A fit in progress to measured rows, at least one.
 
     Attributes:
-        model: as it is now.
-        visibility: the same.
-        covariance: of all planes' parameters.
-        facts: what there is to say about it, in numbers.
+        model, visibility, covariance: present model, visibility, and covariance of all planes' parameters.
+        facts: figures of the fit by name.
     """
 
     def __init__(self, model: Model, rows: Rows, settings: CsiSettings, seed: int) -> None:
         self.model, self._rows, self._settings, self._seed = model, rows, settings, seed
         self.visibility = Visibility.of_scene(len(model.scan.edge_m), settings.outline_sd_m, seed)
         self.covariance = np.diag(np.square(prior_sd(model, settings)).reshape(-1))
-        self.facts: dict[str, float] = {}
-        self._seen = seen_by_rows(model, rows)
-        self._odds = prior_odds(self._seen, settings.outline_sd_m)
+        self.facts = {"rows": float(len(rows.channel))}
+        self._paths = paths_of_rows(model, rows)
+        self._odds = prior_odds(self._paths, settings.outline_sd_m)
         self._learner: Learner | None = None
         self._precision = np.ones(len(rows.channel))
-        gain = np.abs(model.path_gain(self._seen.chain, rows.position_m[self._seen.row]))
+        gain = np.abs(model.path_gain(self._paths.chain, rows.position_m[self._paths.row]))
         self._noise = np.full(len(SCALES), 1 / len(SCALES)), SCALES * (np.median(gain) if len(gain) else 1.0)
         if settings.fit_gain:
-            self._match(self._explained(expit(self._odds), np.ones(len(rows.channel)), np.ones(len(self._seen), bool)))
+            self._match_gain(self._explained(expit(self._odds)))
             self._noise = self._noise[0], self._noise[1] * np.abs(self.model.gain).mean()
 
     def repair(self) -> None:
-        """Tell which paths are there, and set the planes right."""
-        self._seen, self._learner = seen_by_rows(self.model, self._rows), None
-        self._odds = prior_odds(self._seen, self._settings.outline_sd_m)
+        """Infer which paths exist, and correct the planes."""
+        self._paths, self._learner = paths_of_rows(self.model, self._rows), None
+        self._odds = prior_odds(self._paths, self._settings.outline_sd_m)
         self._solve()
 
     def learn(self) -> None:
-        """Learn what is seen, tell which paths are there, set the planes right."""
-        there, trust = self._decode()
+        """Learn visibility, infer which paths exist, and correct the planes."""
+        probability, trust = self._decode()
         if self._learner is None:
-            self._learner = Learner(
-                self.model.walls,
-                self.model.images,
-                self._seen,
-                outline_sd_m=self._settings.outline_sd_m,
-                ridge=self._settings.ridge,
-                seed=self._seed,
-                folds=self._settings.folds,
-            )
-        self.visibility, self._odds = self._learner.fit(there, trust[self._seen.row])
-        # Planes move by little now: the same paths are kept, so that the odds go with them.
+            model, s = self.model, self._settings
+            how = s.outline_sd_m, s.ridge, self._seed, s.folds
+            self._learner = Learner(model.walls, model.images, self._paths, *how)
+        self.visibility, self._odds = self._learner.fit(probability, trust[self._paths.row])
+        # Planes move by little now: the same paths are kept, so that the odds stay theirs.
         self._solve()
 
     def finish(self) -> tuple[float, Complex]:
-        """The sharpness that predicts rows left out best, and what the paths leave of each row."""
-        rows, truth = self._rows, self._rows.channel
+        """The sharpness that predicts held-out rows best, and each row's residual."""
+        truth = self._rows.channel
         power = np.maximum(np.square(np.abs(truth)).sum(axis=1), 1e-300)
         error = []
         for sharpness in SHARPNESS:
-            mean, _ = mixed(self.model, rows, self._seen, self._odds, sharpness, self.covariance)
+            mean, _ = mixed(self.model, self._rows, self._paths, self._odds, sharpness, self.covariance)
             error.append(float(np.median(np.square(np.abs(mean - truth)).sum(axis=1) / power)))
         best = int(np.argmin(error))
-        there, trust = self._decode()
-        everyone = np.ones(len(self._seen), bool)
-        left = self._explained(there, np.ones(len(truth)), everyone).residual(self.model)
+        probability, trust = self._decode()
         self.facts["explained_rows"] = float(trust.mean())
         self.facts["left_out_cea_db"] = float(-10 * np.log10(max(error[best], 1e-30)))
-        return SHARPNESS[best], left
+        return SHARPNESS[best], self._explained(probability).residual(self.model)
 
-    def _explained(self, there: FloatArray, precision: FloatArray, keep: NDArray[np.bool_]) -> Explained:
-        row = self._seen.row[keep]
+    def _explained(self, probability: FloatArray, least: float = -1.0) -> Explained:
+        """Rows with the paths more probable than ``least``."""
+        kept = probability > least
+        row = self._paths.row[kept]
         position = self._rows.position_m[row]
-        return Explained(self._rows.channel, row, self._seen.chain[keep], position, there[keep], precision)
+        return Explained(self._rows.channel, row, self._paths.chain[kept], position, probability[kept], self._precision)
 
     def _decode(self) -> tuple[FloatArray, FloatArray]:
-        """Probability of each path, and whether each row is explained; the noise's shares follow."""
-        seen, rows = self._seen, self._rows
-        position = rows.position_m[seen.row]
-        phase = np.minimum(self.model.phase_sd(seen.chain, position, self.covariance), WIDEST_RAD)
-        gain = self.model.path_gain(seen.chain, position)
-        there, _, share = decode(rows.channel, seen.row, gain, self._odds, phase, self._noise)
+        """Probability of each path, and that the paths explain each row; updates the noise's weights."""
+        paths, rows = self._paths, self._rows
+        position = rows.position_m[paths.row]
+        phase = np.minimum(self.model.phase_sd(paths.chain, position, self.covariance), WIDEST_RAD)
+        gain = self.model.path_gain(paths.chain, position)
+        probability, _, share = decode(rows.channel, paths.row, gain, self._odds, phase, self._noise)
         self._noise = (1 - FLOOR) * share.mean(axis=0) + FLOOR / len(SCALES), self._noise[1]
-        unsure = np.bincount(seen.row, np.square(np.abs(gain)).mean(axis=1) * there * (1 - there), len(rows.channel))
+        unsure = np.square(np.abs(gain)).mean(axis=1) * probability * (1 - probability)
+        unsure = np.bincount(paths.row, unsure, len(rows.channel))
         self._precision = (share / (self._noise[1] ** 2 + unsure[:, None])).sum(axis=1)
-        return there, share[:, SCALES < TRUSTED].sum(axis=1)
+        return probability, share[:, SCALES < TRUSTED].sum(axis=1)
 
     def _solve(self) -> None:
-        there, _ = self._decode()
-        explained = self._explained(there, self._precision, there > LIKELY)
+        """Correct gains and planes."""
+        explained = self._explained(self._decode()[0], LIKELY)
         if self._settings.fit_gain:
-            self._match(explained)
+            self._match_gain(explained)
         if len(self.model.scan):
             self.model, self.covariance = refit(self.model, explained, prior_sd(self.model, self._settings))
 
-    def _match(self, explained: Explained) -> None:
+    def _match_gain(self, explained: Explained) -> None:
         """Set each receiver's complex factor by least squares."""
-        rows = self._rows
-        predicted = rows.channel - explained.residual(self.model)
+        channel = self._rows.channel
+        predicted = channel - explained.residual(self.model)
         gain = self.model.gain.copy()
         for index in range(len(gain)):
-            own = rows.source == index
-            weight = explained.precision[own, None]
-            power = (weight * np.square(np.abs(predicted[own]))).sum()
+            rows = self._rows.source == index
+            weight = explained.precision[rows, None]
+            power = (weight * np.square(np.abs(predicted[rows]))).sum()
             if power > 0:
-                gain[index] *= (weight * predicted[own].conj() * rows.channel[own]).sum() / power
+                gain[index] *= (weight * predicted[rows].conj() * channel[rows]).sum() / power
         self.model = replace(self.model, gain=gain)

@@ -1,4 +1,4 @@
-"""Planes shifted and tilted until the phases of the paths that they mirror fit what was measured (Gauss-Newton)."""
+"""Planes shifted and tilted until the phases of the paths that they mirror fit the measured channels (Gauss-Newton)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...tracing.walls import Walls
 from .csi_paths import Images, images_of
 
 NUMBERS = 5
-"""Parameters of a plane: shift (m), two tilts (rad), logarithm and phase of what it reflects."""
+"""Parameters of a plane: shift (m), two tilts (rad), logarithm and phase of its reflection coefficient."""
 STEPS = 3
 
 Complex = NDArray[np.complex128]
@@ -21,17 +21,15 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Model:
-    """Image sources with all that is fitted to channels.
+    """Image sources with all parameters that are fitted to channels.
 
     Attributes:
-        scan: the planes as they were given.
-        change: of each plane [q, NUMBERS].
-        walls: the planes with their changes.
-        images: of all antennas, one after the other.
-        source: antenna of each chain [c].
-        source_m: antennas [r, 3].
+        scan, walls: planes as given, and with their changes.
+        change: parameters of each plane [q, NUMBERS].
+        images: images of all antennas, antenna by antenna.
+        source, source_m: antenna of each chain [c], and antennas [r, 3].
         k: wave numbers [subcarriers], rad/m.
-        reflection: coefficient of a plane of no change.
+        reflection: coefficient of an unchanged plane.
         gain: complex factor of each antenna [r].
     """
 
@@ -46,23 +44,19 @@ class Model:
     gain: Complex
 
     def changed(self, change: FloatArray) -> Model:
-        """The same with other changes of the planes."""
+        """The model with other parameters of the planes."""
         walls = self.scan.moved(change[:, :3])
         images = images_of(walls, self.source_m[self.source], self.images.plane)
         return replace(self, change=change, walls=walls, images=images)
 
-    def factor(self) -> Complex:
-        """What each chain's mirrors and instrument do to the amplitude [c]."""
-        plane = self.images.plane
-        used = plane >= 0
-        own = self.reflection * np.exp(self.change[:, 3] + 1j * self.change[:, 4])
-        each = np.where(used, own[np.where(used, plane, 0)], 1) if len(own) else np.ones(plane.shape, complex)
-        return np.asarray(each.prod(axis=1) * self.gain[self.source])
-
     def path_gain(self, chain: IntArray, position_m: FloatArray) -> Complex:
         """Gain of paths [p, subcarriers]: factor * exp(-j k L) / (2 k L), free-space loss of isotropic antennas."""
+        plane = self.images.plane
+        # An entry beyond the last plane stands for "no reflection" (index -1).
+        each = np.append(self.reflection * np.exp(self.change[:, 3] + 1j * self.change[:, 4]), 1)
+        factor = each[plane].prod(axis=1) * self.gain[self.source]
         length = np.linalg.norm(position_m - self.images.image_m[chain, -1], axis=1)[:, None]
-        return self.factor()[chain, None] * np.exp(-1j * self.k * length) / (2 * self.k * length)
+        return np.asarray(factor[chain, None] * np.exp(-1j * self.k * length) / (2 * self.k * length))
 
     def length_slope(self, chain: IntArray, position_m: FloatArray) -> FloatArray:
         """Derivative of lengths [p, b, 3] by shift and tilts of each level's plane."""
@@ -71,7 +65,7 @@ class Model:
         return np.einsum("plkd,pd->plk", self.images.slope[chain], away)
 
     def phase_sd(self, chain: IntArray, position_m: FloatArray, covariance: FloatArray) -> FloatArray:
-        """Standard deviation of the phases [p] for a covariance of all planes' parameters, at the middle subcarrier."""
+        """Standard deviation of phases [p] by the covariance of all planes' parameters, at the middle subcarrier."""
         if not len(covariance):
             return np.zeros(len(chain))
         slope = self.length_slope(chain, position_m) * np.median(self.k)
@@ -89,49 +83,38 @@ class Model:
 
 @dataclass(frozen=True)
 class Explained:
-    """What paths make of channels: which paths, and how likely each is.
-
-    Attributes:
-        channel: measured [n, subcarriers].
-        row: of each path [p].
-        chain: of each [p].
-        position_m: of the moving end [p, 3].
-        there: probability of each [p].
-        precision: of each row's residual [n].
-    """
+    """Channels [n, subcarriers], the paths [p] that explain them, and precisions of the residuals [n]."""
 
     channel: Complex
     row: IntArray
     chain: IntArray
     position_m: FloatArray
-    there: FloatArray
+    probability: FloatArray
     precision: FloatArray
 
+    def expected_gain(self, model: Model) -> Complex:
+        """Gain of each path times its probability [p, subcarriers]."""
+        return np.asarray(self.probability[:, None] * model.path_gain(self.chain, self.position_m))
+
     def residual(self, model: Model) -> Complex:
-        """Measured less the mean of what is predicted [n, subcarriers]."""
-        gain = self.there[:, None] * model.path_gain(self.chain, self.position_m)
-        left = self.channel.astype(complex)
-        np.subtract.at(left, self.row, gain)
-        return left
+        """Measured channels less their expectation [n, subcarriers]."""
+        residual = self.channel.astype(complex)
+        np.subtract.at(residual, self.row, self.expected_gain(model))
+        return residual
 
 
 def refit(model: Model, explained: Explained, prior_sd: FloatArray) -> tuple[Model, FloatArray]:
-    """A few steps of Levenberg and Marquardt for the planes' parameters.
+    """A few steps of Levenberg and Marquardt for the planes' parameters, with fixed paths.
 
-    Args:
-        model: to begin with.
-        explained: the paths, held as they are.
-        prior_sd: standard deviation of each plane's parameters about zero [q, NUMBERS]; 0 holds one.
-
-    Returns:
-        The model, and the covariance of all parameters [NUMBERS q, NUMBERS q].
+    ``prior_sd`` [q, NUMBERS] are standard deviations of each plane's parameters about zero; 0 fixes one. Returns the
+    model, and the covariance of all parameters [NUMBERS q, NUMBERS q].
     """
     sd = np.maximum(prior_sd.reshape(-1), 1e-12)
     damping = 1e-6
 
     def cost(candidate: Model) -> float:
-        left = np.square(np.abs(explained.residual(candidate))).sum(axis=1)
-        return float(explained.precision @ left + np.square(candidate.change.reshape(-1) / sd).sum())
+        square = np.square(np.abs(explained.residual(candidate))).sum(axis=1)
+        return float(explained.precision @ square + np.square(candidate.change.reshape(-1) / sd).sum())
 
     best = cost(model)
     normal = np.zeros((len(sd), len(sd)))
@@ -139,7 +122,7 @@ def refit(model: Model, explained: Explained, prior_sd: FloatArray) -> tuple[Mod
         normal, right = _normal_equations(model, explained)
         right = right - model.change.reshape(-1) / sd**2
         while damping < 1e6:
-            # In units of the prior: parameters of metres, rad and none beside each other.
+            # In units of the prior: the parameters are metres, radians and pure numbers.
             scaled = sd[:, None] * normal * sd + np.eye(len(sd))
             scaled[np.diag_indices(len(sd))] *= 1 + damping
             step = sd * np.linalg.solve(scaled, sd * right)
@@ -157,22 +140,20 @@ def refit(model: Model, explained: Explained, prior_sd: FloatArray) -> tuple[Mod
 
 def _normal_equations(model: Model, explained: Explained) -> tuple[FloatArray, FloatArray]:
     """J^H W J and J^H W r, real parts, for all planes' parameters."""
-    chain = explained.chain
-    slope = model.length_slope(chain, explained.position_m)
-    gain = explained.there[:, None] * model.path_gain(chain, explained.position_m)
-    left = explained.residual(model)
+    slope = model.length_slope(explained.chain, explained.position_m)
+    gain, residual = explained.expected_gain(model), explained.residual(model)
     size = NUMBERS * len(model.scan)
     normal, right = np.zeros((size, size)), np.zeros(size)
     for carrier, k in enumerate(model.k):
-        jacobian = np.zeros((len(left), size), complex)
+        jacobian = np.zeros((len(residual), size), complex)
         for level in range(slope.shape[1]):
-            plane = model.images.plane[chain, level]
+            plane = model.images.plane[explained.chain, level]
             use = plane >= 0
-            own = gain[use, carrier]
-            parts = [*(-1j * k * own * slope[use, level, part] for part in range(3)), own, 1j * own]
-            for part, values in enumerate(parts):
+            wave = gain[use, carrier]
+            columns = [*(-1j * k * wave * slope[use, level, part] for part in range(3)), wave, 1j * wave]
+            for part, values in enumerate(columns):
                 np.add.at(jacobian, (explained.row[use], NUMBERS * plane[use] + part), values)
         weighted = jacobian.conj().T * explained.precision
         normal += (weighted @ jacobian).real
-        right += (weighted @ left[:, carrier]).real
+        right += (weighted @ residual[:, carrier]).real
     return normal, right

@@ -1,9 +1,10 @@
-"""The model ``physics``: planes, materials and kriging, of the data's task, with or without a scene."""
+"""The model ``physics``: planes, materials and kriging, by the task of the data and with or without a scene."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,78 +17,81 @@ from ...tracing.polarization import check_polarization
 from ...tracing.solve import Prepared
 from ..method import Inputs
 from ..model import Arrays, Fitted, Model, Problem, Session
-from .selection import KINDS, PhysicsModel, check_antennas
+from .selection import MODULES, PhysicsModel, check_antennas, kind_of_task
 
 logger = logging.getLogger(__name__)
 
-NAME = "physics"
+SETTINGS = {
+    "spectra with --scene": ("spectrum", True),
+    "spectra without": ("spectrum", False),
+    "signal strengths": ("rssi", True),
+    "channel coefficients": ("csi", True),
+}
+"""Headings of the settings in the help, with task and whether there is a scene."""
 
 
 class FittedPhysics(Fitted):
-    """A fitted physics.
+    """A fitted physics model as the registry's interface.
 
-    Attributes:
-        own: the model, see `wrf_mi.models.physics.selection.PhysicsModel`.
+    Args:
+        model: fitted physics model.
     """
 
-    def __init__(self, own: PhysicsModel) -> None:
-        self.own, self.receivers, self.uses_heading = own, own.receivers, own.uses_heading
+    def __init__(self, model: PhysicsModel) -> None:
+        self.model, self.receivers, self.uses_heading = model, model.receivers, model.uses_heading
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """See `Fitted`; with standard deviations."""
-        return self.own.predict(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
+        """Prediction with standard deviations, see `Fitted`."""
+        return self.model.predict(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
 
     def arrays(self) -> Arrays:
-        """See `Fitted`."""
-        return self.own.arrays()
+        """Arrays of the fitted model, see `Fitted`."""
+        return self.model.arrays()
 
     def facts(self) -> dict[str, Any]:
-        """What was fitted, in plain numbers."""
-        return {"fitted": self.own.summary()}
+        """Fitted parameters and choices."""
+        return {"fitted": self.model.summary()}
 
 
 def _check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse antennas in solids; warn of those near surfaces, of crossed polarisations and of antennas left out."""
+    """Refuse antennas in solids; warn of antennas near surfaces, crossed polarisations and ignored antennas."""
     record, scene = problem.record, problem.opened_scene
     check_antennas(record)
     if scene is None:
         return
-    places = np.asarray(record.tx_pos_m, float)
-    Prepared(scene).check(places, record.receivers)
-    if KINDS[record.task](True).uses_antennas:
-        check_polarization(scene, places, record.receivers, record.tx_antenna)
-    elif any(one != ANTENNA for one in (record.tx_antenna, *(receiver.antenna for receiver in record.receivers))):
+    positions = np.asarray(record.tx_pos_m, float)
+    Prepared(scene).check(positions, record.receivers)
+    if kind_of_task(record.task, True).uses_antennas:
+        check_polarization(scene, positions, record.receivers, record.tx_antenna)
+    elif any(antenna != ANTENNA for antenna in (record.tx_antenna, *(one.antenna for one in record.receivers))):
         logger.warning("%s: the physics model for channels takes all antennas to be isotropic", record.name)
 
 
 @cache
-def _of(task: str, with_scene: bool) -> Model:
-    kind = KINDS[task](with_scene)
+def _model(task: str, with_scene: bool) -> Model:
+    kind = kind_of_task(task, with_scene)
 
     def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-        rows, scene = problem.rows(split), problem.opened_scene
-        own = kind.fit(problem.record, rows, scene, problem.settings, problem.seed, session.report)
-        return FittedPhysics(own)
+        given = problem.record, problem.rows(split), problem.opened_scene
+        return FittedPhysics(kind.fit(*given, problem.settings, problem.seed, session.report))
 
     def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        return FittedPhysics(kind.load(arrays, problem.opened_scene))
+        return FittedPhysics(kind.load(arrays))
 
-    ends = fit, load, "docs/joint.md"
-    kept: dict[str, Any] = {"scene": "optional", "uses_antennas": kind.uses_antennas, "scene_alone": True}
-    return Model(NAME, tuple(KINDS), kind.settings, *ends, **kept, headings=True, check=_check)
-
-
-def _entry() -> Model:
-    from dataclasses import replace
-
-    words = {
-        "spectra with --scene": ("spectrum", True),
-        "spectra without": ("spectrum", False),
-        "signal strengths": ("rssi", True),
-        "channel coefficients": ("csi", True),
-    }
-    settings: Any = {name: _of(*data).settings for name, data in words.items()}
-    return replace(_of("rssi", True), settings=settings, by_data=_of)
+    return Model(
+        "physics",
+        tuple(MODULES),
+        kind.settings,
+        fit,
+        load,
+        "docs/joint.md",
+        scene="optional",
+        uses_antennas=kind.uses_antennas,
+        scene_alone=True,
+        headings=True,
+        check=_check,
+    )
 
 
-MODEL = _entry()
+_settings = {name: kind_of_task(*data).settings for name, data in SETTINGS.items()}
+MODEL = replace(_model("rssi", True), settings=_settings, by_data=_model)

@@ -1,317 +1,283 @@
-"""Fit of an RSSI physics model: which folds judge, what they choose, how far predictions are off."""
+"""Fit of an RSSI physics model: Gaussian processes, folds, choice of hyperparameters, calibration of predictions.
+
+The processes of the receivers share part of their mean:
+
+    y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
+
+beta is common to all receivers and learned from all of them; the fields f_r are independent, so that the exact
+posterior needs one Cholesky factor for each receiver (`wrf_mi.models.interpolation.kriging_equations`). The noise's
+heavy tails are reached by reweighting: a row with a large residual has a larger variance.
+
+Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with
+explicit basis functions); Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989),
+JASA 84 (the weights).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .gaussian_process import Part, PooledProcess, fit_pooled
+from ...tasks.scores import REAL_90
+from ..interpolation.kriging_equations import KrigingSystem
 from .rssi_map import PowerMap
-from .rssi_terms import NEAREST_M, Covariance, Places, Priors, Stops, basis, stops_of
+from .rssi_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
 
+Kernel = Callable[[Any, Any], FloatArray]
+"""Covariance [n, m] of the field between two sets of inputs."""
+
+JITTER = 1e-9
+"""Noise added to coincident inputs, as a share of the field's variance."""
+DEGREES = 4.0
+"""Degrees of freedom of the noise's Student-t distribution: fades are deep."""
 FREE_SPACE = 2.0
 """Exponent of the distance in free space."""
-DEGREES = 4.0
-"""Of freedom of the noise's Student-t distribution: fades are deep."""
 FOLDS = 7
 STRETCH = (4, 150)
-"""Rows of a held-out stretch: a fourteenth of all within these bounds, so that each fold holds two at least."""
+"""Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 BUFFER = 0.25
-"""Share of a stretch that is left out on either side of it, because rows in sequence share what a second visit does not
-find again."""
-SEARCH_STEP = 1.5
-"""Factor by which the search changes one number."""
+"""Share of a stretch that is left out on either side of it, as consecutive rows share noise."""
 LEAST_GAIN_DB = 0.005
-"""The search keeps what it has unless the held-out error falls by so much: less is chance, even over many rows."""
-LEVER_STEP_M = 0.1
-NOISE = "noise"
+"""Least reduction of the held-out error by which the search changes a parameter."""
 MOST_STEPS = 5
-"""Of one number in one direction."""
+"""Steps of one parameter in one direction."""
 TRUST = 500.0
-"""So many held-out values count as much as the prior in what is read off their distribution."""
+"""Number of held-out values that weigh as much as the prior in estimates from their distribution."""
 SKEW_TRUST = 2000.0
-"""The same for the middle of their narrowest half, which is much less certain than a mean."""
+"""The same number for the middle of their narrowest half, which is less certain than a mean."""
 RATIO = (0.5, 2.0)
-"""A receiver's noise differs from the others' by a factor in between."""
+"""Bounds of the ratio of a receiver's noise to that of all."""
 COVERED = 0.9
-NORMAL_90 = 1.6449
-"""Half the width of the normal distribution's 90 % interval, in standard deviations."""
+"""Share of residuals that calibrated intervals cover."""
 
 
 @dataclass(frozen=True)
-class Hyperparameters:
-    """The numbers that a fit may choose.
+class Part:
+    """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
 
-    Attributes:
-        shadow_db, shadow_m, body_db, body_m, concentration: see `wrf_mi.models.physics.rssi_terms.Covariance`.
-        drift_db: standard deviation of what is alike in all rows of a stop but not in a second visit.
-        noise_db: of what is each row's own.
-        lever_m: see `wrf_mi.models.physics.rssi_terms.Places.moved`.
+    inputs: Any
+    basis: FloatArray
+    value: FloatArray
+    variance: FloatArray
+
+
+class PooledProcess:
+    """The posterior of all receivers.
+
+    ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
+    beta, above zero; ``point_variance`` is k(x, x); ``beta`` [k] the posterior mean of the shared coefficients.
+
+    Raises:
+        numpy.linalg.LinAlgError: a covariance that is not positive definite.
     """
 
-    shadow_db: float
-    shadow_m: float
-    body_db: float
-    body_m: float
-    concentration: float
-    drift_db: float
-    noise_db: float
-    lever_m: float
+    def __init__(self, parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float) -> None:
+        self._parts, self._kernel, self._point_variance = parts, kernel, point_variance
+        jitter = JITTER * point_variance
+        self._systems = [KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis) for p in parts]
+        pairs = list(zip(self._systems, parts, strict=True))
+        self._information = np.diag(1 / np.square(prior_sd)) + sum(system.information for system in self._systems)
+        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
+        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
 
-    def changed(self, name: str, sign: int) -> Hyperparameters:
-        """One number a step up or down; `NOISE` stands for both parts of the noise."""
-        if name == "lever_m":
-            return replace(self, lever_m=self.lever_m + sign * LEVER_STEP_M)
-        names = ("drift_db", "noise_db") if name == NOISE else (name,)
-        return replace(self, **{one: getattr(self, one) * SEARCH_STEP**sign for one in names})
+    def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
+        cross = self._kernel(inputs, self._parts[receiver].inputs)
+        mean = basis @ self.beta + cross @ self._weights[receiver]
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
 
-    @property
-    def covariance(self) -> Covariance:
-        """Of the field."""
-        return Covariance(self.shadow_db, self.shadow_m, self.body_db, self.body_m, self.concentration)
+    def reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
+        """Parts with the noise variances that their residuals imply for Student-t noise.
+
+        The expected squared residual, posterior variance of the field included, is compared with the squared scale
+        ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
+        """
+        parts = []
+        for part, system, weights, scale in zip(self._parts, self._systems, self._weights, variance, strict=True):
+            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
+            residual = part.variance * weights
+            square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
+            parts.append(replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1)))
+        return parts
+
+
+def fit_pooled(
+    parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float, rounds: int = 0
+) -> PooledProcess:
+    """`PooledProcess` of the same arguments after ``rounds`` of reweighting for Student-t noise."""
+    process = PooledProcess(parts, kernel, prior_sd, point_variance)
+    scale = [part.variance for part in parts]
+    for _ in range(rounds):
+        process = PooledProcess(process.reweighted(scale), kernel, prior_sd, point_variance)
+    return process
 
 
 @dataclass(frozen=True)
-class Base:
-    """What is expected before anything is measured.
+class PriorMean:
+    """Expected signal strength before anything is measured: traced power, or free space where ``traced`` is None.
 
-    Attributes:
-        receivers_m: [n_rx, 3].
-        transmit_dbm: power sent, gains of both antennas included.
-        frequency_hz: of the carrier.
-        traced: map of the traced power, or None: free space.
+    ``transmit_dbm`` includes the gains of both antennas; ``sd`` and ``rx_sd_db`` are those of `basis`.
     """
 
     receivers_m: FloatArray
     transmit_dbm: float
     frequency_hz: float
     traced: PowerMap | None
+    sd: FloatArray
+    rx_sd_db: float
 
-    def columns(self, places: Places, receiver: int, priors: Priors) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Expected dBm [n], columns [n, k] of the mean's corrections, and their prior standard deviations [k]."""
+    def columns(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Expected dBm [n], columns [n, k] of its corrections, and their prior standard deviations [k]."""
         if self.traced is not None:
-            power = self.traced(places.position_m, receiver)
+            power = self.traced(poses.position_m, receiver)
             level = power - float(np.median(self.traced.power_dbm))
         else:
-            distance = np.linalg.norm(self.receivers_m[receiver] - places.position_m, axis=1)
+            distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
             at_1m = 20 * np.log10(speed_of_light / self.frequency_hz / (4 * np.pi))
             power, level = at_1m - 10 * FREE_SPACE * np.log10(np.maximum(distance, NEAREST_M)), None
-        columns, sd = basis(places, receiver, self.receivers_m, level, priors)
-        return self.transmit_dbm + power, columns, sd
+        return self.transmit_dbm + power, *basis(poses, receiver, self.receivers_m, level, self.sd, self.rx_sd_db)
 
 
 class Field:
-    """What some stops tell, with given numbers."""
+    """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
-    def __init__(
-        self,
-        base: Base,
-        priors: Priors,
-        hyperparameters: Hyperparameters,
-        ratio: FloatArray,
-        stops: Stops,
-        rounds: int = 0,
-    ) -> None:
-        """Fit.
-
-        Args:
-            base: what is expected before.
-            priors: of the mean's coefficients.
-            hyperparameters: all else.
-            ratio: of each receiver's noise to that of all, [n_rx].
-            stops: what was measured; may be none.
-            rounds: of reweighting for Student-t noise.
-        """
-        self.base, self.priors, self.hyperparameters, self.ratio, self.rounds = (
-            base,
-            priors,
-            hyperparameters,
-            ratio,
-            rounds,
-        )
-        self.headings = stops.places.heading_rad is not None
-        parts = []
-        for receiver in range(len(base.receivers_m)):
-            heard = np.isfinite(stops.value_dbm[receiver])
-            places = stops.places.take(heard).moved(hyperparameters.lever_m)
-            expected, columns, sd = base.columns(places, receiver, priors)
-            variance = (
-                hyperparameters.drift_db**2 + hyperparameters.noise_db**2 / stops.count[receiver, heard]
-            ) * ratio[receiver] ** 2
-            parts.append(Part(places, columns, stops.value_dbm[receiver, heard] - expected, variance))
-        covariance = hyperparameters.covariance
-        self._process: PooledProcess = fit_pooled(
-            parts, covariance, sd, covariance.point(self.headings), DEGREES, rounds
-        )
-
-    def predict(self, places: Places, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Mean in dBm, and variance of a single report about it before calibration, [m] each."""
-        moved = places.moved(self.hyperparameters.lever_m)
-        expected, columns, _ = self.base.columns(moved, receiver, self.priors)
-        mean, variance = self._process.predict(receiver, moved, columns)
-        noise = (self.hyperparameters.drift_db**2 + self.hyperparameters.noise_db**2) * self.ratio[receiver] ** 2
-        return expected + mean, variance + noise
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Training rows; n of them.
-
-    Attributes:
-        places: of the rows.
-        value_dbm: [n_rx, n], NaN where nothing was received.
-        rows: numbers in the record, ascending.
-        precision: relative to a single report [n_rx, n], see `wrf_mi.core.Record.precision`; None: 1.
+    ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
     """
 
-    places: Places
-    value_dbm: FloatArray
-    rows: IntArray
-    precision: FloatArray | None = None
+    def __init__(
+        self, prior: PriorMean, hyperparameters: Hyperparameters, ratio: FloatArray, stops: Stops, rounds: int = 0
+    ) -> None:
+        self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
+        self.rounds, self.headings = rounds, stops.poses.heading_rad is not None
+        h, parts = hyperparameters, []
+        for receiver in range(len(prior.receivers_m)):
+            received = np.isfinite(stops.value_dbm[receiver])
+            poses = stops.poses.take(received).moved(h.lever_m)
+            expected, columns, sd = prior.columns(poses, receiver)
+            variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
+            parts.append(Part(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
+        self._process = fit_pooled(parts, h.covariance, sd, h.variance(self.headings), rounds)
 
-    def take(self, which: IntArray) -> Measured:
-        """Some of them."""
-        precision = None if self.precision is None else self.precision[:, which]
-        return Measured(self.places.take(which), self.value_dbm[:, which], self.rows[which], precision)
-
-    def folds(self) -> Iterator[tuple[IntArray, IntArray]]:
-        """Rows that train and rows that are held out, as numbers into these.
-
-        Held out are stretches of the record's order. Where that is the order of time, as in all that moves along a
-        path, a stretch is predicted as another run would be: from other visits, not from the row before.
-        """
-        count = len(self.rows)
-        stretch = int(np.clip(count // (2 * FOLDS), *STRETCH))
-        buffer = int(stretch * BUFFER)
-        number = np.arange(count) // stretch
-        for fold in range(min(FOLDS, int(number[-1]) + 1)):
-            out = number % FOLDS == fold
-            near = out.copy()
-            for step in range(1, buffer + 1):
-                near[step:] |= out[:-step]
-                near[:-step] |= out[step:]
-            if not near.all():
-                yield np.flatnonzero(~near), np.flatnonzero(out)
+    def predict(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray]:
+        """Mean in dBm, and variance of a single report about it before calibration, [m] each."""
+        h = self.hyperparameters
+        moved = poses.moved(h.lever_m)
+        expected, columns, _ = self.prior.columns(moved, receiver)
+        mean, variance = self._process.predict(receiver, moved, columns)
+        return expected + mean, variance + (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Predictions of rows that did not train: mean in dBm and standard deviation in dB, [n_rx, n]; NaN where none."""
+def folds(count: int) -> Iterator[tuple[IntArray, IntArray]]:
+    """Training rows and held-out rows of each fold, as indices below ``count``.
 
-    mean_dbm: FloatArray
-    std_db: FloatArray
-
-
-Stopper = Callable[[Measured], Stops]
-
-
-def stopper(reach_m: float, turn_rad: float, most: int) -> Stopper:
-    """Joins rows into stops; see `wrf_mi.models.physics.rssi_terms.stops_of`."""
-    return lambda own: stops_of(own.places, own.value_dbm, own.rows, reach_m, turn_rad, most, precision=own.precision)
+    Stretches of the record's order are held out. Where that is the order of time, as along a path, a stretch is
+    predicted like another run: from other visits, not from the preceding row.
+    """
+    stretch = int(np.clip(count // (2 * FOLDS), *STRETCH))
+    number = np.arange(count) // stretch
+    for fold in range(min(FOLDS, int(number[-1]) + 1)):
+        out = number % FOLDS == fold
+        near = out.copy()
+        for step in range(1, int(stretch * BUFFER) + 1):
+            near[step:] |= out[:-step]
+            near[:-step] |= out[step:]
+        if not near.all():
+            yield np.flatnonzero(~near), np.flatnonzero(out)
 
 
 class Fit:
-    """Chooses on held-out stretches of the training rows."""
+    """Choices by held-out stretches of the training rows; ``join`` makes stops of rows."""
 
-    def __init__(self, base: Base, priors: Priors, measured: Measured, stopper: Stopper) -> None:
-        self.base, self.priors, self.measured, self.stopper = base, priors, measured, stopper
-        self.ratio = np.ones(len(base.receivers_m))
-        self._folds = [(stopper(measured.take(train)), held_out) for train, held_out in measured.folds()]
+    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
+        self._prior, self._measured = prior, measured
+        self.ratio = np.ones(len(prior.receivers_m))
+        self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
 
-    def held_out(self, hyperparameters: Hyperparameters, rounds: int = 0) -> HeldOut:
-        """Each row's prediction by the fold that did not have it."""
-        mean = np.full(self.measured.value_dbm.shape, np.nan)
+    def held_out(self, hyperparameters: Hyperparameters, rounds: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none."""
+        mean = np.full(self._measured.value_dbm.shape, np.nan)
         std = mean.copy()
         for stops, out in self._folds:
-            field = Field(self.base, self.priors, hyperparameters, self.ratio, stops, rounds)
+            field = Field(self._prior, hyperparameters, self.ratio, stops, rounds)
             for receiver in range(len(mean)):
-                heard = out[np.isfinite(self.measured.value_dbm[receiver, out])]
-                if len(heard):
-                    value, variance = field.predict(self.measured.places.take(heard), receiver)
-                    mean[receiver, heard], std[receiver, heard] = value, np.sqrt(variance)
-        return HeldOut(mean, std)
+                received = out[np.isfinite(self._measured.value_dbm[receiver, out])]
+                if len(received):
+                    value, variance = field.predict(self._measured.poses.take(received), receiver)
+                    mean[receiver, received], std[receiver, received] = value, np.sqrt(variance)
+        return mean, std
 
-    def error_db(self, hyperparameters: Hyperparameters) -> float:
-        """Mean absolute error on held-out rows; steadier than the median, which is what is scored."""
-        return float(np.nanmean(np.abs(self.held_out(hyperparameters).mean_dbm - self.measured.value_dbm)))
+    def _residual(self, hyperparameters: Hyperparameters) -> FloatArray:
+        return self.held_out(hyperparameters)[0] - self._measured.value_dbm
 
     def set_ratio(self, hyperparameters: Hyperparameters) -> None:
-        """Each receiver's noise, from the spread of its held-out residuals."""
-        residual = self.held_out(hyperparameters).mean_dbm - self.measured.value_dbm
-        known = np.isfinite(residual).sum(axis=1)
-        spread = np.array(
-            [np.median(np.abs(own[np.isfinite(own)])) if np.isfinite(own).any() else 1 for own in residual]
-        )
-        own = np.clip(spread / np.median(spread), *RATIO)
-        weight = known / (known + TRUST)
-        self.ratio = own**weight
+        """Set ``ratio`` by the spread of each receiver's held-out residuals."""
+        received = [row[np.isfinite(row)] for row in np.abs(self._residual(hyperparameters))]
+        spread = np.array([np.median(row) if len(row) else 1 for row in received])
+        count = np.array([len(row) for row in received])
+        self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
 
     def search(
         self, hyperparameters: Hyperparameters, rounds: int, on_progress: Callable[[float], None]
     ) -> Hyperparameters:
-        """Change one number at a time while that lowers the held-out error by `LEAST_GAIN_DB` at least.
+        """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
 
-        Args:
-            hyperparameters: to begin with.
-            rounds: through all numbers.
-            on_progress: hears the share that is done.
+        ``rounds`` pass through all parameters; ``on_progress`` takes the fraction done.
         """
+
+        def error_db(candidate: Hyperparameters) -> float:
+            return float(np.nanmean(np.abs(self._residual(candidate))))
+
         names = ["shadow_db", "shadow_m", NOISE]
-        if self.measured.places.heading_rad is not None:
+        if self._measured.poses.heading_rad is not None:
             names += ["body_db", "body_m", "lever_m"]
-        best, done = self.error_db(hyperparameters), 0
-        for _ in range(rounds):
-            for name in names:
-                for sign in (1, -1):
-                    for _ in range(MOST_STEPS):
-                        candidate = hyperparameters.changed(name, sign)
-                        error = self.error_db(candidate)
-                        if error > best - LEAST_GAIN_DB:
-                            break
-                        best, hyperparameters = error, candidate
-                done += 1
-                on_progress(done / (rounds * len(names)))
+        best = error_db(hyperparameters)
+        for done, name in enumerate(names * rounds, start=1):
+            for sign in (1, -1):
+                for _ in range(MOST_STEPS):
+                    candidate = hyperparameters.changed(name, sign)
+                    error = error_db(candidate)
+                    if error > best - LEAST_GAIN_DB:
+                        break
+                    best, hyperparameters = error, candidate
+            on_progress(done / (rounds * len(names)))
         return hyperparameters
 
 
 def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:
-    """What to add to predictions so that half of the residuals (measured minus predicted) lie as near as can be.
+    """Shift of predictions that minimises the median absolute residual (measured minus predicted), dB.
 
-    Fades reach deeper than peaks, so the narrowest half lies above the mean (the shorth). With few
-    residuals, which tell little of that, the prior stands.
-
-    Source: Andrews et al., "Robust Estimates of Location" (1972) (the shorth).
+    Fades reach deeper than peaks, so the narrowest half of the residuals lies above their mean (the shorth, Andrews et
+    al., "Robust Estimates of Location" (1972)). With few residuals the prior dominates.
     """
     values = np.sort(residual_db[np.isfinite(residual_db)])
     half = len(values) // 2
     if half < 2:
         return prior_db
-    # The middle of the narrowest half jumps about; the mean over halves of nearly that width does not.
-    width = values[half:] - values[: len(values) - half]
-    near = width <= width.min() * 1.01
-    middle = (values[half:] + values[: len(values) - half])[near] / 2
+    # The middle of the narrowest half is erratic; the mean over halves of nearly that width is not.
+    low, high = values[: len(values) - half], values[half:]
+    near = high - low <= (high - low).min() * 1.01
+    middle = (high + low)[near] / 2
     weight = len(values) / (len(values) + SKEW_TRUST)
     return float(weight * middle.mean() + (1 - weight) * prior_db)
 
 
 def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
-    """Factor of each receiver's standard deviations by which 90 % of its held-out residuals lie in the interval.
+    """Factors [n_rx] of standard deviations with which 90 % of the held-out residuals lie in the 90 % interval.
 
-    A receiver with few of them takes that of all; few of all take one.
+    The factor of a receiver with few residuals tends to that of all, and that of few residuals in all to 1.
     """
-    score = np.abs(residual_db) / std_db / NORMAL_90
+    score = np.abs(residual_db) / std_db / REAL_90
     known = np.isfinite(score)
-    if not known.any():
-        return np.ones(len(score))
 
     def quantile(values: FloatArray, prior: float) -> float:
         weight = len(values) / (len(values) + TRUST / 5)
         return float(np.quantile(values, COVERED) ** weight * prior ** (1 - weight)) if len(values) else prior
 
     pooled = quantile(score[known], 1.0)
-    return np.array([quantile(own[which], pooled) for own, which in zip(score, known, strict=True)])
+    return np.array([quantile(row[which], pooled) for row, which in zip(score, known, strict=True)])

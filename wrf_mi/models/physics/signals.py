@@ -1,53 +1,147 @@
-"""Element signals as a Gaussian process over transmitter positions, from spectra that tell no common phase.
+"""Element signals as a Gaussian process over transmitter positions, from spectra without a common phase.
 
-A spectrum tells its element signals up to a common phase and scale, and for an array that is its own mirror image up to
-the exchange with the mirrored conjugate (`wrf_mi.receivers.retrieve`). Rows are turned so that neighbours agree; then,
-in turn,
+A spectrum determines its element signals up to a common phase and scale, and for an array that is its own mirror image
+up to the exchange with the mirrored conjugate (`wrf_mi.receivers.retrieve`). Rows are aligned with their neighbours;
+then, in turn, the principal components of the signals are taken as independent complex Gaussian processes, whose
+covariances are fitted, and each row is aligned (phase, and exchange) with its prediction from all others. Of the two
+exchanges of all rows at once that of greater likelihood is kept: waves leave towards the receiver, not away from it.
 
-1. the principal components of the signals are taken as independent complex Gaussian processes, and the shares of the
-   dictionary of `wrf_mi.models.physics.signal_kernels` are fitted to each, and
-2. each row is turned (or exchanged) to what all others predict for it.
+A wave that leaves the transmitter towards unit vector q turns its phase by k q . (x - x') between two positions;
+relative to the line of sight, which leaves towards q0, by k (q - q0) . (x - x'). Near scatterers and obstacles limit
+its coherence to some length. So the covariance of a signal without the phase of the line of sight is a sum, with
+shares >= 0, of
 
-Of the two exchanges of all rows at once that with the greater likelihood is kept: waves leave towards the receiver,
-not away from it, and that tells them apart.
+    exp(-|x - x'| / length) exp(j k (q - q0) . (x - x'))
+
+over lengths and over directions q around q0, and of noise.
+
+Source: the double-directional channel, Molisch, "Wireless Communications" (2011), section 6.7; shares by the
+minorise-maximise steps of Zhou, Hu, Zhou and Lange, "MM algorithms for variance components models" (2019).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
-from ...core.angles import FloatArray
+from ...core.angles import FloatArray, fibonacci_sphere
+from ...core.types import IntArray
 from ...receivers.beams import mirror_order
 from ...receivers.retrieve import align_signals
 from ..interpolation.kriging_equations import KrigingSystem, left_out
-from .signal_kernels import ComplexArray, Covariances, Shares, fit_shares
+from .anisotropic_kriging import chosen_rows
 
+ComplexArray = NDArray[np.complex128]
+LEAST_NOISE = 3e-3
+"""Least noise as a share of a signal's power, below the resolution of 8-bit spectra."""
+NEGLIGIBLE = 1e-4
+"""Shares below this part of the greatest are dropped during the iteration."""
+TINY = 1e-100
+"""Least denominator."""
 RICH = 8
-"""Principal components that get the whole dictionary; the others, some per cent of the power, no turns."""
+"""Principal components with the whole dictionary; the others, some per cent of the power, have no turns."""
 ROUNDS = 3
 STEPS = 25
 SWEEPS = 3
-"""Of alignment in each round: rows stop changing after two."""
+"""Sweeps of alignment in each round: rows stop changing after two."""
 LEAST_POWER = 1e-6
-"""Of a component, where a row's is 1: with fewer rows than elements some have nothing but numerical rounding."""
+"""Least power of a component, a row's being 1: with fewer rows than elements some are only rounding."""
 MOST_ROWS = 320
-"""Shares are fitted to at most so many rows, a dictionary of 200 on which takes 300 MB."""
+"""Rows of the fit of shares at most; a dictionary of 200 covariances of them takes 300 MB."""
+STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Dictionary of covariances: each length of coherence [s] (metres) with each turn [t, 3].
+
+    Turns are phase gradients k (q - q0), rad/m; the first is zero.
+    """
+
+    lengths_m: FloatArray
+    turns: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of covariances."""
+        return len(self.lengths_m) * len(self.turns)
+
+    def __call__(self, tx_pos_m: FloatArray) -> ComplexArray:
+        """All covariances between positions [n, 3] (metres), shape [count, n, n], length slowest."""
+        n = len(tx_pos_m)
+        decay = np.exp(-cdist(tx_pos_m, tx_pos_m) / self.lengths_m[:, None, None])
+        phase = np.exp(1j * (self.turns @ tx_pos_m.T))
+        product: ComplexArray = decay[:, None] * (phase[:, :, None] * phase[:, None, :].conj())
+        return product.reshape(self.count, n, n)
+
+    def mixed(self, a_m: FloatArray, b_m: FloatArray, weight: FloatArray) -> ComplexArray:
+        """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m].
+
+        A sum over turns is a product of two thin matrices, which takes less memory than the dictionary.
+        """
+        distance = cdist(a_m, b_m)
+        here, there = np.exp(1j * (a_m @ self.turns.T)), np.exp(-1j * (b_m @ self.turns.T))
+        total = np.zeros((len(weight), *distance.shape), complex)
+        for length, shares in enumerate(weight.reshape(len(weight), len(self.lengths_m), -1).swapaxes(0, 1)):
+            decay = np.exp(-distance / self.lengths_m[length])
+            for matrix, share in zip(total, shares, strict=True):
+                used = np.flatnonzero(share)
+                if len(used):
+                    matrix += decay * ((here[:, used] * share[used]) @ there[:, used].T)
+        return total
+
+
+def departures(towards: FloatArray, wavenumber: float, cone_deg: float, count: int) -> FloatArray:
+    """Turns [t, 3], rad/m, of waves that leave within a cone around the line of sight; the first is zero.
+
+    ``towards`` [3] is the unit vector to the receiver; the cone's directions are those of ``count`` on the sphere.
+    """
+    directions = fibonacci_sphere(count)
+    inside = directions[directions @ towards > np.cos(np.radians(cone_deg))]
+    return np.concatenate([np.zeros((1, 3)), wavenumber * (inside - towards)])
+
+
+def fit_shares(
+    signal: ComplexArray, covariances: ComplexArray, steps: int, least_power: float = 0.0
+) -> tuple[FloatArray, float, float]:
+    """Shares of greatest likelihood of a complex Gaussian signal [n] with covariances [c, n, n].
+
+    Each of the ``steps`` raises the likelihood; a signal below ``least_power`` is taken to have that power.
+
+    Returns:
+        Share of each covariance [c], >= 0; variance of the noise; twice the negative logarithm of the likelihood
+        without its constant.
+    """
+    count, n = len(covariances), len(signal)
+    flat = covariances.reshape(count, -1)
+    power = max(float(np.mean(np.abs(signal) ** 2)), least_power, TINY)
+    weight, noise = np.full(count, power / count), 0.1 * power
+    for step in range(steps + 1):
+        system = KrigingSystem((weight @ flat).reshape(n, n), noise)
+        solved = system.solve(signal)
+        if step == steps:
+            break
+        inverse = system.precision
+        explained = (flat @ np.outer(solved.conj(), solved).ravel()).real
+        expected = (flat @ inverse.T.ravel()).real
+        weight = weight * np.sqrt(np.maximum(explained, 0) / np.maximum(expected, TINY))
+        weight[weight < NEGLIGIBLE * weight.max()] = 0
+        noise *= np.sqrt(float((np.abs(solved) ** 2).sum()) / float(np.trace(inverse).real))
+        noise = max(noise, LEAST_NOISE * power)
+    cost = float((signal.conj() @ solved).real) + system.log_determinant
+    return weight, noise, cost
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Element signals at q positions: independent complex Gaussian components.
+    """Element signals at q positions: independent complex Gaussian components, the columns of ``basis`` [m, m].
 
-    Attributes:
-        mean: [q, m] in the elements.
-        variance: of each component, [q, m].
-        basis: columns are the components, [m, m].
-        prior: variance of each component far from all measurements, [m].
+    ``mean`` [q, m] is in elements, ``variance`` [q, m] and, far from all measurements, ``prior`` [m] in components.
     """
 
     mean: ComplexArray
@@ -57,45 +151,41 @@ class Posterior:
 
     @property
     def ignorance(self) -> FloatArray:
-        """Variance left as a share of that without measurements, [q]: 0 known, 1 unknown."""
+        """Posterior variance as a share of the prior variance, [q]: 0 known, 1 unknown."""
         return self.variance.sum(axis=1) / self.prior.sum()
 
 
+@dataclass(eq=False)
 class SignalProcess:
-    """The process, conditioned on training rows.
+    """Gaussian process of element signals, conditioned on aligned signals [n, m] of training rows at positions [n, 3].
 
-    Args:
-        tx_pos_m: of the rows, [n, 3], metres.
-        signals: aligned, [n, m].
-        covariances: the dictionary.
+    Attributes:
         basis: principal components in its columns, [m, m].
-        weight: shares, [m, c].
-        noise: of each component, [m].
+        weight, noise: shares of the dictionary [m, c] and variance of the noise [m] of each component.
+        precision: inverse covariance of the rows for each component, [m, n, n].
     """
 
-    def __init__(
-        self,
-        tx_pos_m: FloatArray,
-        signals: ComplexArray,
-        covariances: Covariances,
-        basis: ComplexArray,
-        weight: FloatArray,
-        noise: FloatArray,
-    ) -> None:
-        self.tx_pos_m, self.signals, self.covariances = tx_pos_m, signals, covariances
-        self.basis, self.weight, self.noise = basis, weight, noise
-        self._components: ComplexArray = signals @ basis.conj()
-        own = covariances.mixed(tx_pos_m, tx_pos_m, weight)
-        self._inverse: ComplexArray = np.stack(
-            [KrigingSystem(part, level).precision for part, level in zip(own, noise, strict=True)]
-        )
-        self._solved: ComplexArray = np.einsum("cij,jc->ci", self._inverse, self._components)
+    tx_pos_m: FloatArray
+    signals: ComplexArray
+    covariances: Covariances
+    basis: ComplexArray
+    weight: FloatArray
+    noise: FloatArray
+    precision: ComplexArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Factor the covariance."""
+        self._components: ComplexArray = self.signals @ self.basis.conj()
+        mixed = self.covariances.mixed(self.tx_pos_m, self.tx_pos_m, self.weight)
+        systems = zip(mixed, self.noise, strict=True)
+        self.precision = np.stack([KrigingSystem(matrix, level).precision for matrix, level in systems])
+        self._solved: ComplexArray = np.einsum("cij,jc->ci", self.precision, self._components)
 
     def predict(self, tx_pos_m: ArrayLike) -> Posterior:
         """Posterior at positions [q, 3], metres."""
         cross = self.covariances.mixed(np.asarray(tx_pos_m, float), self.tx_pos_m, self.weight)
         mean = np.einsum("cqi,ci->qc", cross, self._solved)
-        known = np.einsum("cqi,cij,cqj->qc", cross, self._inverse, cross.conj(), optimize=True).real
+        known = np.einsum("cqi,cij,cqj->qc", cross, self.precision, cross.conj(), optimize=True).real
         return self._posterior(mean, self.prior - known)
 
     @property
@@ -107,39 +197,28 @@ class SignalProcess:
     def _posterior(self, mean: ComplexArray, variance: FloatArray) -> Posterior:
         return Posterior(mean @ self.basis.T, np.maximum(variance, self.noise), self.basis, self.prior)
 
-    def held_out(self, radius_m: float, rows: NDArray[np.int64]) -> Posterior:
+    def held_out(self, radius_m: float, rows: IntArray) -> Posterior:
         """Posterior at training rows [q] from the rows further away than ``radius_m``."""
         mean = np.zeros((len(rows), len(self.noise)), complex)
-        variance = np.zeros(mean.shape)
+        variance = np.tile(self.prior, (len(rows), 1))
         near = cdist(self.tx_pos_m[rows], self.tx_pos_m) <= radius_m
         for number, row in enumerate(rows):
-            block = np.flatnonzero(near[number])
-            if len(block) == near.shape[1]:
-                variance[number] = self.prior
-                continue
-            for c, inverse in enumerate(self._inverse):
-                weights, variance[number, c] = left_out(inverse, block, row)
+            for c, precision in enumerate(self.precision) if not near[number].all() else ():
+                weights, variance[number, c] = left_out(precision, np.flatnonzero(near[number]), row)
                 mean[number, c] = weights @ self._components[:, c]
         return self._posterior(mean, variance)
 
-    def arrays(self) -> dict[str, NDArray]:
-        """For `from_arrays`."""
-        return {
-            "tx_pos_m": self.tx_pos_m,
-            "signals": self.signals,
-            "lengths_m": self.covariances.lengths_m,
-            "turns": self.covariances.turns,
-            "basis": self.basis,
-            "weight": self.weight,
-            "noise": self.noise,
-        }
+    def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
+        """Arrays for `from_arrays`."""
+        stored = {f"{prefix}{name}": getattr(self, name) for name in STORED}
+        return stored | {f"{prefix}{name}": getattr(self.covariances, name) for name in ("lengths_m", "turns")}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray]) -> SignalProcess:
-        """A process as `arrays` gave it."""
-        names = ("tx_pos_m", "signals", "basis", "weight", "noise")
-        positions, signals, basis, weight, noise = (arrays[name] for name in names)
-        return cls(positions, signals, Covariances(arrays["lengths_m"], arrays["turns"]), basis, weight, noise)
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> SignalProcess:
+        """The process that `arrays` stored."""
+        positions, signals, *components = (arrays[f"{prefix}{name}"] for name in STORED)
+        covariances = Covariances(arrays[f"{prefix}lengths_m"], arrays[f"{prefix}turns"])
+        return cls(positions, signals, covariances, *components)
 
 
 def fit_signals(
@@ -153,84 +232,72 @@ def fit_signals(
     """Align rows and fit the process.
 
     Args:
-        signals: of each row, any phase and scale, [n, m].
+        signals: signals of each row, any phase and scale, [n, m].
         tx_pos_m: [n, 3], metres.
         elements_m: [m, 3].
         covariances: the dictionary.
-        seed: chooses the rows that shares are fitted to where there are more than `MOST_ROWS`.
-        on_progress: hears the share that is done.
+        seed: seed of the choice of rows where there are more than `MOST_ROWS`.
+        on_progress: progress callback: fraction done.
     """
     unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
     opposite = mirror_order(elements_m)
     aligned = align_signals(unit, tx_pos_m, elements_m)
-    chosen = np.arange(len(unit))
-    if len(unit) > MOST_ROWS:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(unit), MOST_ROWS, replace=False))
+    chosen = chosen_rows(len(unit), MOST_ROWS, seed)
     dictionary = covariances(tx_pos_m[chosen])
     exchanges = [aligned] if opposite is None else [aligned, aligned[:, opposite].conj()]
-    best: tuple[float, SignalProcess] | None = None
-    done, rounds = 0, ROUNDS * len(exchanges)
-    for start in exchanges:
-        rows = start[chosen]
+    fits = []
+    for turn, exchange in enumerate(exchanges):
+        rows = exchange[chosen]
         for number in range(ROUNDS):
             cost, process = _fit(rows, tx_pos_m[chosen], covariances, dictionary)
             if number < ROUNDS - 1:
-                rows = _realigned(process, opposite)
-            done += 1
-            on_progress(done / rounds)
-        if best is None or cost < best[0]:
-            best = cost, process
-    assert best is not None
-    process = best[1]
+                rows = realigned(process, opposite)
+            on_progress((turn * ROUNDS + number + 1) / (ROUNDS * len(exchanges)))
+        fits.append((cost, process))
+    _, process = min(fits, key=lambda fit: fit[0])
     if len(chosen) == len(unit):
         return process
-    predicted = process.predict(tx_pos_m).mean
-    whole = np.stack([_turned(row, _ones(row), to, opposite) for row, to in zip(unit, predicted, strict=True)])
+    metric, predicted = np.eye(unit.shape[1], dtype=complex), process.predict(tx_pos_m).mean
+    whole = np.stack([_aligned(row, metric, target, opposite) for row, target in zip(unit, predicted, strict=True)])
     return SignalProcess(tx_pos_m, whole, covariances, process.basis, process.weight, process.noise)
-
-
-def _ones(row: ComplexArray) -> ComplexArray:
-    return np.eye(len(row), dtype=complex)
 
 
 def _fit(
     rows: ComplexArray, tx_pos_m: FloatArray, covariances: Covariances, dictionary: ComplexArray
 ) -> tuple[float, SignalProcess]:
-    _, basis = np.linalg.eigh(rows.T @ rows.conj() / len(rows))
-    basis = basis[:, ::-1]
-    components = rows @ basis.conj()
+    """Fit of the shares of each principal component, and its cost."""
+    basis = np.linalg.eigh(rows.T @ rows.conj() / len(rows))[1][:, ::-1]
     straight = np.arange(len(covariances.lengths_m)) * len(covariances.turns)
-    weight = np.zeros((basis.shape[1], covariances.count))
-    shares: list[Shares] = []
-    for c, signal in enumerate(components.T):
+    weight, noise, cost = np.zeros((basis.shape[1], covariances.count)), np.zeros(basis.shape[1]), 0.0
+    for c, signal in enumerate((rows @ basis.conj()).T):
         which = slice(None) if c < RICH else straight
-        shares.append(fit_shares(signal, dictionary[which], STEPS, LEAST_POWER))
-        weight[c, which] = shares[-1].weight
-    noise = np.array([s.noise for s in shares])
-    return sum(s.cost for s in shares), SignalProcess(tx_pos_m, rows, covariances, basis, weight, noise)
+        weight[c, which], noise[c], each = fit_shares(signal, dictionary[which], STEPS, LEAST_POWER)
+        cost += each
+    return cost, SignalProcess(tx_pos_m, rows, covariances, basis, weight, noise)
 
 
-def _realigned(process: SignalProcess, opposite: NDArray[np.int64] | None) -> ComplexArray:
-    """Each row turned towards what all others predict, in the metric of their certainty."""
-    basis, inverse = process.basis, process._inverse
+def realigned(process: SignalProcess, opposite: IntArray | None) -> ComplexArray:
+    """Rows [n, m] aligned with their predictions from all others, in the metric of the predictions' precision.
+
+    ``opposite`` is the order of the elements in the mirror image [m], or None for an array without one.
+    """
+    basis, precision = process.basis, process.precision
     rows = process.signals.copy()
     components = rows @ basis.conj()
     for _ in range(SWEEPS):
         for i in range(len(rows)):
-            certainty = inverse[:, i, i].real
-            others = components[i] - np.einsum("cj,jc->c", inverse[:, i], components) / certainty
-            rows[i] = _turned(rows[i], (basis * certainty) @ basis.conj().T, others @ basis.T, opposite)
+            certainty = precision[:, i, i].real
+            others = components[i] - np.einsum("cj,jc->c", precision[:, i], components) / certainty
+            rows[i] = _aligned(rows[i], (basis * certainty) @ basis.conj().T, others @ basis.T, opposite)
             components[i] = rows[i] @ basis.conj()
     return rows
 
 
-def _turned(
-    row: ComplexArray, certainty: ComplexArray, target: ComplexArray, opposite: NDArray[np.int64] | None
-) -> ComplexArray:
+def _aligned(row: ComplexArray, metric: ComplexArray, target: ComplexArray, opposite: IntArray | None) -> ComplexArray:
     """The row, or its mirrored conjugate, times the phase that brings it nearest to a target."""
     found: list[tuple[float, ComplexArray]] = []
     for choice in [row] if opposite is None else [row, row[opposite].conj()]:
-        overlap = np.vdot(choice, certainty @ target)
-        gain = 2 * float(np.abs(overlap)) - float(np.vdot(choice, certainty @ choice).real)
+        overlap = np.vdot(choice, metric @ target)
+        gain = 2 * float(np.abs(overlap)) - float(np.vdot(choice, metric @ choice).real)
         found.append((gain, choice * np.exp(1j * np.angle(overlap))))
     return max(found, key=lambda pair: pair[0])[1]

@@ -1,14 +1,15 @@
 """Specular paths of known chains of planes, evaluated for new transmitters in one batch.
 
-The search for chains (`wrf_mi.tracing.search.shoot`) is done once, from the receiver. After that a transmitter costs a
-mirrored position for each chain, an arithmetic test of the points of reflection against the planes' bounds, and a few
-rays along the legs of those that are left, all transmitters and chains at once.
+The search for chains (`wrf_mi.tracing.search.shoot`) is done once, from the receiver. A transmitter then costs a
+mirrored position for each chain, a test of the points of reflection against the planes' bounds, and a few rays along
+the legs of the remaining paths, all transmitters and chains together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,86 +23,99 @@ from ...tracing.search import shoot
 from ...tracing.surfaces import Surfaces, find_planes
 
 MARGIN_M = 1e-3
-"""Slack of a plane's bounds, and how near to its plane a leg's end has to meet the mesh."""
+"""Slack of a plane's bounds, and greatest distance of a leg's end from the mesh at a reflection."""
 NEAR_M = 5e-4
-"""What lies so close to the beginning of a leg is the surface that it begins at."""
-
-
+"""A surface so close to the beginning of a leg is the surface at which the leg begins."""
 PAIRS_PER_CHUNK = 1 << 19
-"""Pairs of transmitter and chain at once: some 100 MB."""
+"""Pairs of transmitter and chain that are computed together: some 100 MB."""
 FEW_PAIRS = 1 << 15
-"""Pairs of ray and triangle that are tried one by one: some 5 ms."""
+"""Pairs of ray and triangle up to which all are tried in NumPy: some 5 ms."""
 EDGE = 1e-9
-"""Slack of a triangle's edges, as a share of them, so that no ray slips between two."""
-Hit = tuple[IntArray, FloatArray, IntArray, FloatArray]
-"""Rays that meet a surface: which, after how many metres, whose, with what normal."""
+"""Slack of a triangle's edges, as a share of them, so that no ray slips between two triangles."""
 LEAST_LANES = 256
-"""Rays are shot in numbers that are powers of two from this on: a kernel is compiled for each number."""
+"""Rays are traced in powers of two from this number on: a kernel is compiled for each number."""
+Hit = tuple[IntArray, FloatArray, IntArray, FloatArray]
+"""Rays that meet a surface: index, distance in metres, object, normal."""
 
 
 @dataclass(frozen=True)
-class Things:
-    """Objects of a room as triangles; b objects.
+class Room:
+    """Objects of triangles and their materials; b objects. Without objects: free space.
 
-    Attributes:
-        names: of the objects.
-        corners: of each object's triangles, [f, 3, 3] in metres, one array an object.
+    ``corners`` are each object's triangles [f, 3, 3] in metres; ``slabs`` [3, b] relative permittivity, conductivity
+    (S/m) and thickness (m) of each object.
     """
 
     names: tuple[str, ...]
     corners: tuple[FloatArray, ...]
+    slabs: FloatArray
 
-    def with_sheets(self, sheets: FloatArray) -> Things:
-        """The same and further rectangles, each given by its four corners in order: [s, 4, 3], metres."""
-        more = tuple(np.stack([sheet[[0, 1, 2]], sheet[[0, 2, 3]]]) for sheet in sheets)
+    @classmethod
+    def of(cls, scene: Any | None) -> Room:
+        """Triangles and materials of a ``sionna.rt.Scene``; None: free space."""
+        if scene is None:
+            return cls((), (), np.zeros((3, 0)))
+        from ...tracing.material_parameters import read_materials
+        from ...tracing.surfaces import scene_surfaces
+
+        surfaces, known = scene_surfaces(scene), read_materials(scene)
+        index = [known.names.index(scene.objects[name].radio_material.name) for name in surfaces.names]
+        slabs = np.stack([known.permittivity, known.conductivity, known.thickness_m])[:, index]
+        return cls(surfaces.names, tuple(surfaces.triangles[a:b] for a, b in pairwise(surfaces.first_face)), slabs)
+
+    def with_sheets(self, sheets: FloatArray, slabs: FloatArray) -> Room:
+        """The room with further rectangles, four corners in order each [s, 4, 3] in metres, of ``slabs`` [3, s]."""
+        corners = (np.stack([sheet[[0, 1, 2]], sheet[[0, 2, 3]]]) for sheet in sheets)
         names = (f"learned {len(self.names) + i}" for i in range(len(sheets)))
-        return Things((*self.names, *names), (*self.corners, *more))
+        joined = np.concatenate([self.slabs, slabs], axis=1)
+        return Room((*self.names, *names), (*self.corners, *corners), joined)
 
+    def open(self) -> tuple[Any, Surfaces] | None:
+        """A Mitsuba scene of the objects (as ``.mi_scene``) and their planes; None for free space."""
+        if not self.names:
+            return None
+        import drjit as dr
+        import mitsuba as mi
 
-def opened(things: Things) -> tuple[Any, Surfaces]:
-    """A Mitsuba scene of the objects (as ``.mi_scene``) and their planes."""
-    import drjit as dr
-    import mitsuba as mi
+        from ...backend.device import to_float, to_uint
 
-    from ...backend.device import to_float, to_uint
-
-    keys = [f"thing{index}" for index in range(len(things.names))]
-    parts: dict[str, Any] = {"type": "scene"}
-    for key, corners in zip(keys, things.corners, strict=True):
-        mesh = mi.Mesh(key, 3 * len(corners), len(corners))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = to_float(corners)
-        parameters["faces"] = to_uint(np.arange(3 * len(corners)))
-        parameters.update()
-        parts[key] = mesh
-    scene: Any = mi.load_dict(parts)
-    # Mitsuba sorts what it is given by name; each shape is asked for its own number.
-    ids = np.zeros(len(things.names), np.uint32)
-    for shape in scene.shapes():
-        pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-        ids[keys.index(shape.id())] = int(pointer[0])
-    first = np.cumsum([0, *(len(part) for part in things.corners)])
-    triangles = np.concatenate([np.zeros((0, 3, 3)), *things.corners]).astype(np.float32).astype(float)
-    return SimpleNamespace(mi_scene=scene), find_planes(things.names, ids, first, triangles)
+        keys = [f"thing{index}" for index in range(len(self.names))]
+        parts: dict[str, Any] = {"type": "scene"}
+        for key, corners in zip(keys, self.corners, strict=True):
+            mesh = mi.Mesh(key, 3 * len(corners), len(corners))
+            parameters = mi.traverse(mesh)
+            parameters["vertex_positions"] = to_float(corners)
+            parameters["faces"] = to_uint(np.arange(3 * len(corners)))
+            parameters.update()
+            parts[key] = mesh
+        scene: Any = mi.load_dict(parts)
+        # Mitsuba sorts shapes by name; each shape states its number.
+        ids = np.zeros(len(self.names), np.uint32)
+        for shape in scene.shapes():
+            pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+            ids[keys.index(shape.id())] = int(pointer[0])
+        first = np.cumsum([0, *(len(corners) for corners in self.corners)])
+        triangles = np.concatenate(self.corners).astype(np.float32).astype(float)
+        return SimpleNamespace(mi_scene=scene), find_planes(self.names, ids, first, triangles)
 
 
 @dataclass(frozen=True)
-class Met:
+class ChainPaths:
     """Paths from n transmitters by known chains; p paths, sorted by transmitter.
 
     Attributes:
-        tx: transmitter of each, shape [p].
-        chain: index of its chain, 0 the direct path, shape [p].
-        image_m: the transmitter's image less the receiver's position, world frame, shape [p, 3].
-        thing: object met at each interaction from the transmitter on, -1 beyond the last, shape [p, depth].
-        plane: plane of each reflection, -1 where the wave passes through or nothing is met, shape [p, depth].
-        normal: of the surface that is met, shape [p, depth, 3].
+        tx: transmitter of each path, [p].
+        chain: chain of each path, 0 the direct path, [p].
+        image_m: the transmitter's image less the receiver's position, world frame, [p, 3].
+        objects: object at each interaction from the transmitter on, -1 beyond the last, [p, depth].
+        plane: plane of each reflection, -1 at transmissions and beyond the last interaction, [p, depth].
+        normal: normal of the surface at each interaction, [p, depth, 3].
     """
 
     tx: IntArray
     chain: IntArray
     image_m: FloatArray
-    thing: IntArray
+    objects: IntArray
     plane: IntArray
     normal: FloatArray
 
@@ -110,14 +124,28 @@ class Met:
         return len(self.tx)
 
 
-class ChainTable:
-    """Chains of reflecting planes seen from one receiver, and the scene that blocks them.
+@dataclass(frozen=True)
+class Chaining:
+    """Search for chains of planes: limits, rays, most chains (those of fewest reflections), seed of the rays."""
 
-    Args:
-        opened_room: from `opened`, or None: the direct path alone, which nothing blocks.
-        receiver_m: position [3], metres.
-        chain: planes from the receiver on, shape [c, reflections], -1 beyond the last; see `find_chains`.
-        passed: surfaces that a path may pass through at most.
+    reflections: int
+    passed: int
+    rays: int
+    most: int
+    seed: int
+
+
+def find_chains(opened_room: tuple[Any, Surfaces], receiver_m: FloatArray, how: Chaining) -> IntArray:
+    """Chains of planes seen from a receiver [3] in metres: shape [c, reflections], -1 beyond the last plane."""
+    found = shoot(*opened_room, receiver_m, how.rays, how.reflections + how.passed, how.reflections, how.seed)
+    order = np.argsort(np.count_nonzero(found >= 0, axis=1), kind="stable")
+    return found[order[: how.most]]
+
+
+class ChainTable:
+    """Chains of reflecting planes (`find_chains`) seen from a receiver [3], and the scene that blocks them.
+
+    ``opened_room`` is from `Room.open`; None: the direct path alone, unobstructed.
     """
 
     def __init__(
@@ -126,35 +154,25 @@ class ChainTable:
         self.receiver_m, self.passed = np.asarray(receiver_m, float), passed
         self.chain = np.concatenate([np.full((1, chain.shape[1]), -1), chain])
         self.length = np.count_nonzero(self.chain >= 0, axis=1)
-        self._scene: Any = None if opened_room is None else opened_room[0]
-        self.surfaces: Surfaces | None = None if opened_room is None else opened_room[1]
-        self._things = np.zeros(0, np.int64)
+        self._scene: Any = None
+        self.surfaces: Surfaces | None = None
         self.normal, self.offset_m = np.zeros((0, 3)), np.zeros(0)
-        if self.surfaces is not None:
+        if opened_room is not None:
+            self._scene, self.surfaces = opened_room
             self.normal, self.offset_m = self.surfaces.normal, self.surfaces.offset
-            self._things = np.full(int(self.surfaces.shape_ids.max(initial=0)) + 1, -1)
-            self._things[self.surfaces.shape_ids] = np.arange(len(self.surfaces.names))
-
-    @property
-    def depth(self) -> int:
-        """Interactions of a path at most."""
-        return int(self.chain.shape[1] + self.passed)
+            self._objects = np.full(int(self.surfaces.shape_ids.max(initial=0)) + 1, -1)
+            self._objects[self.surfaces.shape_ids] = np.arange(len(self.surfaces.names))
 
     def images(self, tx_pos_m: FloatArray, chain: IntArray) -> FloatArray:
-        """Images of transmitters after each reflection, from the transmitter on: shape [p, reflections + 1, 3].
-
-        Args:
-            tx_pos_m: of each path [p, 3].
-            chain: of each path [p].
-        """
-        # From the receiver on, the last plane of a chain is the first that the transmitter's wave meets.
+        """Images [p, reflections + 1, 3] of transmitters [p, 3] after each reflection of chains [p], last first."""
+        # The last plane of a chain, counted from the receiver, is the first that the transmitter's wave meets.
         return image_sources(self.normal, self.offset_m, self.chain[chain][:, ::-1], tx_pos_m)[:, ::-1]
 
-    def __call__(self, tx_pos_m: FloatArray) -> Met:
+    def __call__(self, tx_pos_m: FloatArray) -> ChainPaths:
         """Unobstructed paths of transmitters [n, 3] in metres, through at most ``passed`` surfaces."""
         step = max(1, PAIRS_PER_CHUNK // len(self.chain))
-        parts = [self._part(tx_pos_m[i : i + step], i) for i in range(0, len(tx_pos_m), step)]
-        return Met(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        parts = [self._part(tx_pos_m[i : i + step], i) for i in range(0, max(len(tx_pos_m), 1), step)]
+        return ChainPaths(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _part(self, tx_pos_m: FloatArray, first: int) -> tuple[NDArray[Any], ...]:
         n, count = len(tx_pos_m), len(self.chain)
@@ -162,12 +180,12 @@ class ChainTable:
         images = self.images(tx_pos_m[tx], chain)
         good, vertices = self.vertices(images, chain)
         tx, chain, images, vertices = tx[good], chain[good], images[good], vertices[good]
-        thing, plane, normal, good = self._walk(tx_pos_m[tx], chain, vertices)
+        objects, plane, normal, good = self._walk(tx_pos_m[tx], chain, vertices)
         image = images[good, 0] - self.receiver_m
-        return tx[good] + first, chain[good], image, thing[good], plane[good], normal[good]
+        return tx[good] + first, chain[good], image, objects[good], plane[good], normal[good]
 
     def vertices(self, images: FloatArray, chain: IntArray) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Which paths have all points of reflection within their planes' bounds, and these points, receiver first."""
+        """Whether all points of reflection lie within their planes' bounds [p], and these points, receiver first."""
         planes = self.chain[chain]
         good = np.ones(len(chain), bool)
         vertices = np.full((len(chain), planes.shape[1], 3), np.nan)
@@ -189,13 +207,11 @@ class ChainTable:
     def _walk(
         self, tx_pos_m: FloatArray, chain: IntArray, vertices: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray, NDArray[np.bool_]]:
-        """What each path meets from the transmitter on, and whether it arrives."""
-        count, depth = len(chain), self.depth
-        thing, plane = np.full((2, count, depth), -1)
+        """Objects, planes and normals at each path's interactions from the transmitter on, and whether it arrives."""
+        count, depth = len(chain), self.chain.shape[1] + self.passed
+        objects, plane = np.full((2, count, depth), -1)
         normal = np.zeros((count, depth, 3))
         good, used = np.ones(count, bool), np.zeros(count, np.int64)
-        if not count:
-            return thing, plane, normal, good
         length, passed = self.length[chain], np.zeros(count, np.int64)
         here = np.array(tx_pos_m, float)
         for leg in range(self.chain.shape[1] + 1):
@@ -205,62 +221,57 @@ class ChainTable:
             level = length[row] - 1 - leg  # of the reflection that ends this leg; -1 at the receiver
             last = level < 0
             there = np.where(last[:, None], self.receiver_m, vertices[row, np.maximum(level, 0)])
-            hits = self._hits(here[row], there)
             ended = last.copy()
-            for lane, met, at_end, direction in hits:
-                ends = at_end & ~last[lane]
-                ended[lane[ends]] = True
-                through = ~at_end
-                passed[row[lane[through]]] += 1
-                for some, mirror in ((through, False), (ends, True)):
+            for lane, met, at_end, direction in self._hits(here[row], there):
+                mirrors = at_end & ~last[lane]
+                ended[lane[mirrors]] = True
+                passed[row[lane[~at_end]]] += 1
+                for some, mirror in ((~at_end, False), (mirrors, True)):
                     path = row[lane[some]]
                     fits = used[path] < depth
                     good[path[~fits]] = False
                     path, which = path[fits], np.flatnonzero(some)[fits]
-                    thing[path, used[path]], normal[path, used[path]] = met[which], direction[which]
+                    objects[path, used[path]], normal[path, used[path]] = met[which], direction[which]
                     if mirror:
                         plane[path, used[path]] = self.chain[chain[path], level[lane[which]]]
                     used[path] += 1
             good[row[~ended]] = False
             here[row] = there
-        good &= passed <= self.passed
-        return thing, plane, normal, good
+        return objects, plane, normal, good & (passed <= self.passed)
 
     def _hits(
         self, start_m: FloatArray, end_m: FloatArray
-    ) -> list[tuple[IntArray, IntArray, NDArray[np.bool_], FloatArray]]:
-        """Surfaces along legs, one after the other: leg, object, whether it is at the leg's end, and its normal."""
+    ) -> Iterator[tuple[IntArray, IntArray, NDArray[np.bool_], FloatArray]]:
+        """Surfaces along legs in order: leg, object, whether it lies at the leg's end, and its normal."""
         if self.surfaces is None:
-            return []
+            return
         way = end_m - start_m
         length = np.linalg.norm(way, axis=1)
         direction = way / np.maximum(length, 1e-12)[:, None]
         few = len(length) * len(self.surfaces.triangles) <= FEW_PAIRS
-        met = self._met_by_hand if few else self._met_by_mitsuba
-        out = []
-        for lane, travelled, thing, normal in met(start_m, direction, length + MARGIN_M):
+        hits = self._hits_by_numpy if few else self._hits_by_mitsuba
+        for lane, travelled, met, normal in hits(start_m, direction, length + MARGIN_M):
             if not len(lane):
-                break
-            out.append((lane, thing, np.abs(travelled - length[lane]) < MARGIN_M, normal))
-        return out
+                return
+            yield lane, met, np.abs(travelled - length[lane]) < MARGIN_M, normal
 
-    def _met_by_hand(self, start_m: FloatArray, direction: FloatArray, far_m: FloatArray) -> Iterator[Hit]:
-        """First, second, ... surface on each ray: all triangles are tried, which for one transmitter is soonest done.
+    def _hits_by_numpy(self, start_m: FloatArray, direction: FloatArray, far_m: FloatArray) -> Iterator[Hit]:
+        """First, second, ... surface on each ray by trying all triangles, which is fastest for one transmitter.
 
         Source: Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection" (1997).
         """
         surfaces = self.surfaces
         assert surfaces is not None
         corner = surfaces.triangles[:, 0]
-        one, two = surfaces.triangles[:, 1] - corner, surfaces.triangles[:, 2] - corner
-        across = np.cross(direction[:, None], two[None])
-        determinant = np.einsum("fi,pfi->pf", one, across)
+        first, second = surfaces.triangles[:, 1] - corner, surfaces.triangles[:, 2] - corner
+        across = np.cross(direction[:, None], second[None])
+        determinant = np.einsum("fi,pfi->pf", first, across)
         with np.errstate(divide="ignore", invalid="ignore"):
             from_corner = start_m[:, None] - corner
             u = np.einsum("pfi,pfi->pf", from_corner, across) / determinant
-            turned = np.cross(from_corner, one[None])
+            turned = np.cross(from_corner, first[None])
             v = np.einsum("pi,pfi->pf", direction, turned) / determinant
-            distance = np.einsum("fi,pfi->pf", two, turned) / determinant
+            distance = np.einsum("fi,pfi->pf", second, turned) / determinant
             inside = (u >= -EDGE) & (v >= -EDGE) & (u + v <= 1 + EDGE) & (np.abs(determinant) > EDGE)
         distance = np.where(inside, distance, np.inf)
         begin = np.full(len(start_m), NEAR_M)
@@ -273,8 +284,8 @@ class ChainTable:
             yield lane, begin[lane], surfaces.object_of(face), surfaces.normal[surfaces.plane[face]]
             begin = begin + NEAR_M
 
-    def _met_by_mitsuba(self, start_m: FloatArray, direction: FloatArray, far_m: FloatArray) -> Iterator[Hit]:
-        """The same with a tree of triangles and many rays at once."""
+    def _hits_by_mitsuba(self, start_m: FloatArray, direction: FloatArray, far_m: FloatArray) -> Iterator[Hit]:
+        """First, second, ... surface on each ray by Mitsuba, which is fastest for many transmitters."""
         import drjit as dr
         import mitsuba as mi
 
@@ -283,15 +294,14 @@ class ChainTable:
         lanes = max(LEAST_LANES, 1 << (len(far_m) - 1).bit_length())
 
         def padded(values: FloatArray) -> FloatArray:
-            more = np.zeros((lanes - len(values), *values.shape[1:]))
-            return np.concatenate([values, more])
+            return np.concatenate([values, np.zeros((lanes - len(values), *values.shape[1:]))])
 
         d, origin = to_vectors(padded(direction), mi.Vector3f), to_vectors(padded(start_m), mi.Point3f)
         far = to_float(padded(far_m))
         active: Any = on_device(np.arange(lanes) < len(far_m), mi.Bool)
         begin: Any = mi.Float(NEAR_M)
         found = []
-        # One more than may be passed: the end of the leg itself.
+        # All that may be passed, one too many, and the end of the leg itself.
         for _ in range(self.passed + 2):
             ray = mi.Ray3f(origin + d * begin, d)
             hit = self._scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
@@ -303,31 +313,5 @@ class ChainTable:
         dr.eval(found)
         for some, shape, travelled, n in found:
             lane = np.flatnonzero(some.numpy())
-            thing = self._things[shape.numpy()[lane]]
-            yield lane, travelled.numpy()[lane].astype(float), thing, n.numpy().T[lane].astype(float)
-
-
-def find_chains(
-    opened_room: tuple[Any, Surfaces],
-    receiver_m: FloatArray,
-    reflections: int,
-    passed: int,
-    rays: int,
-    seed: int,
-    most: int,
-) -> IntArray:
-    """Chains of planes seen from a receiver, shape [c, reflections], -1 beyond the last.
-
-    Args:
-        opened_room: from `opened`.
-        receiver_m: position [3], metres.
-        reflections: at most.
-        passed: surfaces that a ray may go straight through at most.
-        rays: that search.
-        seed: of their directions.
-        most: chains that are kept: those of fewest reflections.
-    """
-    scene, surfaces = opened_room
-    found = shoot(scene, surfaces, receiver_m, rays, reflections + passed, reflections, seed)
-    order = np.argsort(np.count_nonzero(found >= 0, axis=1), kind="stable")
-    return found[order[:most]]
+            met = self._objects[shape.numpy()[lane]]
+            yield lane, travelled.numpy()[lane].astype(float), met, n.numpy().T[lane].astype(float)

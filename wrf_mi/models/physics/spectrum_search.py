@@ -1,159 +1,228 @@
-"""Surfaces that the mesh lacks, found in what a traced spectrum leaves unexplained.
+"""Surfaces that the mesh lacks, found in the misfit of a traced spectrum.
 
-The known paths are the reference wave of a hologram: a further wave shows by how it beats with them, phase included,
-and a mirror's wave is known once its plane is. A mirror at the right place makes spectra likelier for all transmitters
-whose point of reflection lies on it, over many wavelengths; at a wrong one it helps some and harms others. Candidates
-are planes along the mesh's own directions, a sixteenth of a wavelength apart, in patches; the best patches grow into
-rectangles, edge by edge, and stay if the likelihood rises by more than chance allows. A rectangle also hides what lies
-behind it: every known path that crosses it is weakened by what it lets pass.
+The known paths are the reference wave of a hologram: a further wave beats with them, phase included, and a mirror's
+wave is determined by its plane. A mirror at the right position makes spectra likelier for all transmitters whose point
+of reflection lies on it, over many wavelengths; at a wrong one only for some. Candidates are planes along the mesh's
+directions, a sixteenth of a wavelength apart, in patches; the best patches grow into rectangles ("sheets"), edge by
+edge, and stay if the likelihood rises significantly. A sheet also attenuates every known path that crosses it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import speed_of_light
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.image_method import mirrored
 from ...tracing.slab import slab
-from .spectrum_gains import Antennas, Slabs, gains
-from .spectrum_loss import Grid
-from .spectrum_rays import Met
-from .spectrum_sheets import KINDS, Frame, Known, Sheet
+from .spectrum_gains import gains, spherical_waves
+from .spectrum_loss import ComplexArray, Spectrometer
+from .spectrum_rays import ChainPaths, ChainTable
 
-ComplexArray = NDArray[np.complex128]
-
+KINDS = np.array([[1.0, 1e7, 0.002], [2.6, 0.02, 0.02]]).T
+"""Relative permittivity, conductivity (S/m) and thickness (m) of a sheet, [3, kinds]: metal, or a wooden board."""
+FAMILIES = 6
+"""Families of parallel planes at most."""
 HALF_M = (0.35, 0.7)
 """Half the edges of the patches that are tried, metres."""
 PATCH_M = 0.5
 """A patch hides paths that cross its plane so near to a row's point of reflection, metres."""
 LEAST_SEED = 8.0
-"""Gain of a patch that is looked at further."""
+"""Least gain of a patch."""
 SEEDS, GROWN = 40, 10
 """Patches that are tried in one round, and the best of them that are grown."""
-CHUNK_SIZE = 4
-"""Sheets that are taken in one round."""
+SHEETS_PER_ROUND = 4
 SCANNED_ROWS = 600
 """Rows of the scan for patches: enough to rank them."""
 LEAST_M = 0.15
 """Shortest edge of a sheet."""
 LEAST_ROWS = 4
-"""Transmitters that must see it."""
+"""Least number of transmitters that a sheet affects."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A family of parallel planes: two axes in them and their normal [3, 3], bounds of the room along these [3]."""
+
+    axes: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def frames_of(normals: FloatArray, areas: FloatArray, points_m: FloatArray) -> list[Frame]:
+    """Families of planes along normals [q, 3], those of most area [q] first, within the bounds of points [n, 3]."""
+    left = np.array(areas, float)
+    frames: list[Frame] = []
+    while left.max(initial=0) > 0 and len(frames) < FAMILIES:
+        normal = normals[int(left.argmax())]
+        up = np.eye(3)[int(np.abs(normal).argmin()) if abs(normal[2]) > 0.9 else 2]
+        first = np.cross(up, normal)
+        first /= np.linalg.norm(first)
+        axes = np.stack([first, np.cross(normal, first), normal])
+        along = points_m @ axes.T
+        frames.append(Frame(axes, along.min(axis=0), along.max(axis=0)))
+        left[np.abs(normals @ normal) > np.cos(np.radians(5))] = 0
+    return frames
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A rectangle that reflects, in a plane of a family at an offset along the family's normal, of a kind of `KINDS`.
+
+    Its edges [4] are low and high along the first axis, then along the second, metres.
+    """
+
+    frame: int
+    offset_m: float
+    edges_m: tuple[float, ...]
+    kind: int
+
+    def corners(self, frames: list[Frame]) -> FloatArray:
+        """Shape [4, 3], in order, metres."""
+        a, b, c, d = self.edges_m
+        along = np.array([[x, y, self.offset_m] for x, y in ((a, c), (b, c), (b, d), (a, d))])
+        return along @ frames[self.frame].axes
+
+    def contains(self, point_m: FloatArray) -> NDArray[np.bool_]:
+        """Whether points [n, 2] along the first two axes lie inside the edges."""
+        (x, y), (a, b, c, d) = point_m.T, self.edges_m
+        return np.asarray((x > a) & (x < b) & (y > c) & (y < d))
+
+
+@dataclass(frozen=True)
+class KnownPaths:
+    """Paths [p] of the present model with waves at the elements [p, m], and their straight legs [g]."""
+
+    wave: ComplexArray
+    tx: IntArray
+    path: IntArray
+    start_m: FloatArray
+    end_m: FloatArray
+
+    @classmethod
+    def of(cls, table: ChainTable, paths: ChainPaths, wave: ComplexArray, tx_pos_m: FloatArray) -> KnownPaths:
+        """Legs of paths from transmitters [n, 3] by a table's chains, with their waves [p, m]."""
+        vertices = table.vertices(table.images(tx_pos_m[paths.tx], paths.chain), paths.chain)[1]
+        length, legs = table.length[paths.chain], []
+        here = np.tile(table.receiver_m, (len(paths), 1))
+        for leg in range(vertices.shape[1] + 1):
+            row = np.flatnonzero(length >= leg)
+            last = length[row] == leg
+            level = min(leg, vertices.shape[1] - 1)
+            there = np.where(last[:, None], tx_pos_m[paths.tx[row]], vertices[row, level])
+            legs.append((row, here[row], there))
+            here[row] = there
+        return cls(wave, paths.tx, *(np.concatenate(column) for column in zip(*legs, strict=True)))
+
+    def select(self, count: int) -> KnownPaths:
+        """Paths of the first ``count`` transmitters."""
+        kept = self.tx < count
+        number = np.cumsum(kept) - 1
+        leg = kept[self.path]
+        return KnownPaths(self.wave[kept], self.tx[kept], number[self.path[leg]], self.start_m[leg], self.end_m[leg])
+
+    def crossings(self, axes: FloatArray, offset_m: float) -> tuple[IntArray, FloatArray]:
+        """Paths that cross a plane, and the points along its axes [k, 2]; legs that end at it do not cross it."""
+        near, far = self.start_m @ axes[2] - offset_m, self.end_m @ axes[2] - offset_m
+        leg = np.flatnonzero((near * far < 0) & (np.minimum(np.abs(near), np.abs(far)) > 1e-3))
+        share = near[leg] / (near[leg] - far[leg])
+        point = self.start_m[leg] + share[:, None] * (self.end_m[leg] - self.start_m[leg])
+        return self.path[leg], point @ axes[:2].T
 
 
 @dataclass(frozen=True)
 class Plane:
-    """What a plane does to all rows: waves of each kind [kinds, n, m], where [n, 2], whether [n]; crossings."""
+    """Reflected waves [kinds, n, m] of an infinite plane, points of reflection [n, 2] where ``fine``, and crossings."""
 
     wave: ComplexArray
-    place: FloatArray
+    point: FloatArray
     fine: NDArray[np.bool_]
     path: IntArray
     crossing: FloatArray
 
 
+@dataclass
 class Search:
-    """Looks for sheets with some transmitters.
+    """Search for sheets with transmitters [n, 3], their spectra's shapes [n, r * c] and present paths."""
 
-    Args:
-        frames: families of planes to look in.
-        tx_pos_m: transmitters [n, 3], metres.
-        receiver_m: the array's origin [3].
-        elements_m: its elements less that [m, 3], world frame.
-        antennas: of the transmitters and of the elements.
-        frequency_hz: of the carrier.
-        shapes: the rows' spectra, see `Grid.shapes`.
-        grid: of these.
-        known: paths of these transmitters.
-    """
+    frames: list[Frame]
+    instrument: Spectrometer
+    tx_pos_m: FloatArray
+    shapes: FloatArray
+    known: KnownPaths
 
-    def __init__(
-        self,
-        frames: list[Frame],
-        tx_pos_m: FloatArray,
-        receiver_m: FloatArray,
-        elements_m: FloatArray,
-        antennas: Antennas,
-        frequency_hz: float,
-        shapes: FloatArray,
-        grid: Grid,
-        known: Known,
-    ) -> None:
-        self.frames, self._tx, self._rx, self._elements = frames, tx_pos_m, receiver_m, elements_m
-        self._antennas = antennas
-        self._hz, self._shapes, self._grid, self._known = frequency_hz, shapes, grid, known
-        self.wavelength_m = speed_of_light / frequency_hz
-        self._passed = []
-        for kind in KINDS:
-            permittivity, conductivity, thickness = (np.array([value]) for value in kind)
-            passed = slab(np.ones(1), permittivity, conductivity, thickness, frequency_hz)
-            self._passed.append(complex(passed.transmitted_te[0]))
+    def __post_init__(self) -> None:
+        """Compute the transmission of each kind of sheet at normal incidence."""
+        self.wavelength_m, self._rx = self.instrument.wavelength_m, self.instrument.receiver.position_m
+        normal = np.ones(KINDS.shape[1])
+        self._passed = slab(normal, KINDS[0], KINDS[1], KINDS[2], self.instrument.frequency_hz).transmitted_te
 
-    def plane(self, frame: int, offset_m: float, kinds: int = len(KINDS)) -> Plane:
-        """What a plane of a family would do."""
+    def loss(self, signals: ComplexArray, row: IntArray | slice = slice(None)) -> FloatArray:
+        """Loss of element signals of some rows."""
+        return self.instrument.grid.loss(signals, self.shapes[row])[0]
+
+    def plane(self, frame: int, offset_m: float, kinds: int = KINDS.shape[1]) -> Plane:
+        """Effect of a plane of a family."""
         axes = self.frames[frame].axes
         normal = axes[2]
-        height = self._tx @ normal - offset_m
-        image = mirrored(self._tx, normal, offset_m) - self._rx
+        height = self.tx_pos_m @ normal - offset_m
+        image = mirrored(self.tx_pos_m, normal, offset_m) - self._rx
         n = len(image)
         zeros = np.zeros((n, 1), np.int64)
-        met = Met(zeros[:, 0], zeros[:, 0], image, zeros, zeros, np.broadcast_to(normal, (n, 1, 3)))
-        length = np.linalg.norm(image, axis=1)
-        distance = np.linalg.norm(image[:, None] - self._elements, axis=-1)
-        wave = length[:, None] / distance * np.exp(-2j * np.pi / self.wavelength_m * distance)
-        gain = [gains(met, Slabs(*(np.array([v]) for v in kind)), self._antennas, self._hz) for kind in KINDS[:kinds]]
+        paths = ChainPaths(zeros[:, 0], zeros[:, 0], image, zeros, zeros, np.broadcast_to(normal, (n, 1, 3)))
+        antennas, hz = self.instrument.antennas, self.instrument.frequency_hz
+        gain = np.stack([gains(paths, KINDS[:, [kind]], antennas, hz) for kind in range(kinds)])
         near = float(self._rx @ normal - offset_m)
-        fine = near * height > 0  # both on one side
+        fine = near * height > 0
         share = near / np.where(fine, near + height, 1.0)
-        place = (self._rx + share[:, None] * image) @ axes[:2].T
-        return Plane(np.stack(gain)[:, :, None] * wave, place, fine, *self._known.crossings(axes, offset_m))
+        point = (self._rx + share[:, None] * image) @ axes[:2].T
+        wave = gain[:, :, None] * spherical_waves(image, self.instrument)
+        return Plane(wave, point, fine, *self.known.crossings(axes, offset_m))
 
     def change(self, sheet: Sheet, plane: Plane | None = None) -> tuple[IntArray, ComplexArray]:
-        """Rows that a sheet changes [k] and what it adds to their signals [k, m]."""
+        """Rows that a sheet changes [k] and the change of their signals [k, m]."""
         plane = plane or self.plane(sheet.frame, sheet.offset_m)
-        inside = plane.fine & _inside(plane.place, sheet.edges_m)
-        hidden = np.unique(plane.path[_inside(plane.crossing, sheet.edges_m)])
-        hit = np.zeros(len(self._tx), bool)
-        hit[self._known.tx[hidden]] = True
-        row = np.flatnonzero(hit | inside)
+        inside = plane.fine & sheet.contains(plane.point)
+        hidden = np.unique(plane.path[sheet.contains(plane.crossing)])
+        changed = inside.copy()
+        changed[self.known.tx[hidden]] = True
+        row = np.flatnonzero(changed)
         added = np.where(inside[row, None], plane.wave[sheet.kind, row], 0)
-        number = np.full(len(self._tx), -1)
-        number[row] = np.arange(len(row))
-        lost = (1 - self._passed[sheet.kind]) * self._known.wave[hidden]
-        np.subtract.at(added, number[self._known.tx[hidden]], lost)
+        lost = (1 - self._passed[sheet.kind]) * self.known.wave[hidden]
+        np.subtract.at(added, np.searchsorted(row, self.known.tx[hidden]), lost)
         return row, added
 
-    def __call__(self, signals: ComplexArray, most: int, least_gain: float) -> list[Sheet]:
-        """Sheets in the order in which they were found.
+    def gain(self, sheet: Sheet, plane: Plane, signals: ComplexArray, before: FloatArray) -> float:
+        """Reduction of the loss by a sheet; 0 where it affects too few transmitters."""
+        row, added = self.change(sheet, plane)
+        return float((before[row] - self.loss(signals[row] + added, row)).sum()) if len(row) >= LEAST_ROWS else 0.0
 
-        Args:
-            signals: what is explained already, [n, m].
-            most: sheets.
-            least_gain: by how much the logarithm of the likelihood has to grow.
+    def __call__(self, signals: ComplexArray, most: int, least_gain: float) -> list[Sheet]:
+        """Sheets in the order in which they are found, from the present model's element signals [n, m].
+
+        ``least_gain`` is the least gain of a sheet in the logarithm of the likelihood.
         """
         found: list[Sheet] = []
         signals = signals.copy()
         while len(found) < most:
-            before = self._grid.loss(signals, self._shapes)[0]
+            before = self.loss(signals)
             tried = [Growth(self, signals, before, *seed) for seed in self._seeds(signals)]
-            tried.sort(key=lambda one: -one.best[0])
-            grown = [one.grow() for one in tried[:GROWN]]
-            grown.sort(key=lambda one: -one[0])
+            tried.sort(key=lambda growth: -growth.best[0])
             taken = 0
-            for gain, sheet in grown:
-                if gain < least_gain or taken == CHUNK_SIZE or len(found) == most:
+            for gain, sheet in sorted((growth.grow() for growth in tried[:GROWN]), key=lambda pair: -pair[0]):
+                if gain < least_gain or taken == SHEETS_PER_ROUND or len(found) == most:
                     break
                 row, added = self.change(sheet)
-                own = before[row] - self._grid.loss(signals[row] + added, self._shapes[row])[0]
-                # What another one has explained meanwhile waits for the next round.
-                if own.sum() < 0.8 * gain:
+                change = before[row] - self.loss(signals[row] + added, row)
+                # A sheet that has lost gain to one taken before waits for the next round.
+                if change.sum() < 0.8 * gain:
                     continue
                 signals[row] += added
-                before[row] -= own
+                before[row] -= change
                 taken += 1
                 found.append(sheet)
             if not taken:
@@ -161,18 +230,15 @@ class Search:
         return found
 
     def _seeds(self, signals: ComplexArray) -> list[tuple[int, float, FloatArray]]:
-        """Patches that promise most: family, offset, centre and half size.
+        """Most promising patches: family, offset, centre and half size.
 
-        A conducting plane is tried as a whole, row by row; what a patch of it gains is the sum over the rows whose
-        point of reflection lies in it, as rows know nothing of each other. Of the known paths a row loses those that
-        cross the plane near that point.
+        A conducting plane is tried as a whole, row by row; the gain of a patch is the sum over the rows whose point of
+        reflection lies in it, as rows are independent. A row loses the known paths that cross the plane near its point.
         """
         rows = min(len(signals), SCANNED_ROWS)
-        signals, shapes, known = signals[:rows], self._shapes[:rows], self._known.select(rows)
-        some = Search(
-            self.frames, self._tx[:rows], self._rx, self._elements, self._antennas, self._hz, shapes, self._grid, known
-        )  # fmt: skip
-        before = self._grid.loss(signals, shapes)[0]
+        signals, known = signals[:rows], self.known.select(rows)
+        some = Search(self.frames, self.instrument, self.tx_pos_m[:rows], self.shapes[:rows], known)
+        before = some.loss(signals)
         candidates: list[tuple[float, int, float, FloatArray]] = []
         for index, frame in enumerate(self.frames):
             for offset in np.arange(frame.low[2], frame.high[2] + self.wavelength_m / 16, self.wavelength_m / 16):
@@ -182,24 +248,22 @@ class Search:
                 if plane.fine.sum() < LEAST_ROWS:
                     continue
                 tx = known.tx[plane.path]
-                near = np.abs(plane.crossing - plane.place[tx]).max(axis=1) < PATCH_M
+                near = np.abs(plane.crossing - plane.point[tx]).max(axis=1) < PATCH_M
                 hidden = np.unique(plane.path[near & plane.fine[tx]])
                 changed = plane.wave[0].copy()
                 np.subtract.at(changed, known.tx[hidden], known.wave[hidden])
                 use = np.flatnonzero(plane.fine)
-                gain = before[use] - self._grid.loss(signals[use] + changed[use], shapes[use])[0]
+                gain = before[use] - some.loss(signals[use] + changed[use], use)
                 for half in HALF_M:
-                    first, second = (np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1))
-                    inside = [
-                        (np.abs(plane.place[use, i] - centres[:, None]) < half).astype(float)
-                        for i, centres in ((0, first), (1, second))
-                    ]
-                    total = (inside[0] * gain) @ inside[1].T
+                    grid = [np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1)]
+                    first, second = (
+                        (np.abs(plane.point[use, i] - grid[i][:, None]) < half).astype(float) for i in (0, 1)
+                    )
+                    total = (first * gain) @ second.T
                     for i, j in np.argwhere(total > LEAST_SEED):
-                        candidates.append(
-                            (float(total[i, j]), index, float(offset), np.array([first[i], second[j], half]))
-                        )
-        candidates.sort(key=lambda one: -one[0])
+                        patch = np.array([grid[0][i], grid[1][j], half])
+                        candidates.append((float(total[i, j]), index, float(offset), patch))
+        candidates.sort(key=lambda candidate: -candidate[0])
         seeds: list[tuple[int, float, FloatArray]] = []
         for _, index, offset, patch in candidates:
             apart = all(
@@ -212,38 +276,16 @@ class Search:
                 break
         return seeds
 
-    def gain(self, sheet: Sheet, plane: Plane, signals: ComplexArray, before: FloatArray) -> float:
-        """By how much the loss falls with a sheet; 0 where too few transmitters see it."""
-        row, added = self.change(sheet, plane)
-        if len(row) < LEAST_ROWS:
-            return 0.0
-        after, _ = self._grid.loss(signals[row] + added, self._shapes[row])
-        return float((before[row] - after).sum())
+
+Judged = tuple[float, Sheet]
+"""A sheet and its gain."""
 
 
 class Growth:
-    """A patch whose edges and plane move as long as the loss falls.
-
-    Args:
-        search: with its rows.
-        signals: what is explained already [n, m].
-        before: its loss [n].
-        frame: family of planes.
-        offset_m: of the plane.
-        patch: its centre and half its edge.
-
-    Attributes:
-        best: gain and sheet so far.
-    """
+    """A patch, given by family, offset, centre and half size, whose edges and plane move as long as the loss falls."""
 
     def __init__(
-        self,
-        search: Search,
-        signals: ComplexArray,
-        before: FloatArray,
-        frame: int,
-        offset_m: float,
-        patch: FloatArray,
+        self, search: Search, signals: ComplexArray, before: FloatArray, frame: int, offset_m: float, patch: FloatArray
     ) -> None:
         self._search, self._signals, self._before, self._frame = search, signals, before, frame
         self._family, self._planes = search.frames[frame], dict[float, Plane]()
@@ -252,61 +294,50 @@ class Growth:
         edges = (x - half, x + half, y - half, y + half)
         self.best = self._swept(self._judged(offset_m, edges), np.linspace(-self._half / 4, self._half / 4, 5))
 
-    def grow(self) -> tuple[float, Sheet]:
-        """Gain and sheet when nothing helps any more."""
+    def grow(self) -> Judged:
+        """Gain and sheet when no change helps any more."""
         if self.best[0] <= 0:
             return self.best
         best = self._edged(self.best, 0.4)
-        # Planes half a wavelength apart look alike in phase: the likeliest gets its chance with edges of its own.
-        others = [
-            self._swept(
-                self._judged(best[1].offset_m + shift * self._half, best[1].edges_m), np.linspace(-0.04, 0.04, 9)
-            )
-            for shift in (-2, -1, 1, 2)
-        ]
-        other = max(others, key=lambda one: one[0])
+        # Planes half a wavelength apart look alike in phase: the likeliest gets edges of its own.
+        judged = (self._judged(best[1].offset_m + shift * self._half, best[1].edges_m) for shift in (-2, -1, 1, 2))
+        others = [self._swept(each, np.linspace(-0.04, 0.04, 9)) for each in judged]
+        other = max(others, key=itemgetter(0))
         if other[0] > 0.6 * best[0]:
-            best = max(best, self._edged(other, 0.2), key=lambda one: one[0])
+            best = max(best, self._edged(other, 0.2), key=itemgetter(0))
         self._planes.clear()
         return best
 
-    def _judged(self, offset: float, edges: tuple[float, ...], only: int | None = None) -> tuple[float, Sheet]:
+    def _judged(self, offset: float, edges: tuple[float, ...], kind: int | None = None) -> Judged:
+        """The better kind, or the given one, of a sheet within the family's bounds; gain 0 where it is too small."""
         family = self._family
-        limits = [(family.low[i // 2], family.high[i // 2]) for i in range(4)]
-        a, b, c, d = (float(np.clip(e, *limit)) for e, limit in zip(edges, limits, strict=True))
-        best = 0.0, Sheet(self._frame, offset, (a, b, c, d), 0)
+        low, high = np.repeat(family.low[:2], 2), np.repeat(family.high[:2], 2)
+        a, b, c, d = clipped = tuple(np.clip(edges, low, high).tolist())
+        best = 0.0, Sheet(self._frame, offset, clipped, 0)
         inside = family.low[2] - LEAST_M < offset < family.high[2] + LEAST_M
         if b - a < LEAST_M or d - c < LEAST_M or not inside:
             return best
         if offset not in self._planes:
             self._planes[offset] = self._search.plane(self._frame, offset)
-        for kind in range(len(KINDS)) if only is None else (only,):
-            sheet = Sheet(self._frame, offset, (a, b, c, d), kind)
+        for each in range(KINDS.shape[1]) if kind is None else (kind,):
+            sheet = Sheet(self._frame, offset, clipped, each)
             gain = self._search.gain(sheet, self._planes[offset], self._signals, self._before)
-            if gain > best[0]:
-                best = gain, sheet
+            best = max(best, (gain, sheet), key=itemgetter(0))
         return best
 
-    def _swept(self, best: tuple[float, Sheet], offsets: FloatArray) -> tuple[float, Sheet]:
+    def _swept(self, best: Judged, offsets: FloatArray) -> Judged:
         tries = [self._judged(best[1].offset_m + float(shift), best[1].edges_m) for shift in offsets]
-        return max([best, *tries], key=lambda one: one[0])
+        return max([best, *tries], key=itemgetter(0))
 
-    def _edged(self, best: tuple[float, Sheet], step: float) -> tuple[float, Sheet]:
+    def _edged(self, best: Judged, step: float) -> Judged:
         while step >= 0.05:
             old = best[0]
             for edge in range(4):
                 for change in (-step, step):
                     edges = list(best[1].edges_m)
                     edges[edge] += change
-                    tried = self._judged(best[1].offset_m, tuple(edges), best[1].kind)
-                    best = max(best, tried, key=lambda one: one[0])
+                    best = max(best, self._judged(best[1].offset_m, tuple(edges), best[1].kind), key=itemgetter(0))
             best = self._swept(best, np.array([-0.01, -0.003, 0.003, 0.01]))
             if best[0] <= old + 1e-6:
                 step /= 2
         return best
-
-
-def _inside(place: FloatArray, edges: tuple[float, ...]) -> NDArray[np.bool_]:
-    a, b, c, d = edges
-    inside: NDArray[np.bool_] = (place[:, 0] > a) & (place[:, 0] < b) & (place[:, 1] > c) & (place[:, 1] < d)
-    return inside
