@@ -54,7 +54,7 @@ def thin(points_m: FloatArray) -> Thinned:
     cloud, kept = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
     if len(kept) < STRAY_NEIGHBOURS:
         raise InputError(f"only {len(kept)} points have neighbours; give a denser point cloud")
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamPhysics(NORMAL_RADIUS_M * voxel / VOXEL_M, NORMAL_NEIGHBOURS))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS_M * voxel / VOXEL_M, NORMAL_NEIGHBOURS))
     return Thinned(np.asarray(cloud.points), count[kept], np.asarray(cloud.normals), voxel)
 
 
