@@ -16,8 +16,7 @@ from wrf_mi.scene.plan import read_walls
 from wrf_mi.scene.plan_align import grid_from_scans
 from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_plan
 from wrf_mi.scene.plan_walls import find_walls
-from wrf_mi.scene.register import register_walls
-from wrf_mi.scene.register_search import sample_walls
+from wrf_mi.scene.register import register_walls, sample_walls
 
 NEAR_M = 0.2
 """Walls agree within the blur of the robot's poses."""

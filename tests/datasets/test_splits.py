@@ -218,10 +218,10 @@ def test_bad_split_files(tmp_path: Path):
     with pytest.raises(InputError, match="missing"):
         load_split(path)
     path.write_text("no npz")
-    with pytest.raises(InputError, match="not a split file"):
+    with pytest.raises(InputError, match="not readable"):
         load_split(path)
     np.savez(path, train=np.arange(3))
-    with pytest.raises(InputError, match="not a split file"):
+    with pytest.raises(InputError, match="not readable"):
         load_split(path)
     rows = np.arange(3)
     head = {"format": 1, "name": "a", "seed": 0, "train": rows}

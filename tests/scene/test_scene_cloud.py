@@ -13,7 +13,7 @@ from made_rooms import attic, by_kind, closed_box, l_shape, sampled, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
-from wrf_mi.scene import packages
+from wrf_mi.scene import points
 from wrf_mi.scene.cloud import surfaces_from_points
 from wrf_mi.scene.surfaces import Surface
 
@@ -146,7 +146,7 @@ def test_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    assert packages.import_module is importlib.import_module
-    monkeypatch.setattr(packages, "import_module", missing)
+    assert points.import_module is importlib.import_module
+    monkeypatch.setattr(points, "import_module", missing)
     with pytest.raises(InputError, match=r"need open3d: pip install 'wrf-mi\[lidar\]'"):
         surfaces_from_points(np.zeros((100, 3)))

@@ -11,8 +11,7 @@ from calling import call
 from made_rooms import Mesh, attic, by_kind, l_shape
 
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.mesh import read_mesh
-from wrf_mi.scene.mesh_planes import planes_of_mesh
+from wrf_mi.scene.mesh import planes_of_mesh, read_mesh
 from wrf_mi.scene.surfaces import Surface
 
 

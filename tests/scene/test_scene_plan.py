@@ -20,7 +20,7 @@ from made_plans import (
 )
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan import floor_of, layout_walls, make_plan, plan_surfaces
+from wrf_mi.scene.plan import floor_of, layout_walls, plan_surfaces, walls_of_plan
 from wrf_mi.scene.plan_align import grid_from_scans, sensor_of
 from wrf_mi.scene.plan_lines import dominant_direction
 from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, grid_from_points, grid_from_probability, read_layout
@@ -138,7 +138,7 @@ def test_scans_with_wrong_poses_are_aligned():
     grid = grid_from_scans(xy, time)
     blurred = grid_from_points(xy)
     assert np.count_nonzero(grid.occupied) < 0.5 * np.count_nonzero(blurred.occupied)
-    walls = make_plan(PlanPoints(xy, time)).walls_m
+    walls = walls_of_plan(PlanPoints(xy, time))
     # In its own frame, off by the mean error of the poses.
     found, right = agreement(walls, TWO_ROOMS_M, 0.25)
     assert found > 0.95
@@ -168,7 +168,7 @@ def test_layout_is_extruded_as_it_is(tmp_path):
     doubled = np.array([[0, 0], [4, 0], [4, 3], [2, 3], [2, 1], [2, 3], [0, 3], [0, 0]], float)
     file = tmp_path / "layout.csv"
     file.write_text("x,y\n" + "\n".join(f"{x},{y}" for x, y in doubled) + "\n")
-    surfaces = plan_surfaces(file, height_m=2.5, floor_m=0.2)
+    surfaces = plan_surfaces(read_layout(file), height_m=2.5, floor_m=0.2)
     kinds = [s.kind for s in surfaces]
     assert kinds[:2] == ["floor", "ceiling"]
     assert sum(s.area_m2 for s in surfaces if s.kind == "wall") == pytest.approx(2.5 * (4 + 3 + 4 + 3 + 2))
@@ -230,8 +230,7 @@ def test_flat_from_the_robots_map():
     from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 
     from wrf_mi.scene.plan_sources import read_plan
-    from wrf_mi.scene.register import register_walls
-    from wrf_mi.scene.register_search import sample_walls
+    from wrf_mi.scene.register import register_walls, sample_walls
 
     home = Path(DATA, "flat-ble")
     grid = read_plan(home / "lidar" / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0)

@@ -117,10 +117,10 @@ def test_arrays_that_are_no_plan(tmp_path, arrays, line):
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
-        ("a.csv", "a,b\n0,0\n1,1\n", "line 1: the header is not x,y"),
-        ("a.csv", "", "line 1: the header"),
-        ("a.csv", "x,y\n0,0\n1\n", "line 3: expected two numbers"),
-        ("a.csv", "x,y\n0,0\n1,nan\n", "line 3: expected two numbers"),
+        ("a.csv", "a,b\n0,0\n1,1\n", "line 1: header is .a,b.; it must be x,y"),
+        ("a.csv", "", "empty; give a header"),
+        ("a.csv", "x,y\n0,0\n1\n", "row 2: 1 field, but the header has 2"),
+        ("a.csv", "x,y\n0,0\n1,nan\n", "row 2: y is .nan.; give a finite number"),
         ("a.csv", "x,y\n1,1\n1,1\n", "no wall"),
         ("a.csv", "x,y\n1,1\n", "no wall"),
         ("a.xyz", "1 2\n1 2 3\n", "line 2: expected two numbers"),

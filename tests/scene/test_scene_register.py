@@ -9,8 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from wrf_mi.core import InputError
 from wrf_mi.scene.plan import layout_walls, plan_surfaces
-from wrf_mi.scene.register import read_pairs, register_pairs, register_walls, wall_points
-from wrf_mi.scene.register_search import distance_to_walls, sample_walls
+from wrf_mi.scene.register import (
+    distance_to_walls,
+    read_pairs,
+    register_pairs,
+    register_walls,
+    sample_walls,
+    wall_points,
+)
 
 L_WALLS = layout_walls(L_ROOM_M)
 EXACT_M = 1e-9
@@ -81,10 +87,10 @@ def test_pairs_from_a_file(tmp_path):
     assert source.tolist() == [[0, 0], [2, 0]]
     assert target.tolist() == [[1, 1], [1, 3]]
     file.write_text("x,y,z,to_x,to_y,to_z\n0,0,0,1,1\n")
-    with pytest.raises(InputError, match=r"pairs.csv: line 2: expected 6 numbers"):
+    with pytest.raises(InputError, match=r"pairs.csv: row 1: 5 fields, but the header has 6"):
         read_pairs(file)
-    file.write_text("a,b\n")
-    with pytest.raises(InputError, match="line 1: the header is neither"):
+    file.write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"line 1: header is .a,b.; it must be x,y,z,to_x,to_y,to_z or x,y,to_x,to_y"):
         read_pairs(file)
 
 

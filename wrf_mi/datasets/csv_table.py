@@ -11,7 +11,9 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line, text_lines
-from .folder_files import SINGLE_MAX
+
+SINGLE_MAX = float(np.finfo(np.float32).max)
+"""Largest number in single precision, in which everything is computed."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class CsvTable:
     """A CSV file with a header.
 
     Attributes:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         header: names of the columns.
         rows: text of each field, one list per row, each as long as the header.
     """
@@ -29,38 +31,34 @@ class CsvTable:
     rows: list[list[str]]
 
     def numbers(self, column: str, may_be_empty: bool = False) -> FloatArray:
-        """Numbers of a column, shape [rows].
-
-        Args:
-            column: its name.
-            may_be_empty: read an empty field (or ``nan``) as NaN.
+        """Numbers of a column, shape [rows]; an empty field or ``nan`` is NaN if it is allowed.
 
         Raises:
             InputError: no such column, or a field that is not a finite number, in single precision too.
         """
-        return self.numbers_at(self._place(column), column, may_be_empty)
+        return self.numbers_at(self._index(column), column, may_be_empty)
 
     def texts(self, column: str) -> list[str]:
-        """Fields of a column as they stand.
+        """Fields of a column as text.
 
         Raises:
             InputError: no such column.
         """
-        place = self._place(column)
-        return [fields[place] for fields in self.rows]
+        index = self._index(column)
+        return [fields[index] for fields in self.rows]
 
-    def _place(self, column: str) -> int:
+    def _index(self, column: str) -> int:
         if self.header.count(column) != 1:
             what = "has no column" if column not in self.header else "has twice the column"
             text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
             raise InputError(f"{self.path}: {text}; the first line must name each column once")
         return self.header.index(column)
 
-    def numbers_at(self, place: int, what: str, may_be_empty: bool = False) -> FloatArray:
-        """Numbers of the column at a place from 0, whatever its name: ``numbers`` with what messages call it."""
+    def numbers_at(self, index: int, what: str, may_be_empty: bool = False) -> FloatArray:
+        """Numbers of the column at an index, which messages call ``what``."""
         values = np.full(len(self.rows), np.nan)
         for row, fields in enumerate(self.rows):
-            text = fields[place].strip()
+            text = fields[index].strip()
             if may_be_empty and text.lower() in ("", "nan"):
                 continue
             try:
@@ -78,8 +76,8 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     """Read a CSV file whose first line is its header.
 
     Args:
-        path: of the file.
-        skip_blank: skip blank lines, as pandas does, and count rows without them; else they are refused.
+        path: path of the file.
+        skip_blank: skip blank lines, as pandas does, and count rows without them; otherwise they are refused.
 
     Raises:
         InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
@@ -98,3 +96,16 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
             text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
             raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
     return CsvTable(path, [name.strip() for name in header], rows)
+
+
+def read_columns(path: Path, *headers: str) -> FloatArray:
+    """Numbers [rows, columns] of a CSV file with one of some headers, such as ``x,y,z``.
+
+    Raises:
+        InputError: another header, or as `read_csv` and `CsvTable.numbers`.
+    """
+    table = read_csv(path)
+    found = ",".join(table.header)
+    if found.lower() not in headers:
+        raise InputError(f"{path}: line 1: header is {found[:40]!r}; it must be {' or '.join(headers)}")
+    return np.stack([table.numbers_at(index, name) for index, name in enumerate(table.header)], axis=-1)

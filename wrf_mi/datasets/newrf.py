@@ -8,8 +8,8 @@ room's mesh beside it as ``<room>.stl``, metres:
 - for each path ``path_gain`` [p] complex and ``path_last_point`` [p, 3], its last interaction point (the
   transmitter's position for the line of sight); receiver i has paths ``path_offsets[i]:path_offsets[i + 1]``.
 
-Here the *receiver* moves. By reciprocity the record's transmitter is that moving end, and its one receiver stands at
-the file's ``tx_pos``.
+The *receiver* of these data moves. By reciprocity the record's transmitter is the moving end, and its receiver stands
+at the file's ``tx_pos``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
-from ..core.files import one_line
+from ..core.antenna import UPRIGHT
+from ..core.files import readable, stored_arrays
+from .folder_files import single_file
 
 KEYS = ("tx_pos", "rx_pos", "frequency_hz", "csi", "line_of_sight", "path_offsets", "path_gain", "path_last_point")
 """All arrays of a room's file; a record needs the first four."""
@@ -35,8 +37,8 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     """Read and check one room.
 
     Args:
-        path: ``<room>.npz``, or a folder that holds one such file.
-        name: the record's name; the file's own without its ending by default.
+        path: path of ``<room>.npz``, or of a folder with such a file.
+        name: name of the record; by default that of the file without its ending.
 
     Returns:
         A record with ``task="csi"``: ``observation`` [1, n, 1] complex64, ``tx_pos_m`` the file's ``rx_pos``.
@@ -44,7 +46,7 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file, the array and the row.
     """
-    file = room_file(Path(path))
+    file = single_file(Path(path), (".npz",), "one room in .npz")
     arrays = read_arrays(file, KEYS[:4])
     _check(file, arrays)
     n = len(arrays["rx_pos"])
@@ -55,7 +57,7 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
         name=name or file.stem,
         task="csi",
         tx_pos_m=arrays["rx_pos"].astype(float),
-        receivers=(Receiver("access-point", arrays["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0])),),
+        receivers=(Receiver("access-point", arrays["tx_pos"].astype(float), np.array(UPRIGHT)),),
         observation=arrays["csi"].astype(np.complex64)[None, :, None],
         official=(np.arange(n - n_test), np.arange(n - n_test, n)),
         frequencies_hz=np.array([float(arrays["frequency_hz"])]),
@@ -63,23 +65,8 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     )
 
 
-def room_file(path: Path) -> Path:
-    """The one ``.npz`` file of a folder, or the file itself.
-
-    Raises:
-        InputError: none, or several.
-    """
-    if not path.is_dir():
-        return path
-    rooms = sorted(path.glob("*.npz"))
-    if len(rooms) != 1:
-        found = ", ".join(room.name for room in rooms) or "none"
-        raise InputError(f"{path}: one room in .npz is read at a time, found {found}; give the file itself")
-    return rooms[0]
-
-
 def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 (hex) over the arrays of a room: their names, types, shapes and bytes, whatever file holds them."""
+    """SHA-256 (hex) over the names, types, shapes and bytes of a room's arrays."""
     digest = hashlib.sha256()
     for key in KEYS:
         values = np.asarray(arrays[key])
@@ -90,20 +77,16 @@ def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def read_arrays(file: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of a room's file as they are there.
+    """Some arrays of a room's file.
 
     Raises:
-        InputError: missing or damaged, or one of the arrays is missing.
+        InputError: the file is missing or damaged, or an array is missing.
     """
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in keys}
-    except FileNotFoundError:
-        raise InputError(f"{file}: missing; give a room's .npz file") from None
-    except KeyError as error:
-        raise InputError(f"{file}: no array ({one_line(error)}); a room needs {', '.join(keys)}") from None
-    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{file}: not readable as .npz ({one_line(error)}); convert or fetch it again") from None
+    with readable(file, f"{file}: missing; give a room's .npz file", "convert or fetch it again"):
+        arrays = stored_arrays(file)
+    if lacking := [key for key in keys if key not in arrays]:
+        raise InputError(f"{file}: no array {lacking[0]}; a room needs {', '.join(keys)}")
+    return {key: arrays[key] for key in keys}
 
 
 def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -1,7 +1,7 @@
-"""Scene folders: one room as meshes, materials and a file that Mitsuba and Sionna RT both open.
+"""Scene folders: a room as meshes, materials and a file that Mitsuba and Sionna RT both open.
 
-``scene.xml`` and ``meshes/*.ply`` are the scene, ``materials.yml`` the file to edit, ``scene.yml`` what is known about
-it, ``preview.png`` a picture.
+``scene.xml`` and ``meshes/*.ply`` are the scene, ``materials.yml`` is the file to edit, ``scene.yml`` holds source,
+frame and counts, and ``preview.png`` is a picture.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -21,7 +20,8 @@ from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, one_line, text_lines, write_atomically
+from ..core.files import atomic_folder, one_line, write_atomically
+from ..datasets.folder_files import read_yaml
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .surfaces import Surface
@@ -35,17 +35,17 @@ PREVIEW_FILE = "preview.png"
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """A scene folder that was read.
+    """Content of a scene folder.
 
     Attributes:
-        folder: where it is.
-        xml: its scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
+        folder: path of the folder.
+        xml: scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
         materials: complete: every rule, surface and thickness.
         description: one line.
         frame: axes and origin of the coordinates.
-        source: the file it was made from.
-        registration: 4 x 4 matrix that took the source's frame to the scene's, or None.
-        counts: numbers of surfaces, faces and, of a scan, points.
+        source: file that the scene was made from.
+        registration: 4 x 4 matrix from the source's frame to the scene's, or None.
+        counts: numbers of surfaces, faces and, for a scan, points.
     """
 
     folder: Path
@@ -76,26 +76,26 @@ def write_scene(
     counts: Mapping[str, int] | None = None,
     replace: bool = False,
 ) -> Path:
-    """Write a scene folder whole or not at all.
+    """Write a scene folder atomically.
 
     Args:
-        folder: to make.
-        surfaces: in the scene's frame, metres.
+        folder: path of the folder.
+        surfaces: surfaces in the scene's frame, metres.
         frame: axes and origin of the coordinates, one line.
-        source: the file that the surfaces were made from.
+        source: file that the surfaces were made from.
         materials: rules and exceptions; None takes the default rules.
         registration: 4 x 4 matrix from the source's frame to the scene's that has been applied already, or None.
         description: one line.
         points_m: a sample of the scan [n, 3] or [n, 2] in the scene's frame for the preview.
-        counts: further numbers to state.
-        replace: let it take the place of an existing folder.
+        counts: further numbers for ``scene.yml``.
+        replace: replace an existing folder.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names a surface
-            that is not there.
+        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names an unknown
+            surface.
     """
     from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
 
@@ -136,15 +136,18 @@ def write_scene(
 
 
 def read_scene_folder(folder: str | Path) -> SceneFolder:
-    """Read a scene folder and let ``scene.xml`` follow ``materials.yml``.
+    """Read a scene folder.
 
-    Where the two name different materials, ``scene.xml`` is written anew (and what was added to it by hand is lost).
+    If ``scene.xml`` and ``materials.yml`` name different materials, ``scene.xml`` is written anew; additions by hand
+    are lost.
 
     Raises:
         InputError: a file is missing or damaged, a surface has no mesh, or the scene file cannot be written.
     """
     folder = Path(folder)
-    facts = _facts(folder / FACTS_FILE)
+    facts = read_yaml(folder / FACTS_FILE)
+    if missing := [key for key in ("description", "frame", "xml", "source") if key not in facts]:
+        raise InputError(f"{folder / FACTS_FILE}: no {missing[0]} in it; write the scene anew")
     materials = read_materials(folder / MATERIALS_FILE)
     xml = folder / facts["xml"]
     meshes = {path.stem for path in (folder / "meshes").glob("*.ply")}
@@ -174,18 +177,6 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
 
 def _xml(materials: Materials) -> str:
     return scene_xml({name: materials.of(name, "other") for name in materials.surfaces})
-
-
-def _facts(path: Path) -> dict[str, Any]:
-    try:
-        facts = yaml.safe_load("\n".join(text_lines(path)))
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({one_line(error)})") from None
-    if not isinstance(facts, dict):
-        facts = {}
-    if missing := [key for key in ("description", "frame", "xml", "source") if key not in facts]:
-        raise InputError(f"{path}: no {missing[0]} in it; write the scene anew")
-    return facts
 
 
 def _materials_in(xml: Path) -> dict[str, str]:
