@@ -10,7 +10,8 @@ import pytest
 import trimesh
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
-from wrf_mi_scenes.furnished import measured_parts, write_scene
+from wrf_mi_scenes.furnished import measured_parts
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array

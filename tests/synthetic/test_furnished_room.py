@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_scenes.furnished import furnished_parts, measured_parts, write_scene
+from wrf_mi_scenes.furnished import furnished_parts, measured_parts
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import element_signals
-from wrf_mi.synthetic.furnished_room import TracedRoom, array_signals, traced_room, transmitters
+from wrf_mi.synthetic.furnished_room import TracedRoom, traced_room, transmitters
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.array_channels import array_channels
 from wrf_mi.tracing.devices import solids, winding_number
 from wrf_mi.tracing.surfaces import scene_surfaces
 
@@ -77,7 +79,7 @@ def test_specular_signals_are_those_of_the_other_direction(tmp_path: Path) -> No
     there = trace_paths(scene, tx, RECEIVER, options).paths
     back = trace_paths(scene, RECEIVER.position_m, ends, TraceOptions(max_depth=2, rays=1 << 14)).paths
     expected = element_signals(there, RECEIVER, array_m, FREQUENCY_HZ)[0]
-    found = array_signals(back, RECEIVER, array_m, FREQUENCY_HZ)
+    found = array_channels(back, RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
@@ -88,7 +90,7 @@ def test_scattered_waves_come_from_their_last_point(tmp_path: Path) -> None:
     options = TraceOptions(scattering=True, max_depth=1, rays=1 << 8)
     paths = trace_paths(scene, RECEIVER.position_m, ends, options).paths
     one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
-    found = array_signals(one, RECEIVER, array_m, FREQUENCY_HZ)[0]
+    found = array_channels(one, RECEIVER, array_m, FREQUENCY_HZ)[0, :, 0]
     point = one.vertices_m[0, 0]
     elements = RECEIVER.position_m + array_m @ RECEIVER.to_world.T
     wavenumber = 2 * np.pi * FREQUENCY_HZ / 299792458.0

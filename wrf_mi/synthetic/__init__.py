@@ -1,4 +1,4 @@
-"""Data sets that are traced on this machine: the laboratory, a furnished room, channels of two floors."""
+"""Synthetic data sets, traced on this machine: the laboratory, a furnished room, channels of two floors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["laboratory_record", "load_record", "traced_room", "walked_channels"]
 
 
 def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
-    """Read any data set as `wrf_mi.datasets.load` does, and trace what is made on this machine where it is asked for.
+    """Read any data set as `wrf_mi.datasets.load` does, or trace a synthetic data set.
 
-    These are the embedded ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
+    Synthetic are ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
     ``traced-csi-office`` (a minute or two each).
 
     Args:
-        name_or_folder: a folder, or a known data set's name.
-        progress: show a progress bar on standard error where tracing takes time.
+        name_or_folder: a folder, or the name of a known data set.
+        progress: show a progress bar on standard error while tracing.
 
     Raises:
         InputError: as `wrf_mi.datasets.load`.
