@@ -45,11 +45,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def data_folder(path: str | Path, content: str) -> Path:
-    """The path of a folder.
-
-    Raises:
-        InputError: it is not a folder; ``content`` ends the message.
-    """
+    """The path of a folder; an `InputError` that ends with ``content`` if it is none."""
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder; give one that holds {content}")
@@ -57,11 +53,7 @@ def data_folder(path: str | Path, content: str) -> Path:
 
 
 def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
-    """The file of a folder with one of some suffixes, or the path itself where it is no folder.
-
-    Raises:
-        InputError: no such file, or several.
-    """
+    """The only file of a folder with one of some suffixes, or the path itself where it is no folder."""
     if not path.is_dir():
         return path
     found = sorted(file for file in path.iterdir() if file.suffix in suffixes)
@@ -86,11 +78,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
 
 
 def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:
-    """A list of finite numbers from YAML, shape [count].
-
-    Raises:
-        InputError: the value is anything else, or exceeds single precision.
-    """
+    """A list of finite numbers from YAML, shape [count]; an `InputError` for anything else."""
     values = numbers_of(value)
     if values.shape != (count,) or not fits_single(values):
         raise InputError(f"{path}: {one_line(what)} is {shown(value)}; give a list of {count} finite numbers")
@@ -117,11 +105,7 @@ def shown(value: object) -> str:
 
 
 def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
-    """An orientation from YAML: a unit quaternion x, y, z, w.
-
-    Raises:
-        InputError: the value is no unit quaternion.
-    """
+    """An orientation from YAML: a unit quaternion x, y, z, w; an `InputError` for anything else."""
     orientation = finite_numbers(path, f"{name}: orientation", value, 4)
     norm = float(np.linalg.norm(orientation))
     if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
@@ -131,11 +115,7 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
 
 
 def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS) -> Antenna:
-    """An antenna from YAML: a mapping with some of ``words``; the default antenna for None.
-
-    Raises:
-        InputError: anything else; the message names ``path`` and the entry ``name``.
-    """
+    """An antenna from YAML: a mapping with some of ``words``, or None for the default; else an `InputError`."""
     if value is None:
         return ANTENNA
     if not isinstance(value, dict) or not set(value) <= set(words):
@@ -166,11 +146,7 @@ def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:
 
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
-    """Checked carriers [n] of a file's column `FREQUENCY`.
-
-    Raises:
-        InputError: a carrier that is not positive.
-    """
+    """Carriers [n] of a file's column `FREQUENCY`; an `InputError` if one is not positive."""
     if len(bad := np.flatnonzero(~(carriers_hz > 0))):
         text = f"row {bad[0] + 1}: {FREQUENCY} is {carriers_hz[bad[0]]:g}"
         raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
@@ -178,11 +154,7 @@ def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
 
 
 def whole_number(path: Path, line: int, text: str) -> int:
-    """The whole number from 0 on a line.
-
-    Raises:
-        InputError: the line holds anything else.
-    """
+    """The whole number from 0 on a line; an `InputError` for anything else."""
     digits = text.strip()
     if not (digits.isascii() and digits.isdecimal()):
         raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
@@ -230,11 +202,7 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
 
 
 def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
-    """Refuse to write a record with attributes that a layout does not state.
-
-    Raises:
-        InputError: the first of the names that the record has.
-    """
+    """Refuse to write a record with one of some attributes, which a layout does not state."""
     for name in names:
         if getattr(record, name) is not None:
             remedy = f"set Record.{name} to None, or use another layout"

@@ -6,9 +6,11 @@ import os
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pooch
+import yaml
 
 from ..core import InputError, Record
 from ..core.arrays import planar_array
@@ -66,7 +68,7 @@ class DataSet:
     file: str | None = None
     shared_folder: str | None = None
     frequency_hz: float | None = None
-    array: tuple[int, int, float] | None = None
+    array: list[Any] | None = None
     note: str = ""
 
 
@@ -78,68 +80,12 @@ class DataSetStatus:
     location: Path | None
 
 
-KNOWN = (
-    DataSet(
-        name="rfid-lab",
-        task="spectrum",
-        licence="MIT",
-        origin="data by the authors of NeRF2; GitHub wenchaozheng/WRF-GSplus, folder data_test200",
-        base_url="https://raw.githubusercontent.com/wenchaozheng/WRF-GSplus",
-        manifest="rfid-lab.txt",
-        folds="rfid-lab-blocked_folds.txt",
-        # Only frequency times spacing follows from the spectra; 915 MHz and 0.161 m fit as well.
-        frequency_hz=920e6,
-        array=(4, 4, 0.16),
-    ),
-    DataSet(
-        name="flat-ble",
-        task="rssi",
-        licence="CC BY 4.0",
-        origin="M. Kolakowski, Sensors 21, 6270 (2021), doi 10.5281/zenodo.5457591; "
-        "GitHub marckolak/ble-rss-fingerprints-calib2021",
-        base_url="https://raw.githubusercontent.com/marckolak/ble-rss-fingerprints-calib2021",
-        manifest="flat-ble.txt",
-        note="lidar/points.npz and lidar/gridmap.npz, which some copies of this data set hold, were derived from its "
-        "scans by steps that are not published: they cannot be made again here. layout.csv has the walls.",
-    ),
-    *(
-        DataSet(
-            name=f"newrf-{room}",
-            task="csi",
-            licence="MIT",
-            origin="channels computed by MATLAB's ray tracer (image method); H. Lu, GitHub LuHaofan/NeWRF",
-            base_url="https://raw.githubusercontent.com/LuHaofan/NeWRF",
-            manifest=f"newrf-{room}.txt",
-            file=f"{room}.npz",
-            shared_folder="newrf",
-        )
-        for room in ("conference", "office")
-    ),
-    DataSet(
-        name="laboratory",
-        task="spectrum",
-        licence="MIT",
-        origin="traced on this machine by Sionna RT in the scene of the same name (wrf_mi.synthetic.load_record)",
-    ),
-    DataSet(
-        name="traced-room",
-        task="spectrum",
-        licence="MIT",
-        origin="traced on this machine by Sionna RT in the laboratory with furniture (wrf_mi.synthetic.load_record)",
-        note="room/ in it is the scene that a model may be given: bare walls, some centimetres off, of one material.",
-    ),
-    *(
-        DataSet(
-            name=f"traced-csi-{place}",
-            task="csi",
-            licence="MIT",
-            origin=f"traced on this machine by Sionna RT in a made-up {place} (wrf_mi.synthetic.load_record)",
-            note="uplink and downlink are noisy at 25 dB; scores are held against the downlink without noise. "
-            "floor/ in it is the scene that a model may be given: bare walls, some centimetres off, of one material.",
-        )
-        for place in ("flat", "office")
-    ),
-)
+def _known() -> tuple[DataSet, ...]:
+    text = (files(__package__) / "data" / "datasets.yml").read_text(encoding="utf-8")
+    return tuple(DataSet(**entry) for entry in yaml.safe_load(text))
+
+
+KNOWN = _known()
 
 
 def known(name: str) -> DataSet:

@@ -31,11 +31,8 @@ def kinds(planes: Sequence[Plane], areas: Sequence[Any], middle_m: float) -> lis
 
     Level planes that are large are floors and ceilings in turn from the lowest up, at least `STOREY_M` apart; steeper
     large planes over a floor are sloping ceilings. Upright planes that span most of a room's height are walls.
-
-    Args:
-        planes: with their axes set.
-        areas: the area of each (shapely), in its coordinates.
-        middle_m: median height of the points, which separates floors from ceilings where there is only one of them.
+    The areas (shapely) are in the coordinates of their planes. The median height of the points, ``middle_m``, separates
+    floors from ceilings where there is only one of them.
     """
     found: list[Kind] = ["other"] * len(planes)
     shadow = [footprint(plane, area) for plane, area in zip(planes, areas, strict=True)]

@@ -24,12 +24,8 @@ def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]
     """Extend or cut areas to the lines where their planes meet.
 
     Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
-    line is made to end there; an area on both sides stays, and the other ends at it.
-
-    Args:
-        planes: p planes with their axes set.
-        areas: the area of each (shapely), in the plane's coordinates.
-        reach_m: largest gap or overlap that is closed, for each plane.
+    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
+    coordinates of their planes.
     """
     areas = list(areas)
     for _ in range(PASSES):

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from ..core import InputError
-from ..core.angles import FloatArray
 from ..core.files import atomic_folder, one_line, write_atomically
 from ..datasets.folder_files import read_yaml
 from .materials import FILE as MATERIALS_FILE
@@ -41,20 +40,12 @@ class SceneFolder:
         folder: path of the folder.
         xml: scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
         materials: complete: every rule, surface and thickness.
-        description: one line.
-        frame: axes and origin of the coordinates.
-        source: file that the scene was made from.
-        registration: 4 x 4 matrix from the source's frame to the scene's, or None.
         counts: numbers of surfaces, faces and, for a scan, points.
     """
 
     folder: Path
     xml: Path
     materials: Materials
-    description: str
-    frame: str
-    source: str
-    registration: FloatArray | None
     counts: Mapping[str, int]
 
     @property
@@ -146,8 +137,8 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
     """
     folder = Path(folder)
     facts = read_yaml(folder / FACTS_FILE)
-    if missing := [key for key in ("description", "frame", "xml", "source") if key not in facts]:
-        raise InputError(f"{folder / FACTS_FILE}: no {missing[0]} in it; write the scene anew")
+    if "xml" not in facts:
+        raise InputError(f"{folder / FACTS_FILE}: no xml in it; write the scene anew")
     materials = read_materials(folder / MATERIALS_FILE)
     xml = folder / facts["xml"]
     meshes = {path.stem for path in (folder / "meshes").glob("*.ply")}
@@ -162,17 +153,7 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         except OSError as error:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
-    registration = facts.get("registration")
-    return SceneFolder(
-        folder=folder,
-        xml=xml,
-        materials=full,
-        description=str(facts["description"]),
-        frame=str(facts["frame"]),
-        source=str(facts["source"]),
-        registration=None if registration is None else np.asarray(registration, float),
-        counts=facts.get("counts", {}),
-    )
+    return SceneFolder(folder, xml, full, facts.get("counts", {}))
 
 
 def _xml(materials: Materials) -> str:

@@ -68,16 +68,8 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
 def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
     """The area of a floor, ceiling or wall with its shadows filled: gaps before which things stand.
 
-    Neither a shadow nor an opening has points, but what casts a shadow was scanned itself. A gap with nothing before it
-    (a door, a window, the missing quarter of an L-shaped room) stays.
-
-    Args:
-        plane: with its axes set.
-        area: shapely, in the plane's coordinates.
-        kind: role of the plane; areas of kind "other" stay as they are.
-        points_m: the thinned cloud [n, 3] without the points of floors, ceilings and walls: these are seen through a
-            gap and do not hide it.
-        noise_m: standard deviation of the points.
+    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. ``points_m`` [n,
+    3] are those of things alone: floors, ceilings and walls are seen through a gap and do not hide it.
     """
     if kind == "other":
         return area

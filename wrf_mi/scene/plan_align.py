@@ -120,15 +120,12 @@ class _Canvas:
 
 
 def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -> PlanGrid:
-    """A map from scans: cells that were hit, and cells that beams went through.
+    """A map in cells of `POINT_CELL_M`: cells that were hit, and cells that beams went through.
 
     Args:
-        xy_m: returns [n, 2] in one frame, each scan moved by its pose, which may be off by some decimetres.
+        xy_m: returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres.
         time_s: time of each return's scan, shape [n].
         name: name of the source, for errors.
-
-    Returns:
-        Cells of `POINT_CELL_M`, free ones only around places of the sensor that were found.
 
     Raises:
         InputError: as `wrf_mi.scene.plan_sources.grid_from_points`.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +12,7 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line
+from ..core.files import one_line, stored_arrays
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -43,11 +42,7 @@ class Thinned:
 
 
 def lidar_package(name: str) -> Any:
-    """A package of the extra ``lidar``, imported only where a scan or plan is read.
-
-    Raises:
-        InputError: it is not installed, or a system library that it needs is missing.
-    """
+    """A package of the extra ``lidar``; an `InputError` if it or a system library that it needs is not installed."""
     try:
         return import_module(name)
     except ModuleNotFoundError:
@@ -58,11 +53,7 @@ def lidar_package(name: str) -> Any:
 
 
 def source_file(path: str | Path, units: str, wanted: str) -> Path:
-    """The path of a file in known units.
-
-    Raises:
-        InputError: unknown units, or no such file; ``wanted`` ends the message.
-    """
+    """The path of a file; an `InputError` for unknown units or a missing file, whose message ends with ``wanted``."""
     if units not in UNITS_M:
         raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
     if not Path(path).is_file():
@@ -82,12 +73,10 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
         InputError: missing file, unknown units, no points, or a point that is not finite.
     """
     file = source_file(path, units, f"a point cloud ({FORMATS})")
-    suffix = file.suffix.lower()
-    if suffix in (".las", ".laz"):
+    if file.suffix.lower() in (".las", ".laz"):
         lidar_package("laspy")  # a missing package is no fault of the file
-    read: Callable[[Path], FloatArray] = _READERS.get(suffix, _read_trimesh)
     try:
-        points = np.asarray(read(file), float)
+        points = np.asarray(_read(file), float)
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
     if points.ndim != 2 or points.shape[1] != 3:
@@ -101,11 +90,7 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building.
-
-    Raises:
-        InputError: they look like millimetres or centimetres, or are too small for a room.
-    """
+    """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building."""
     low, high = np.quantile(points_m, CORE, axis=0)
     size = high - low
     text = f"{name}: extent {' x '.join(f'{side:.4g}' for side in size)} m"
@@ -118,11 +103,7 @@ def check_extent(points_m: FloatArray, name: str | Path) -> None:
 
 
 def thin(points_m: FloatArray) -> Thinned:
-    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals.
-
-    Raises:
-        InputError: Open3D is missing, or hardly a point has neighbours.
-    """
+    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
     o3d = lidar_package("open3d")
     voxel = VOXEL_M
     mean, count = _cells(points_m, voxel)
@@ -146,30 +127,17 @@ def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray
     return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
 
 
-def _read_arrays(file: Path) -> FloatArray:
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-        return np.asarray(arrays["xyz_m" if "xyz_m" in arrays else "points"], float)
-
-
-def _read_las(file: Path) -> FloatArray:
-    with lidar_package("laspy").open(file) as source:
-        return np.asarray(source.read().xyz, float)
-
-
-def _read_text(file: Path) -> FloatArray:
-    with file.open(encoding="utf-8-sig") as stream:
-        commas = "," in next((line for line in stream if line.strip() and not line.startswith("#")), "")
-    return np.loadtxt(file, usecols=(0, 1, 2), delimiter="," if commas else None, ndmin=2, encoding="utf-8-sig")
-
-
-def _read_trimesh(file: Path) -> FloatArray:
-    return np.asarray(getattr(trimesh.load(file), "vertices", np.empty((0, 3))), float)
-
-
-_READERS = {
-    ".npz": _read_arrays,
-    ".las": _read_las,
-    ".laz": _read_las,
-    ".xyz": _read_text,
-    ".txt": _read_text,
-}
+def _read(file: Path) -> Any:
+    match file.suffix.lower():
+        case ".npz":
+            arrays = stored_arrays(file)
+            return arrays["xyz_m" if "xyz_m" in arrays else "points"]
+        case ".las" | ".laz":
+            with lidar_package("laspy").open(file) as source:
+                return source.read().xyz
+        case ".xyz" | ".txt":
+            with file.open(encoding="utf-8-sig") as stream:
+                commas = "," in next((line for line in stream if line.strip() and not line.startswith("#")), "")
+            columns, delimiter = (0, 1, 2), "," if commas else None
+            return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
+    return getattr(trimesh.load(file), "vertices", np.empty((0, 3)))

@@ -66,8 +66,7 @@ def read_positions(path: str | Path) -> FloatArray:
 
 
 def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int, int]:
-    """Number of lines between neighbouring positions that cross a wall, and of positions outside all floors and
-    ceilings.
+    """Number of lines between neighbouring positions that cross a wall, and of positions outside all floors.
 
     Args:
         positions_m: shape [n, 3]; z NaN where it is not known.
@@ -97,16 +96,10 @@ def check_positions(
     mirrored: Sequence[tuple[str, Sequence[Surface]]],
     name: str,
 ) -> None:
-    """Refuse a scene that measured positions do not fit, above all a mirrored scene.
-
-    Args:
-        positions_m: shape [n, 3] in the scene's frame; z NaN where it is not known.
-        surfaces: surfaces of the scene.
-        mirrored: remedy and surfaces of each reflection of the source (`reflections`).
-        name: name of the source and the positions, for errors.
+    """Refuse a scene that measured positions [n, 3] do not fit, above all a mirrored scene.
 
     Raises:
-        InputError: a reflection fits the positions clearly better, or the positions fit neither.
+        InputError: a reflection (`reflections`) fits the positions clearly better, or the positions fit neither.
     """
     count = len(_distinct(positions_m))
     crossings, outside = conflicts(positions_m, surfaces)

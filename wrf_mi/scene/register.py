@@ -52,7 +52,6 @@ class Registration:
     Attributes:
         matrix: shape [4, 4], applied to columns (x, y, z, 1) in metres.
         rms_m: rms residual; of a fit to walls, over the points that agree.
-        median_m: median of all residuals.
         share: share of the points within `NEAR_M` of a wall; 1 for pairs.
         agreement: mean of the share of the scene that lies at walls and the share of the walls that it shows, each
             point weighted by exp(-(d / 0.1 m)^2 / 2); 1 for pairs.
@@ -63,7 +62,6 @@ class Registration:
 
     matrix: FloatArray
     rms_m: float
-    median_m: float
     share: float
     agreement: float
     count: int
@@ -125,7 +123,7 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
     matrix = _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
-    return Registration(matrix, rms, float(np.median(error)), 1.0, 1.0, n, float(similar.scale))
+    return Registration(matrix, rms, 1.0, 1.0, n, float(similar.scale))
 
 
 def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
@@ -213,7 +211,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
                 f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
             )
     matrix, rms = _motion(rotation_2d(pose[2]), pose[:2]), float(np.sqrt(np.mean(near**2)))
-    return Registration(matrix, rms, float(np.median(residual)), share, score, len(points), scale)
+    return Registration(matrix, rms, share, score, len(points), scale)
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
