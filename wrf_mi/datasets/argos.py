@@ -51,16 +51,12 @@ CHUNK_SIZE = 1 << 26
 
 @dataclass(frozen=True)
 class _Layout:
-    """Number of users and antennas, samples of a user's slot, first sample of each pilot symbol in it, Hz where
-    known.
-    """
+    """Numbers of users and antennas, samples of a user's slot, and first sample of each pilot symbol in it."""
 
     users: int
     antennas: int
     slot: int
     starts: tuple[int, ...]
-    carrier_hz: float | None
-    rate_hz: float | None
 
 
 def read_argos(
@@ -108,9 +104,10 @@ def read_argos(
         text = f"{len(channel) - np.count_nonzero(silent)} of {len(channel)} samples hold a signal"
         raise InputError(f"{file}: {text}; two at least are needed, to train on and to score")
     channel[silent] = np.nan
+    carrier_hz, rate_hz = _number(attributes, "FREQ"), _number(attributes, "RATE")
     frequencies = None
-    if layout.carrier_hz is not None and layout.rate_hz is not None:
-        frequencies = layout.carrier_hz + SUBCARRIERS * layout.rate_hz / FFT
+    if carrier_hz is not None and rate_hz is not None:
+        frequencies = carrier_hz + SUBCARRIERS * rate_hz / FFT
     return Record(
         name=name or file.stem,
         task="csi",
@@ -152,18 +149,21 @@ def _open(
     if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
         text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
         raise InputError(f"{file}: {text}; give start")
-    which = _cell(file, shape, cell) if len(shape) == 5 else None
+    if len(shape) == 5 and cell is None and shape[1] > 1:
+        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+    if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:
+        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
 
     def parts() -> Iterator[NDArray[Any]]:
         step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
         for first in range(0, len(asked), step):
             chunk = asked[first : first + step]
             rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
-            if which is None:
+            if len(shape) == 4:
                 values = pilots[rows][:, :, : layout.users * layout.slot]
                 yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
             else:
-                yield pilots[rows, which].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
+                yield pilots[rows, cell or 0].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
 
     return layout, parts()
 
@@ -175,7 +175,7 @@ def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start
         raise InputError(f"{file}: {text}; correct num_mob_ant or samples_per_user")
     first = ARGOS_START if start is None else start
     starts = tuple(first + k * FFT for k in range(ARGOS_SYMBOLS))
-    return _Layout(users, shape[1], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
+    return _Layout(users, shape[1], slot, starts)
 
 
 def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
@@ -190,15 +190,7 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
     first = _whole(file, attributes, "PREFIX_LEN") + guard if start is None else start
     room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
     starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
-    return _Layout(shape[2], shape[3], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
-
-
-def _cell(file: Path, shape: tuple[int, ...], cell: int | None) -> int:
-    if cell is None and shape[1] > 1:
-        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
-    if not 0 <= (cell or 0) < shape[1]:
-        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
-    return cell or 0
+    return _Layout(shape[2], shape[3], slot, starts)
 
 
 def _text(file: Path, attributes: dict[str, Any], key: str, default: str) -> str:

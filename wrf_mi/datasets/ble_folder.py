@@ -95,6 +95,11 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     if len(silent):
         text = f"{RSSI}{ids[silent[0]]} is empty in every row, in {TEST} too"
         raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
+    tx_antennas = _antennas(anchors, TX)
+    for row, antenna in enumerate(tx_antennas, start=1):
+        if antenna != tx_antennas[0]:
+            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
+            raise InputError(f"{anchors.path}: {text}; there is one transmitter: state the same in every row")
     record = Record(
         name=name or folder.resolve().name,
         task="rssi",
@@ -107,7 +112,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=_in_both("heading", tables),
-        tx_antenna=_tx_antenna(anchors),
+        tx_antenna=tx_antennas[0],
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=std,
         source=str(folder),
@@ -212,15 +217,6 @@ def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
         read_antenna(table.path, f"row {row}: {prefix}antenna", {key: text for key, text in entry.items() if text})
         for row, entry in enumerate(entries, start=1)
     ]
-
-
-def _tx_antenna(table: CsvTable) -> Antenna:
-    antennas = _antennas(table, TX)
-    for row, antenna in enumerate(antennas, start=1):
-        if antenna != antennas[0]:
-            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
-            raise InputError(f"{table.path}: {text}; there is one transmitter: state the same in every row")
-    return antennas[0]
 
 
 def _id(text: str) -> str:

@@ -10,7 +10,6 @@ import hashlib
 import logging
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from importlib.resources import files
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -23,7 +22,7 @@ from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_arrays
 from .newrf import KEYS, arrays_sha256, read_arrays
 from .newrf_original import convert_newrf
-from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, locate, remote_files
+from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, known, locate, remote_files
 
 THREADS = 8
 """Number of simultaneous downloads."""
@@ -95,8 +94,7 @@ def download(
             if entry.converted:
                 _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
         if dataset.folds is not None:
-            folds = (files(__package__) / "data" / dataset.folds).read_bytes()
-            (part / "blocked_folds.txt").write_bytes(folds)
+            (part / "blocked_folds.txt").write_bytes((FOLDER / dataset.folds).read_bytes())
         source = f"{dataset.name}: {dataset.origin}\nLicence: {dataset.licence}\n{dataset.note}".strip()
         (part / "SOURCE.txt").write_text(f"{source}\n", encoding="utf-8")
     return target

@@ -86,7 +86,13 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     info = read_yaml(station)
     receiver = _read_station(station, info, antennas)
     stated = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
-    frequencies = None if stated is None else _frequencies(station, stated, subcarriers)
+    frequencies = None if stated is None else numbers_of(stated)
+    if frequencies is not None:
+        if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
+            raise InputError(f"{station}: frequencies_hz is {shown(stated)}; give a list of frequencies in Hz")
+        if len(frequencies) != subcarriers:
+            text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
+            raise InputError(f"{station}: {text}; give one for each, the uplink's first")
     positions = np.full((n, 3), np.nan)
     if (folder / POSITIONS).exists():
         positions = read_columns(folder / POSITIONS, AXES)
@@ -195,13 +201,3 @@ def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> Receiver:
     antenna = read_antenna(path, "antenna", info.get("antenna"))
     receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
     return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
-
-
-def _frequencies(path: Path, values: object, subcarriers: int) -> FloatArray:
-    frequencies = numbers_of(values)
-    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
-        raise InputError(f"{path}: frequencies_hz is {shown(values)}; give a list of frequencies in Hz")
-    if len(frequencies) != subcarriers:
-        text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
-        raise InputError(f"{path}: {text}; give one for each, the uplink's first")
-    return frequencies

@@ -119,70 +119,52 @@ def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
     state = _named(frame, "DataFrame").state
     manager = _named(state.get("_mgr") if isinstance(state, dict) else None, "BlockManager")
     blocks, axes = _arguments(manager, 2)
-    names = _index(axes[0])
+    _, index = _arguments(_named(axes[0], "_new_Index"), 2)
+    names = _array(index.get("data")) if isinstance(index, dict) else np.zeros(0)
+    if not all(isinstance(name, str) for name in names):
+        raise ValueError("columns without names")
     columns: dict[str, list[Any] | NDArray[Any]] = {}
     for block in blocks:
         values, places, _ = _arguments(_named(block, "_unpickle_block"), 3)
         rows = _array(values)
-        for place, row in zip(_places(places, len(rows)), rows, strict=True):
+        if _is(places, "slice"):
+            numbers = list(range(*_arguments(places, 3))[: len(rows) + 1])
+        else:
+            numbers = _array(places).tolist()
+        if len(numbers) != len(rows):
+            raise ValueError(f"{len(rows)} columns with {len(numbers)} numbers")
+        for number, row in zip(numbers, rows, strict=True):
             plain = row.dtype != object
-            columns[names[place]] = row if plain else [f if isinstance(f, PLAIN) else _array(f) for f in row]
+            columns[names[number]] = row if plain else [f if isinstance(f, PLAIN) else _array(f) for f in row]
     return columns
-
-
-def _index(index: Any) -> list[str]:
-    _, described = _arguments(_named(index, "_new_Index"), 2)
-    names = _array(described.get("data")) if isinstance(described, dict) else np.zeros(0)
-    if not all(isinstance(name, str) for name in names):
-        raise ValueError("columns without names")
-    return list(names)
-
-
-def _places(places: Any, count: int) -> list[int]:
-    if _is(places, "slice"):
-        start, stop, step = _arguments(places, 3)
-        found = range(start, stop, step)[: count + 1]
-    else:
-        found = _array(places).tolist()
-    if len(found) != count:
-        raise ValueError(f"{count} columns at {len(found)} places")
-    return list(found)
 
 
 def _array(described: Any) -> NDArray[Any]:
     """The NumPy array of a description: by its bytes, or by a list where it holds objects."""
     if _is(described, "_frombuffer"):
         data, dtype, shape, order = _arguments(described, 4)
-    elif _is(described, "_reconstruct"):
-        if not isinstance(described.state, tuple) or len(described.state) != 5:
-            raise ValueError("an array without content")
-        _, shape, dtype, fortran, data = described.state
-        order = "F" if fortran else "C"
     else:
-        raise ValueError(f"{getattr(described, 'name', type(described).__name__)} where an array belongs")
-    kind = _dtype(dtype)
-    if kind.hasobject:
+        state = _named(described, "_reconstruct").state
+        if not isinstance(state, tuple) or len(state) != 5:
+            raise ValueError("an array without content")
+        _, shape, dtype, fortran, data = state
+        order = "F" if fortran else "C"
+    code, *_ = _named(dtype, "dtype").args
+    if code == "O8":
         if not isinstance(data, list):
             raise ValueError("an array of objects without a list")
         flat = np.empty(len(data), object)
         flat[:] = data
     else:
+        endian = dtype.state[1] if isinstance(dtype.state, tuple) else "|"
+        if endian not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
+            raise ValueError(f"an array of type {code}")
         if not isinstance(data, bytes | bytearray):
             raise ValueError("an array of numbers without bytes")
-        flat = np.frombuffer(data, kind).copy()
+        flat = np.frombuffer(data, f"{endian}{code}").copy()
     if math.prod(shape) != len(flat):
         raise ValueError(f"{len(flat)} values for the shape {shape}")
     return flat.reshape(shape, order=order)
-
-
-def _dtype(described: Any) -> np.dtype[Any]:
-    code, *_ = _named(described, "dtype").args
-    if code == "O8":
-        return np.dtype(object)
-    order = described.state[1] if isinstance(described.state, tuple) else "|"
-    if order not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
-        raise ValueError(f"an array of type {code}")
-    return np.dtype(f"{order}{code}")
 
 
 def _is(value: Any, name: str) -> bool:

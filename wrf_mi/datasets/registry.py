@@ -80,12 +80,9 @@ class DataSetStatus:
     location: Path | None
 
 
-def _known() -> tuple[DataSet, ...]:
-    text = (files(__package__) / "data" / "datasets.yml").read_text(encoding="utf-8")
-    return tuple(DataSet(**entry) for entry in yaml.safe_load(text))
-
-
-KNOWN = _known()
+FOLDER = files(__package__) / "data"
+"""Folder with the known data sets' descriptions, manifests and folds."""
+KNOWN = tuple(DataSet(**entry) for entry in yaml.safe_load((FOLDER / "datasets.yml").read_text(encoding="utf-8")))
 
 
 def known(name: str) -> DataSet:
@@ -104,7 +101,7 @@ def remote_files(dataset: DataSet) -> list[RemoteFile]:
     """The files of a data set's public original from its manifest; empty for data made on this machine."""
     if dataset.manifest is None:
         return []
-    lines = (files(__package__) / "data" / dataset.manifest).read_text(encoding="utf-8").splitlines()
+    lines = (FOLDER / dataset.manifest).read_text(encoding="utf-8").splitlines()
     entries = [line.split() for line in lines if line and not line.startswith("#")]
     return [
         RemoteFile(path, sha256.removeprefix("arrays:"), remote, sha256.startswith("arrays:"))
@@ -166,7 +163,7 @@ def load(name_or_folder: str | Path) -> Record:
     path = folder / (dataset.file or "")
     record = layout_of(path).read(path, dataset.name)
     if record.folds is None and dataset.folds is not None:
-        with as_file(files(__package__) / "data" / dataset.folds) as folds:
+        with as_file(FOLDER / dataset.folds) as folds:
             record = replace(record, folds=parse_folds(folds, len(record)))
     if record.frequencies_hz is None and dataset.frequency_hz is not None:
         record = replace(record, frequencies_hz=np.array([dataset.frequency_hz]))

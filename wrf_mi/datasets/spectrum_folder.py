@@ -146,7 +146,13 @@ def write_spectrum_folder(
             for row, image in enumerate(spectra, start=1):
                 Image.fromarray(image).save(images / f"{row:05d}.png")
         content: dict[str, Any] = {"dataset_name": record.name}
-        content |= {receiver.name: _entry(receiver) for receiver in record.receivers}
+        for rx in record.receivers:
+            entry = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
+            if antenna := antenna_entry(rx.antenna):
+                entry["antenna"] = antenna
+            if rx.array_m is not None:
+                entry["array"] = {"elements_m": rx.array_m.tolist()}
+            content[rx.name] = entry
         if antenna := antenna_entry(record.tx_antenna):
             content[TX_ANTENNA] = antenna
         if record.frequencies_hz is not None:
@@ -178,13 +184,6 @@ def parse_folds(path: Path, rows: int) -> IntArray:
         what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
         raise InputError(f"{path}: {what}; number the folds 0, 1, ... without gaps, two at least")
     return folds
-
-
-def _entry(receiver: Receiver) -> dict[str, Any]:
-    pose = {"position": receiver.position_m.tolist(), "orientation": receiver.orientation_xyzw.tolist()}
-    antenna = antenna_entry(receiver.antenna)
-    elements = {} if receiver.array_m is None else {"array": {"elements_m": receiver.array_m.tolist()}}
-    return pose | ({"antenna": antenna} if antenna else {}) | elements
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:

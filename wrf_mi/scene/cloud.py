@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import shapely
@@ -13,8 +12,7 @@ import shapely
 from ..core import InputError
 from ..core.angles import FloatArray
 from .classify import kinds
-from .corners import join
-from .outline import fill_shadows, outline, triangulated
+from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
 from .points import thin
 from .surfaces import KINDS, Surface, number_names
@@ -65,7 +63,9 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
         if len(index) < FEWEST_POINTS:
             continue
         area, cell = outline(plane, points[index])
-        if area.area >= SMALLEST_M2 and _contrast(plane, area, points, noise) >= LEAST_CONTRAST:
+        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise)]))
+        inside, beside = np.count_nonzero(away < 2 * noise) / 2, np.count_nonzero(away > 3 * noise) / 3
+        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
             kept.append(plane)
             areas.append(area)
             reach.append(3 * noise + cell)
@@ -139,10 +139,3 @@ def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
                 headings.append(n)
         turned.append(replace(plane, normal=n, offset_m=float(n @ plane.centre_m)))
     return turned
-
-
-def _contrast(plane: Plane, area: Any, points: FloatArray, noise_m: float) -> float:
-    """Density of points in the plane relative to the density beside it."""
-    away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
-    inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
-    return inside / max(beside, 1)

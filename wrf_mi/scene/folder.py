@@ -119,7 +119,7 @@ def write_scene(
         for surface in surfaces:
             mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
             mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
-        _write(part / XML_FILE, _xml(full))
+        _write(part / XML_FILE, scene_xml(full.by_surface()))
         _write(part / MATERIALS_FILE, materials_text(full))
         _write(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
@@ -146,18 +146,14 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
         raise InputError(f"{folder}: surface {odd[0]!r} has {which}; write the scene anew")
     full = materials.complete(materials.surfaces)
-    if _materials_in(xml) != {name: full.of(name, "other") for name in full.surfaces}:
+    if _materials_in(xml) != full.by_surface():
         logger.info("%s: materials changed in %s, written anew", xml, MATERIALS_FILE)
         try:
-            write_atomically(xml, _xml(full))
+            write_atomically(xml, scene_xml(full.by_surface()))
         except OSError as error:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
     return SceneFolder(folder, xml, full, facts.get("counts", {}))
-
-
-def _xml(materials: Materials) -> str:
-    return scene_xml({name: materials.of(name, "other") for name in materials.surfaces})
 
 
 def _materials_in(xml: Path) -> dict[str, str]:

@@ -70,7 +70,13 @@ def make_scene(
         materials = read_materials(materials)
     if registration is not None and register_walls_of is not None:
         raise InputError(f"{file}: registration by pairs and to walls: give one of them")
-    matrix = None if registration is None else _rigid(registration)
+    matrix = None if registration is None else np.asarray(registration, float)
+    if matrix is not None:
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+            raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
+        rotation = matrix[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
+            raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     for name in ("shapely", "mapbox_earcut"):
         lidar_package(name)
     from .plan import read_walls
@@ -166,13 +172,3 @@ def _has_faces(file: Path) -> bool:
     with file.open("rb") as stream:
         head = stream.read(1 << 16).split(b"end_header")[0].split()
     return b"face" in head and head[head.index(b"face") + 1] != b"0"
-
-
-def _rigid(registration: ArrayLike) -> FloatArray:
-    matrix = np.asarray(registration, float)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
-    rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
-        raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
-    return matrix

@@ -55,6 +55,10 @@ class Materials:
         entry = self.surfaces.get(name, kind)
         return entry if entry in THICKNESS_M else {**RULES, **self.rules}[entry]
 
+    def by_surface(self) -> dict[str, str]:
+        """Material of each listed surface by its name."""
+        return {name: self.of(name, "other") for name in self.surfaces}
+
     def complete(self, kinds: Mapping[str, str]) -> Materials:
         """Materials with every rule, every surface and the thickness of every used material stated.
 

@@ -247,18 +247,17 @@ def _bounds_rooms(index: int, bodies: Sequence[_Body], slabs: set[int], slab_bou
         return False
     others = [other for i, other in enumerate(bodies) if i != index and i not in slabs]
     around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
-    if any(other.closed and body.volume_m3 < 0 < other.volume_m3 and _off_floor(body, other) for other in around):
-        return True
+    low, high = body.bounds_m[:, 2]
+    for other in around:
+        # A cavity is clear of floor and ceiling, furniture is not.
+        floor, ceiling = other.bounds_m[:, 2]
+        clear = low > floor + INSIDE_M and high < ceiling - INSIDE_M
+        if other.closed and body.volume_m3 < 0 < other.volume_m3 and clear:
+            return True
     outer = [other.bounds_m for other in around]
     if slab_bounds_m is not None and _within(body.bounds_m, slab_bounds_m):
         outer.append(slab_bounds_m)
     return all(body.height_m >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer)
-
-
-def _off_floor(body: _Body, outer: _Body) -> bool:
-    """Whether a body is clear of the floor and ceiling of another body, as a cavity is and furniture is not."""
-    (low, high), (floor, ceiling) = body.bounds_m[:, 2], outer.bounds_m[:, 2]
-    return bool(low > floor + INSIDE_M and high < ceiling - INSIDE_M)
 
 
 def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:

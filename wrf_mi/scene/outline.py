@@ -1,7 +1,8 @@
-"""Extent of a plane: the area with holes that its points cover, with the shadows of what stood before it filled."""
+"""Extents of planes: areas with holes that their points cover, with shadows filled and corners closed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,11 @@ BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
 HIDDEN_SHARE = 0.5
 """Least share of a gap before which something stands, for the gap to be filled."""
 SMALLEST_GAP_M2 = 0.02
+STEEPEST = np.cos(np.radians(20))
+"""Planes that meet at a smaller angle have no reliable line in common."""
+GRID_M = 1e-5
+PASSES = 2
+"""Number of passes over all pairs of planes; the second pass closes the corner of three planes."""
 
 
 def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
@@ -53,7 +59,7 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
     bins = np.ceil((flat.max(axis=0) - low) / cell).astype(int) + CLOSED_CELLS + 2
     index = ((flat - low) / cell).astype(int)
     count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
-    mask = _without_strays(_clean(_occupied(count), cell), count)
+    mask = _covered(count, cell)
     # One rectangle for each run of marked cells.
     steps = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(steps == 1)
@@ -84,13 +90,80 @@ def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, nois
         cells = len(np.unique(np.floor(inside / SHADOW_CELL_M), axis=0))
         if cells * SHADOW_CELL_M**2 >= HIDDEN_SHARE * gap.area:
             filled.append(gap)
-    return shapely.union_all(filled, grid_size=1e-5)
+    return shapely.union_all(filled, grid_size=GRID_M)
 
 
 def polygons(area: Any) -> list[Any]:
     """The polygons of an area, the largest first."""
     parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and not part.is_empty]
     return sorted(parts, key=lambda part: -part.area)
+
+
+def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]) -> list[Any]:
+    """Extend or cut areas to the lines where their planes meet.
+
+    Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
+    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
+    coordinates of their planes.
+    """
+    areas = list(areas)
+    for _ in range(PASSES):
+        for i, a in enumerate(planes):
+            for j, b in enumerate(planes):
+                if i != j and abs(a.normal @ b.normal) < STEEPEST:
+                    areas[i] = _end_at(a, areas[i], b, areas[j], min(reach_m[i], reach_m[j]))
+    return areas
+
+
+def _end_at(a: Plane, area: Any, b: Plane, other: Any, reach: float) -> Any:
+    along = np.cross(a.normal, b.normal)
+    along /= np.linalg.norm(along)
+    point = np.linalg.solve(np.stack([a.normal, b.normal, along]), np.array([a.offset_m, b.offset_m, 0.0]))
+
+    def to_line(plane: Plane) -> tuple[FloatArray, FloatArray]:
+        """Transform to coordinates (t, s): t along the line, s away from it."""
+        rows = np.stack([along, np.cross(plane.normal, along)])
+        return rows @ np.stack([plane.u, plane.v], axis=1), rows @ (plane.normal * plane.offset_m - point)
+
+    matrix, shift = to_line(a)
+    turned, other_turned = _transformed(area, matrix, shift), _transformed(other, *to_line(b))
+    stretches = shapely.intersection(
+        shapely.buffer(_stretches(other_turned, reach), reach, cap_style="square"), _stretches(turned, reach)
+    )
+    changed = turned
+    for stretch in polygons(stretches):
+        t0, _, t1, _ = stretch.bounds
+        if t1 - t0 < reach:
+            continue
+        share = [
+            shapely.intersection(turned, shapely.box(t0, s, t1, s + reach)).area / (reach * (t1 - t0))
+            for s in (reach, -2 * reach)
+        ]
+        if (share[0] > 0.25) == (share[1] > 0.25):
+            continue
+        sign = 1 if share[0] > share[1] else -1
+        # The parts of the strip beside the line that the area comes near are filled up to the line.
+        near = [part.bounds for part in polygons(shapely.intersection(turned, _box(t0, t1, 0, sign * reach)))]
+        fill = [_box(max(s[0], t0), min(s[2], t1), 0, sign * max(abs(s[1]), abs(s[3]))) for s in near]
+        cut = _box(t0, t1, 0, -2 * sign * reach)
+        changed = shapely.difference(shapely.union_all([changed, *fill]), cut)
+    return area if changed is turned else _transformed(changed, matrix.T, -matrix.T @ shift)
+
+
+def _stretches(turned: Any, reach: float) -> Any:
+    """Stretches of the line that an area comes near: a union of boxes of unit height."""
+    low, _, high, _ = turned.bounds
+    strip = shapely.intersection(turned, shapely.box(low, -reach, high, reach))
+    return shapely.union_all([_box(part.bounds[0], part.bounds[2], 0, 1) for part in polygons(strip)])
+
+
+def _box(t0: float, t1: float, s0: float, s1: float) -> Any:
+    return shapely.box(t0, min(s0, s1), t1, max(s0, s1))
+
+
+def _transformed(area: Any, matrix: FloatArray, shift: FloatArray) -> Any:
+    """A transformed area on a fine grid: rounding would let edges that touch cross."""
+    return shapely.set_precision(shapely.make_valid(affinity.affine_transform(area, [*matrix.ravel(), *shift])), GRID_M)
 
 
 def triangulated(area: Any) -> tuple[FloatArray, IntArray]:
@@ -106,25 +179,18 @@ def large_parts(mask: Mask, cells: float, structure: NDArray[Any] | None = None)
     return mask & (np.bincount(parts.ravel()) >= cells)[parts]
 
 
-def _occupied(count: NDArray[Any]) -> Mask:
-    """Cells about as full as those around them; a stray beside an edge is not."""
+def _covered(count: NDArray[Any], cell: float) -> Mask:
+    """Cells that a plane covers, from the number of points in each."""
+    # Cells about as full as those around them; a stray beside an edge is not.
     full = count.astype(float)
     total = ndimage.uniform_filter(full, AROUND_CELLS, mode="constant")
     squares = ndimage.uniform_filter(full * full, AROUND_CELLS, mode="constant")
-    occupied: Mask = count >= np.maximum(2, SHARE * squares / np.maximum(total, 1e-9))
-    return occupied
-
-
-def _clean(mask: Mask, cell: float) -> Mask:
+    mask: Mask = count >= np.maximum(2, SHARE * squares / np.maximum(total, 1e-9))
     disc = np.hypot(*np.mgrid[-CLOSED_CELLS : CLOSED_CELLS + 1, -CLOSED_CELLS : CLOSED_CELLS + 1]) <= CLOSED_CELLS + 0.5
-    mask = ndimage.binary_closing(mask, disc)
-    mask = ndimage.binary_opening(mask, np.ones((2, 2), bool))
+    mask = ndimage.binary_opening(ndimage.binary_closing(mask, disc), np.ones((2, 2), bool))
     mask = large_parts(mask, SMALLEST_M2 / cell**2)
-    return ~large_parts(~mask, SMALL_HOLE_M2 / cell**2)
-
-
-def _without_strays(mask: Mask, count: NDArray[Any]) -> Mask:
-    """The mask without small sparse parts, which surfaces that cross the plane leave in it."""
+    mask = ~large_parts(~mask, SMALL_HOLE_M2 / cell**2)
+    # Small sparse parts come from surfaces that cross the plane.
     label, parts = ndimage.label(mask)
     if parts < 2:
         return mask

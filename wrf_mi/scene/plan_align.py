@@ -7,7 +7,6 @@ and all are refined against all others. The sensor's place is where no return li
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,11 +140,11 @@ def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -
 
 def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]:
     """Stops: successive scans aligned with the first of them, then moved to their mean pose."""
-    times, scan = np.unique(time_s, return_inverse=True)
+    times, number = np.unique(time_s, return_inverse=True)
     groups: list[list[tuple[FloatArray, FloatArray]]] = []
     field, pose = np.zeros(canvas.shape), np.zeros(3)
     for i in range(len(times)):
-        raw = xy_m[scan == i]
+        raw = xy_m[number == i]
         if i and times[i] - times[i - 1] <= STANDING_S:
             middle = raw.mean(axis=0)
             found, mean = canvas.match(field, raw, middle, pose, WITHIN_STOP, 0.0)
@@ -160,18 +159,13 @@ def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]
     for group in groups:
         back = np.median([(raw - moved).mean(axis=0) for raw, moved in group], axis=0)
         scans = [moved + back for _, moved in group]
-        stops.append(_Stop(_lasting(scans, canvas), sensor_of(max(scans, key=len)), np.zeros(3)))
+        # A return of each cell that enough of the scans hit.
+        count, points = np.sum([canvas.image(scan) for scan in scans], axis=0), np.concatenate(scans)
+        cells = canvas.cells(points)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        lasting = first[count[tuple(cells[first].T)] >= max(1, STAYS * len(scans))]
+        stops.append(_Stop(points[lasting], sensor_of(max(scans, key=len)), np.zeros(3)))
     return stops
-
-
-def _lasting(scans: Sequence[FloatArray], canvas: _Canvas) -> FloatArray:
-    """A return of each cell that enough of the scans hit."""
-    count = np.sum([canvas.image(points) for points in scans], axis=0)
-    points = np.concatenate(scans)
-    cells = canvas.cells(points)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    often = count[tuple(cells[first].T)] >= max(1, STAYS * len(scans))
-    return np.asarray(points[first[often]])
 
 
 def sensor_of(scan_m: FloatArray) -> FloatArray | None:

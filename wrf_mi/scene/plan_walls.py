@@ -265,13 +265,14 @@ def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
         ends = [run.start, run.end]
         for side, sign in enumerate((-1, 1)):
             here = ends[side]
-            if any(_meets(run, here, b) for b in runs):
+            across = [b for b in runs if b.axis != run.axis]
+            near = [b for b in across if abs(b.offset - here) <= SAME_WALL_M]
+            if any(b.start - SAME_WALL_M <= run.offset <= b.end + SAME_WALL_M for b in near):
                 continue
             reachable = [
                 b.offset
-                for b in runs
-                if b.axis != run.axis
-                and 0 < sign * (b.offset - here) <= HIDDEN_GAP_M
+                for b in across
+                if 0 < sign * (b.offset - here) <= HIDDEN_GAP_M
                 and b.start - FURNITURE_DEPTH_M <= run.offset <= b.end + FURNITURE_DEPTH_M
             ]
             if not reachable:
@@ -283,9 +284,3 @@ def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
                 ends[side] = there
         walls.append(replace(run, start=ends[0], end=ends[1]))
     return walls
-
-
-def _meets(run: Run, here: float, other: Run) -> bool:
-    """Whether another wall across passes at a run's end."""
-    across = other.axis != run.axis and abs(other.offset - here) <= SAME_WALL_M
-    return across and other.start - SAME_WALL_M <= run.offset <= other.end + SAME_WALL_M

@@ -57,7 +57,10 @@ def simulate_scan(
     rng = np.random.default_rng(seed)
     parts = []
     for pose in np.asarray(poses_m, float).reshape(-1, 3):
-        directions = _sphere(rays_per_pose, rng)
+        index = np.arange(rays_per_pose) + rng.random()  # Gonzalez 2010, Math. Geosci. 42
+        z, azimuth = 1 - 2 * index / (rays_per_pose + 1), index * (np.pi * (3 - np.sqrt(5))) + rng.random() * 2 * np.pi
+        across = np.sqrt(1 - z * z)
+        directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
         ray = mi.Ray3f(mi.Point3f(*pose.tolist()), to_vectors(directions, mi.Vector3f))
         distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
         seen = np.isfinite(distance)
@@ -69,12 +72,3 @@ def simulate_scan(
     if not len(points):
         raise InputError("simulated scan: no ray met the scene; put the scanner inside it")
     return points
-
-
-def _sphere(count: int, rng: np.random.Generator) -> FloatArray:
-    """Directions [count, 3] spread evenly over the sphere (Gonzalez 2010, Math. Geosci. 42)."""
-    index = np.arange(count) + rng.random()
-    z = 1 - 2 * index / (count + 1)
-    azimuth = index * (np.pi * (3 - np.sqrt(5))) + rng.random() * 2 * np.pi
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
