@@ -16,8 +16,7 @@ import pytest
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
 from wrf_mi.datasets.fetch import download
-from wrf_mi.datasets.newrf import arrays_sha256
-from wrf_mi.datasets.newrf_original import convert_newrf
+from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DataSet, RemoteFile, known, remote_files
 
 DATA = os.environ.get("WRF_MI_DATA")

@@ -12,8 +12,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits, read_newrf
-from wrf_mi.datasets.newrf import KEYS, arrays_sha256
-from wrf_mi.datasets.newrf_original import convert_newrf, read_pickled_table
+from wrf_mi.datasets.newrf import KEYS, arrays_sha256, convert_newrf, read_pickled_table
 
 DATA = os.environ.get("WRF_MI_DATA")
 needs_data = pytest.mark.skipif(

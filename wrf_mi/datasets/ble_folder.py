@@ -36,8 +36,16 @@ from ..core.antenna import ANTENNA, UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line
 from ..core.types import IntArray
-from .csv_table import CsvTable, read_csv
-from .folder_files import TX_ANTENNA_WORDS, carriers_of, data_folder, read_antenna, refuse_unstated, shown
+from .folder_files import (
+    TX_ANTENNA_WORDS,
+    CsvTable,
+    carriers_of,
+    data_folder,
+    read_antenna,
+    read_csv,
+    refuse_unstated,
+    shown,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -1,6 +1,6 @@
 """Download of known data sets from their public originals at fixed commits, checked by SHA-256.
 
-For converted files (the pickles of NeWRF, `wrf_mi.datasets.newrf_original`) the resulting arrays are checked in place
+For converted files (the pickles of NeWRF, `wrf_mi.datasets.newrf`) the resulting arrays are checked in place
 of the original, which is not kept.
 """
 
@@ -20,8 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_arrays
-from .newrf import KEYS, arrays_sha256, read_arrays
-from .newrf_original import convert_newrf
+from .newrf import KEYS, arrays_sha256, convert_newrf, read_arrays
 from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, known, locate, remote_files
 
 THREADS = 8

@@ -1,8 +1,9 @@
-"""Files shared by several layouts: positions, index files and YAML, with errors that name the line."""
+"""Files shared by several layouts: CSV, positions, index files and YAML, with errors that name the line."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import csv
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines
 from ..core.types import IntArray
-from .csv_table import SINGLE_MAX, read_columns
 
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"
@@ -24,6 +24,8 @@ INDEX_FILES = ("train_index.txt", "test_index.txt")
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
 """Keys of a transmitter's antenna, whose frame is always the world, turned with the heading."""
+SINGLE_MAX = float(np.finfo(np.float32).max)
+"""Largest number in single precision, in which everything is computed."""
 DIGITS = 18
 """Most digits of a whole number; more may not fit into 64 bits."""
 
@@ -130,6 +132,100 @@ def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = 
 def antenna_entry(antenna: Antenna) -> dict[str, str]:
     """Entry for `read_antenna`: the attributes that differ from the default."""
     return {key: value for key, value in asdict(antenna).items() if value != getattr(ANTENNA, key)}
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """A CSV file with a header.
+
+    Attributes:
+        path: path of the file, for messages.
+        header: names of the columns.
+        rows: text of each field, one list per row, each as long as the header.
+    """
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+
+    def numbers(self, column: str, may_be_empty: bool = False, index: int | None = None) -> FloatArray:
+        """Numbers of a column, shape [rows]; an empty field or ``nan`` is NaN if it is allowed.
+
+        With an ``index`` the column is found by it, and ``column`` is its name in messages.
+
+        Raises:
+            InputError: no such column, or a field that is not a finite number, in single precision too.
+        """
+        index = self._index(column) if index is None else index
+        values = np.full(len(self.rows), np.nan)
+        for row, fields in enumerate(self.rows):
+            text = fields[index].strip()
+            if may_be_empty and text.lower() in ("", "nan"):
+                continue
+            try:
+                values[row] = float(text)
+            except ValueError:
+                values[row] = np.nan
+            if not abs(values[row]) <= SINGLE_MAX:
+                remedy = "give a finite number" + (" of single precision" if np.isfinite(values[row]) else "")
+                remedy += ", or leave it empty" if may_be_empty else ""
+                raise InputError(f"{self.path}: row {row + 1}: {one_line(column)} is {text[:40]!r}; {remedy}")
+        return values
+
+    def texts(self, column: str) -> list[str]:
+        """Fields of a column as text.
+
+        Raises:
+            InputError: no such column.
+        """
+        index = self._index(column)
+        return [fields[index] for fields in self.rows]
+
+    def _index(self, column: str) -> int:
+        if self.header.count(column) != 1:
+            what = "has no column" if column not in self.header else "has twice the column"
+            text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
+            raise InputError(f"{self.path}: {text}; the first line must name each column once")
+        return self.header.index(column)
+
+
+def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
+    """Read a CSV file whose first line is its header.
+
+    Args:
+        path: path of the file.
+        skip_blank: skip blank lines, as pandas does, and count rows without them; otherwise they are refused.
+
+    Raises:
+        InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
+    """
+    lines = [line for line in text_lines(path) if line.strip() or not skip_blank]
+    if not lines:
+        raise InputError(f"{path}: empty; give a header and one row per measurement")
+    try:
+        header, *rows = csv.reader(lines, strict=True)
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({one_line(error)}); correct it") from None
+    if not rows:
+        raise InputError(f"{path}: no rows below the header; give one per measurement")
+    for row, fields in enumerate(rows, start=1):
+        if len(fields) != len(header):
+            text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
+            raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
+    return CsvTable(path, [name.strip() for name in header], rows)
+
+
+def read_columns(path: Path, *headers: str) -> FloatArray:
+    """Numbers [rows, columns] of a CSV file with one of some headers, such as ``x,y,z``.
+
+    Raises:
+        InputError: another header, or as `read_csv` and `CsvTable.numbers`.
+    """
+    table = read_csv(path)
+    found = ",".join(table.header)
+    if found.lower() not in headers:
+        raise InputError(f"{path}: line 1: header is {found[:40]!r}; it must be {' or '.join(headers)}")
+    return np.stack([table.numbers(name, index=index) for index, name in enumerate(table.header)], axis=-1)
 
 
 def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:

@@ -25,8 +25,16 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
-from .csv_table import CsvTable, read_csv
-from .folder_files import POSITIONS, data_folder, finite_numbers, read_official, read_yaml, shown
+from .folder_files import (
+    POSITIONS,
+    CsvTable,
+    data_folder,
+    finite_numbers,
+    read_csv,
+    read_official,
+    read_yaml,
+    shown,
+)
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
 NOT_RECEIVED_DBM = -100.0
@@ -90,7 +98,7 @@ def _read_positions(path: Path) -> FloatArray:
         raise InputError(f"{path}: line 1: {text}; give x,y,z in metres")
     lower = [column.lower() for column in table.header]
     axes = [lower.index(axis) for axis in "xyz"] if sorted(lower) == ["x", "y", "z"] else [0, 1, 2]
-    return np.stack([table.numbers_at(axis, table.header[axis]) for axis in axes], axis=-1)
+    return np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
 
 
 def _read_powers(path: Path, gateways: list[str]) -> NDArray[np.float32]:
@@ -108,7 +116,7 @@ def _read_powers(path: Path, gateways: list[str]) -> NDArray[np.float32]:
         columns, power = gateways, np.stack([table.numbers(gateway) for gateway in gateways])
     else:
         columns = [f"{column} ({gateway})" for column, gateway in zip(table.header, gateways, strict=True)]
-        power = np.stack([table.numbers_at(index, f"column {what}") for index, what in enumerate(columns)])
+        power = np.stack([table.numbers(f"column {what}", index=index) for index, what in enumerate(columns)])
     power[power == NOT_RECEIVED_DBM] = np.nan
     silent = np.flatnonzero(np.isnan(power).all(axis=1))
     if len(silent):

@@ -32,7 +32,6 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.files import atomic_folder, one_line
-from .csv_table import read_columns
 from .folder_files import (
     AXES,
     POSITIONS,
@@ -42,6 +41,7 @@ from .folder_files import (
     fits_single,
     numbers_of,
     read_antenna,
+    read_columns,
     read_official,
     read_yaml,
     refuse_unstated,

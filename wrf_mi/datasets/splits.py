@@ -63,10 +63,14 @@ def make_splits(
         raise InputError(f"seed {seed}: choose a whole number from 0")
     splits = []
     for label, train, test in _train_and_test(record, name, seed):
+        what = f"{record.name}, split {label}"
+        for verb, part in (("trains", train), ("scores", test)):
+            if len(part) == 0:
+                raise InputError(f"{what}: no row that was received {verb}; use another split")
         # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it
         # is nested in a longer one, validation rows included.
         order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
-        order = order[: _kept(f"{record.name}, split {label}", len(order), n_train)]
+        order = order[: _kept(what, len(order), n_train)]
         # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
         counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
         validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
@@ -152,7 +156,7 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
         train, test = (part[received[part]] for part in record.official)
-        return [_checked(record, name, train, test)]
+        return [(name, train, test)]
     if kind == "blocked":
         folds = position_folds(record)
         count = int(folds.max()) + 1
@@ -162,19 +166,12 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
                 raise InputError(f"split {name!r}: no such fold; {record.name} has blocked:0 to blocked:{count - 1}")
             chosen = range(int(fold), int(fold) + 1)
         of_row = folds[rows]
-        return [_checked(record, f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
+        return [(f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [(name, order[:first], order[first:])]
-
-
-def _checked(record: Record, label: str, train: IntArray, test: IntArray) -> tuple[str, IntArray, IntArray]:
-    for what, part in (("trains", train), ("scores", test)):
-        if len(part) == 0:
-            raise InputError(f"{record.name}, split {label}: no row that was received {what}; use another split")
-    return label, train, test
 
 
 def _kept(what: str, available: int, n_train: int | float | None) -> int:

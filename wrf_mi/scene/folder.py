@@ -119,9 +119,9 @@ def write_scene(
         for surface in surfaces:
             mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
             mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
-        _write(part / XML_FILE, scene_xml(full.by_surface()))
-        _write(part / MATERIALS_FILE, materials_text(full))
-        _write(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
+        write_atomically(part / XML_FILE, scene_xml(full.by_surface()))
+        write_atomically(part / MATERIALS_FILE, materials_text(full))
+        write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
     return folder
 
@@ -164,7 +164,3 @@ def _materials_in(xml: Path) -> dict[str, str]:
         return {}
     references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in shapes}
     return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")

@@ -18,7 +18,7 @@ from PIL import Image
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line, stored_arrays, text_lines
-from ..datasets.csv_table import read_columns
+from ..datasets.folder_files import read_columns
 
 Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]

@@ -12,7 +12,7 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line, stored_arrays
+from ..core.files import one_line
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -130,8 +130,8 @@ def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray
 def _read(file: Path) -> Any:
     match file.suffix.lower():
         case ".npz":
-            arrays = stored_arrays(file)
-            return arrays["xyz_m" if "xyz_m" in arrays else "points"]
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+                return arrays["xyz_m" if "xyz_m" in arrays else "points"]
         case ".las" | ".laz":
             with lidar_package("laspy").open(file) as source:
                 return source.read().xyz

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..datasets.csv_table import read_csv
+from ..datasets.folder_files import read_csv
 from .plan_sources import PlanGrid
 from .register import best_motion, wall_points
 from .surfaces import Surface, moved
@@ -130,16 +130,9 @@ def reflections(
 ) -> list[tuple[str, list[Surface]]]:
     """The scenes of a source with its y or its x reversed.
 
-    Args:
-        surfaces: surfaces of the source, in its frame.
-        file: path of the source, for the remedy.
-        grid: cells of a source that is an occupancy grid, or None.
-        matrix: registration of the source [4, 4], or None.
-        known_walls_m: end points [m, 2, 2] of walls that the source was registered to, or None; each reflection is
-            registered to them anew.
-
-    Returns:
-        Remedy and surfaces of each reflection.
+    ``grid`` are the cells of an occupancy grid, ``matrix`` is the registration of the source [4, 4], and each
+    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any. Returns the remedy and the surfaces of each
+    reflection.
     """
     if grid is not None:
         # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.

@@ -15,7 +15,7 @@ from skimage.transform import estimate_transform
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..datasets.csv_table import read_columns
+from ..datasets.folder_files import read_columns
 from .plan_lines import rotation_2d
 from .surfaces import Surface
 
