@@ -182,7 +182,13 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
     if shape[4] % 2:
         raise InputError(f"{file}: {PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
-    size, text = _number(attributes, "FFT_SIZE"), _text(file, attributes, "PILOT_SEQ_TYPE", "lts")
+    found = np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))
+    word = found[0] if len(found) else ""
+    text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
+    if not text or not isinstance(word, bytes | str):
+        what = "empty" if not text else shown(word)
+        raise InputError(f"{file}: attribute PILOT_SEQ_TYPE is {what}; it must be lts")
+    size = _number(attributes, "FFT_SIZE")
     if size not in (None, FFT) or text.lower() != "lts":
         other = f"pilots {text!r} of {size or FFT:g} samples"
         raise InputError(f"{file}: {other}; the long training symbol (lts) of {FFT} is read")
@@ -191,16 +197,6 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
     room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
     starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
     return _Layout(shape[2], shape[3], slot, starts)
-
-
-def _text(file: Path, attributes: dict[str, Any], key: str, default: str) -> str:
-    """Text of an attribute, with escapes for what is not UTF-8."""
-    found = np.ravel(attributes.get(key, default))
-    word = found[0] if len(found) else ""
-    text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
-    if not text or not isinstance(word, bytes | str):
-        raise InputError(f"{file}: attribute {key} is {'empty' if not text else shown(word)}; it must be {default}")
-    return text
 
 
 def _number(attributes: dict[str, Any], key: str) -> float | None:

@@ -125,25 +125,24 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
         jobs = {pool.submit(store.fetch, path, downloader=downloader): path for path in store.registry}
         try:
             for job in as_completed(jobs):
-                _result(job.exception(), name, store.get_url(jobs[job]))
+                error, url = job.exception(), store.get_url(jobs[job])
+                if isinstance(error, requests.exceptions.HTTPError):
+                    raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
+                if isinstance(error, requests.exceptions.RequestException):
+                    remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
+                    raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
+                if isinstance(error, ValueError):  # raised by pooch for a wrong hash
+                    text = f"{url} has not the published SHA-256, nothing was kept"
+                    raise InputError(f"data set {name}: {text}; try again") from None
+                if isinstance(error, OSError):
+                    text = f"cannot be written ({one_line(error)})"
+                    raise InputError(f"data set {name}: {text}; choose another folder") from None
+                if error is not None:
+                    raise error
                 bar.advance(task)
         finally:
             pool.shutdown(cancel_futures=True)
             logger.setLevel(level)
-
-
-def _result(error: BaseException | None, name: str, url: str) -> None:
-    if isinstance(error, requests.exceptions.HTTPError):
-        raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
-    if isinstance(error, requests.exceptions.RequestException):
-        remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
-        raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
-    if isinstance(error, ValueError):  # how pooch reports a wrong hash
-        raise InputError(f"data set {name}: {url} has not the published SHA-256, nothing was kept; try again") from None
-    if isinstance(error, OSError):
-        raise InputError(f"data set {name}: cannot be written ({one_line(error)}); choose another folder") from None
-    if error is not None:
-        raise error
 
 
 def _is_intact(path: Path, entry: RemoteFile) -> bool:

@@ -136,13 +136,7 @@ def antenna_entry(antenna: Antenna) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file with a header.
-
-    Attributes:
-        path: path of the file, for messages.
-        header: names of the columns.
-        rows: text of each field, one list per row, each as long as the header.
-    """
+    """A CSV file: names of the columns, and the text of each field, a list per row."""
 
     path: Path
     header: list[str]
@@ -173,11 +167,7 @@ class CsvTable:
         return values
 
     def texts(self, column: str) -> list[str]:
-        """Fields of a column as text.
-
-        Raises:
-            InputError: no such column.
-        """
+        """Fields of a column as text."""
         index = self._index(column)
         return [fields[index] for fields in self.rows]
 
@@ -192,9 +182,7 @@ class CsvTable:
 def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     """Read a CSV file whose first line is its header.
 
-    Args:
-        path: path of the file.
-        skip_blank: skip blank lines, as pandas does, and count rows without them; otherwise they are refused.
+    Blank lines are refused, or skipped and not counted, as pandas does.
 
     Raises:
         InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
@@ -229,14 +217,7 @@ def read_columns(path: Path, *headers: str) -> FloatArray:
 
 
 def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z,frequency_hz``.
-
-    Returns:
-        Carriers are None where the header is ``x,y,z``.
-
-    Raises:
-        InputError: another header, no rows, a row that is not of finite numbers, or a carrier that is not positive.
-    """
+    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z`` or `FREQUENCY` too."""
     values = read_columns(path, AXES, f"{AXES},{FREQUENCY}")
     return values[:, :3], carriers_of(path, values[:, 3]) if values.shape[1] > 3 else None
 
@@ -260,16 +241,10 @@ def whole_number(path: Path, line: int, text: str) -> int:
 
 
 def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) -> tuple[IntArray, IntArray] | None:
-    """Training and test rows, from 0, of a folder's index files; None where it has neither.
-
-    Args:
-        folder: folder of the data.
-        rows: number of rows of the data.
-        first: number of the first row in the index files: 1 where they name images ``00001.png``, else 0.
-        source: file whose rows are numbered, for messages.
+    """Training and test rows, from 0, of a folder's index files, which begin with ``first``; None without these files.
 
     Raises:
-        InputError: one of the two is missing, or a line is no row, out of range, twice, or in both.
+        InputError: one of the two is missing, or a line is no row of ``source``, out of range, twice, or in both.
     """
     files = [folder / name for name in INDEX_FILES]
     if not any(file.exists() for file in files):

@@ -23,13 +23,9 @@ DATA_VARIABLE = "WRF_MI_DATA"
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A file of a public original.
+    """A file of a public original: path in the folder of the data set, SHA-256 (hex), and path below the base URL.
 
-    Attributes:
-        path: path in the folder of the data set.
-        sha256: hex digest of the file, or of the arrays of a converted file (`wrf_mi.datasets.newrf.arrays_sha256`).
-        remote: path below the base URL.
-        converted: whether the file is converted from the original's.
+    The SHA-256 of a converted file is that of its arrays (`wrf_mi.datasets.newrf.arrays_sha256`).
     """
 
     path: str

@@ -70,7 +70,14 @@ def make_splits(
         # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it
         # is nested in a longer one, validation rows included.
         order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
-        order = order[: _kept(what, len(order), n_train)]
+        count = len(order)
+        if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+            count = int(n_train)
+        elif n_train is not None:
+            count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
+        if not 1 <= count <= len(order):
+            raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
+        order = order[:count]
         # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
         counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
         validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
@@ -83,15 +90,9 @@ def save_split(path: str | Path, split: Split) -> None:
 
     Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0).
     """
-    arrays = {
-        "format": np.int64(SPLIT_FORMAT),
-        "name": np.str_(split.name),
-        "seed": np.int64(split.seed),
-        "train": split.train,
-        "validation": split.validation,
-        "test": split.test,
-    }
-    write_arrays(Path(path), arrays)
+    parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    facts = {"format": np.int64(SPLIT_FORMAT), "name": np.str_(split.name), "seed": np.int64(split.seed)}
+    write_arrays(Path(path), {**facts, **parts})
 
 
 def load_split(path: str | Path) -> Split:
@@ -172,15 +173,3 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [(name, order[:first], order[first:])]
-
-
-def _kept(what: str, available: int, n_train: int | float | None) -> int:
-    if n_train is None:
-        return available
-    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
-        count = int(n_train)
-    else:
-        count = round(float(n_train) * available) if 0 < n_train <= 1 else 0
-    if not 1 <= count <= available:
-        raise InputError(f"{what}: n_train {n_train}; choose 1 to {available} rows or a fraction in (0, 1]")
-    return count

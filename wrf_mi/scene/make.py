@@ -12,7 +12,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
-from .plan_sources import PlanGrid, Row0, read_plan
+from .plan_sources import PlanGrid, Row0, read_layout, read_plan
 from .points import check_extent, lidar_package, read_points
 from .surfaces import Surface, moved
 
@@ -50,8 +50,8 @@ def make_scene(
         floor_m: z of a plan's floor.
         resolution_m: side of a plan's cell; overrides that of the file.
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.
-        register_walls_of: a layout file (`wrf_mi.scene.plan.read_walls`) to whose walls the scene is registered
-            (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
+        register_walls_of: a layout file (`wrf_mi.scene.plan_sources.read_layout`) to whose walls the scene is
+            registered (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
         positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
             source whose walls they cross, or that they fit better when mirrored, is refused.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
@@ -79,12 +79,12 @@ def make_scene(
             raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     for name in ("shapely", "mapbox_earcut"):
         lidar_package(name)
-    from .plan import read_walls
+    from .plan import layout_walls
     from .positions import check_positions, read_positions, reflections
     from .register import register_walls, wall_points
 
     measured = None if positions is None else read_positions(positions)
-    known_walls = None if register_walls_of is None else read_walls(register_walls_of)
+    known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     surfaces, points, grid = _surfaces(file, units, height_m, floor_m, resolution_m, row_0)
     if known_walls is not None:
         matrix = register_walls(wall_points(surfaces), known_walls, str(file)).matrix
@@ -165,10 +165,9 @@ def _has_faces(file: Path) -> bool:
     """Whether a file is a mesh and not a cloud; PLY may be either."""
     from .mesh import SUFFIXES
 
-    if file.suffix.lower() not in SUFFIXES or not file.is_file():
-        return False
-    if file.suffix.lower() != ".ply":
-        return True
+    suffix = file.suffix.lower()
+    if suffix != ".ply" or not file.is_file():
+        return suffix in SUFFIXES and file.is_file()
     with file.open("rb") as stream:
         head = stream.read(1 << 16).split(b"end_header")[0].split()
     return b"face" in head and head[head.index(b"face") + 1] != b"0"

@@ -59,11 +59,6 @@ class _Body:
         """Lowest and highest coordinates, shape [2, 3]."""
         return np.stack([self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))])
 
-    @property
-    def height_m(self) -> float:
-        """Extent along z."""
-        return float(np.ptp(self.corners_m[..., 2]))
-
 
 @dataclass(frozen=True)
 class _Facet:
@@ -243,11 +238,11 @@ def _bounds_rooms(index: int, bodies: Sequence[_Body], slabs: set[int], slab_bou
     body = bodies[index]
     if not body.closed:
         return True
-    if body.height_m < STOREY_M:
+    low, high = body.bounds_m[:, 2]
+    if high - low < STOREY_M:
         return False
     others = [other for i, other in enumerate(bodies) if i != index and i not in slabs]
     around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
-    low, high = body.bounds_m[:, 2]
     for other in around:
         # A cavity is clear of floor and ceiling, furniture is not.
         floor, ceiling = other.bounds_m[:, 2]
@@ -257,7 +252,7 @@ def _bounds_rooms(index: int, bodies: Sequence[_Body], slabs: set[int], slab_bou
     outer = [other.bounds_m for other in around]
     if slab_bounds_m is not None and _within(body.bounds_m, slab_bounds_m):
         outer.append(slab_bounds_m)
-    return all(body.height_m >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer)
+    return all(high - low >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer)
 
 
 def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:

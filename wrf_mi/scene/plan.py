@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import shapely
 from shapely.geometry import Polygon
@@ -14,7 +12,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .outline import triangulated
 from .plan_align import grid_from_scans
-from .plan_sources import PlanGrid, PlanPoints, grid_from_points, read_layout
+from .plan_sources import PlanGrid, PlanPoints, grid_from_points
 from .plan_walls import find_walls
 from .surfaces import Kind, Surface, number_names
 
@@ -25,15 +23,6 @@ COVERED = 0.9
 EDGE_M = 0.1
 """A wall this near to the floor's edge stands at it."""
 SMALLEST_FLOOR_M2 = 0.5
-
-
-def read_walls(path: str | Path) -> FloatArray:
-    """The walls of a layout file, ``x,y`` of consecutive vertices: end points [n, 2, 2], each stretch once.
-
-    Raises:
-        InputError: as `wrf_mi.scene.plan_sources.read_layout`.
-    """
-    return layout_walls(read_layout(path))
 
 
 def layout_walls(vertices_m: FloatArray) -> FloatArray:
@@ -79,13 +68,8 @@ def walls_of_plan(
     Points whose scans are known by their times are aligned with one another first, and free space is found from the
     places of the sensor (`wrf_mi.scene.plan_align`).
 
-    Args:
-        source: the plan, as `wrf_mi.scene.plan_sources.read_plan` returns it.
-        resolution_m: side of a cell to count points in.
-        name: name of the source, for errors.
-
     Raises:
-        InputError: no wall.
+        InputError: no wall; the message begins with ``name``.
     """
     if isinstance(source, PlanPoints):
         if source.time_s is None:

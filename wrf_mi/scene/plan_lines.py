@@ -41,13 +41,7 @@ ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
 
 @dataclass(frozen=True)
 class Run:
-    """An axis-parallel piece of wall in a turned plan.
-
-    Attributes:
-        axis: 0 along x (its offset is a y), 1 along y.
-        offset: coordinate across the axis, metres.
-        start, end: coordinates along the axis, metres.
-    """
+    """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1)."""
 
     axis: int
     offset: float

@@ -58,12 +58,7 @@ class PlanGrid:
 
 @dataclass(frozen=True)
 class PlanPoints:
-    """LiDAR returns in a horizontal plane.
-
-    Attributes:
-        xy_m: shape [n, 2].
-        time_s: time of each return's scan, shape [n], or None; returns of equal time belong to one scan.
-    """
+    """LiDAR returns [n, 2] in a horizontal plane and the times [n] of their scans, equal within a scan, or None."""
 
     xy_m: FloatArray
     time_s: FloatArray | None = None

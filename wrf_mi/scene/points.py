@@ -136,8 +136,8 @@ def _read(file: Path) -> Any:
             with lidar_package("laspy").open(file) as source:
                 return source.read().xyz
         case ".xyz" | ".txt":
-            with file.open(encoding="utf-8-sig") as stream:
-                commas = "," in next((line for line in stream if line.strip() and not line.startswith("#")), "")
+            with file.open(encoding="utf-8-sig") as text:
+                commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
             columns, delimiter = (0, 1, 2), "," if commas else None
             return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
     return getattr(trimesh.load(file), "vertices", np.empty((0, 3)))

@@ -227,37 +227,27 @@ def _draw_slant(
                     corners[chosen], facecolors=shades[chosen], edgecolors="none", antialiaseds=False, zorder=order
                 )
             )
-    _rims(axes, surfaces)
+    # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
+    rims = [np.empty((0, 2, 3))]
+    for surface in surfaces:
+        if surface.kind != "ceiling" and len(surface.faces) <= 500:
+            edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+            edge, count = np.unique(edges, axis=0, return_counts=True)
+            rims.append(surface.vertices_m[edge[count == 1]])
+    if len(lines := np.concatenate(rims)):
+        axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
     axes.set_proj_type("ortho")
     axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
     size = np.maximum(high - low, 0.1)
-    for setter, a, s in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), low, size, strict=True):
-        setter(a, a + s)
+    for axis, name, a, s in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", low, size, strict=True):
+        axes.set(**{f"{name}lim": (a, a + s)})
+        axis.set_label_text(f"{name} (m)", fontsize=8)
+        axis.set_pane_color((1, 1, 1, 0))
+    axes.zaxis.labelpad = -4
     axes.set_box_aspect(size, zoom=0.98)
-    axes.set_xlabel("x (m)", fontsize=8)
-    axes.set_ylabel("y (m)", fontsize=8)
-    axes.set_zlabel("z (m)", fontsize=8, labelpad=-4)
     axes.tick_params(labelsize=7, pad=0)
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.grid(False)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_pane_color((1, 1, 1, 0))
-
-
-def _rims(axes: Any, surfaces: Sequence[Surface]) -> None:
-    """Thin lines along the free edges of walls and floors, which make the corners readable."""
-    rims = []
-    for surface in surfaces:
-        if surface.kind == "ceiling" or len(surface.faces) > 500:
-            continue
-        edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edge, count = np.unique(edges, axis=0, return_counts=True)
-        rims.append(surface.vertices_m[edge[count == 1]])
-    # Closed bodies have no free edge.
-    if any(len(lines) for lines in rims):
-        axes.add_collection3d(
-            Line3DCollection(np.concatenate(rims), colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3)
-        )
 
 
 def _draw_plan(
