@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
-from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from .folder_files import (
     POSITIONS,
@@ -59,8 +58,21 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
             transmission; one line with the file and the row.
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
-    gateways = _read_gateways(folder / GATEWAYS)
-    positions = _read_positions(folder / POSITIONS)
+    found = read_yaml(folder / GATEWAYS)
+    if not found:
+        raise InputError(f"{folder / GATEWAYS}: no gateway in it; give one line NAME: [x, y, z] for each, metres")
+    for key in found:
+        if not str(key).isprintable():
+            text = f"gateway {shown(key)} does not go into one line"
+            raise InputError(f"{folder / GATEWAYS}: {text}; call it gateway1, gateway2, ...")
+    gateways = {str(key): finite_numbers(folder / GATEWAYS, f"{key}: position", at, 3) for key, at in found.items()}
+    table = _headed(folder / POSITIONS)
+    if len(table.header) != 3:
+        text = f"header {','.join(table.header)[:40]!r} has {len(table.header)} columns"
+        raise InputError(f"{table.path}: line 1: {text}; give x,y,z in metres")
+    lower = [column.lower() for column in table.header]
+    axes = [lower.index(axis) for axis in "xyz"] if sorted(lower) == ["x", "y", "z"] else [0, 1, 2]
+    positions = np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
     power = _read_powers(folder / POWERS, list(gateways))
     rows = len(positions)
     if power.shape[1] != rows:
@@ -78,27 +90,6 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
         frequencies_hz=np.array([CARRIER_HZ]),
         source=str(folder),
     )
-
-
-def _read_gateways(path: Path) -> dict[str, FloatArray]:
-    found = read_yaml(path)
-    if not found:
-        raise InputError(f"{path}: no gateway in it; give one line NAME: [x, y, z] for each, metres")
-    for name in found:
-        if not str(name).isprintable():
-            text = f"gateway {shown(name)} does not go into one line"
-            raise InputError(f"{path}: {text}; call it gateway1, gateway2, ...")
-    return {str(name): finite_numbers(path, f"{name}: position", at, 3) for name, at in found.items()}
-
-
-def _read_positions(path: Path) -> FloatArray:
-    table = _headed(path)
-    if len(table.header) != 3:
-        text = f"header {','.join(table.header)[:40]!r} has {len(table.header)} columns"
-        raise InputError(f"{path}: line 1: {text}; give x,y,z in metres")
-    lower = [column.lower() for column in table.header]
-    axes = [lower.index(axis) for axis in "xyz"] if sorted(lower) == ["x", "y", "z"] else [0, 1, 2]
-    return np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
 
 
 def _read_powers(path: Path, gateways: list[str]) -> NDArray[np.float32]:

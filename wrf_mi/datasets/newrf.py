@@ -98,11 +98,7 @@ def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def read_arrays(file: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Some arrays of a room's file.
-
-    Raises:
-        InputError: the file is missing or damaged, or an array is missing.
-    """
+    """Some arrays of a room's file; an `InputError` if the file or an array is missing."""
     with readable(file, f"{file}: missing; give a room's .npz file", "convert or fetch it again"):
         arrays = stored_arrays(file)
     if lacking := [key for key in keys if key not in arrays]:

@@ -34,14 +34,7 @@ PREVIEW_FILE = "preview.png"
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Content of a scene folder.
-
-    Attributes:
-        folder: path of the folder.
-        xml: scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
-        materials: complete: every rule, surface and thickness.
-        counts: numbers of surfaces, faces and, for a scan, points.
-    """
+    """Content of a scene folder: scene file for Mitsuba and Sionna RT, complete materials, and counts of its parts."""
 
     folder: Path
     xml: Path

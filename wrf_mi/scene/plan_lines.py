@@ -61,10 +61,7 @@ class Run:
 
 
 def without_specks(grid: PlanGrid) -> PlanGrid:
-    """The grid without stray returns, and free only in rooms.
-
-    Beams that slip through a gap or a window say nothing about the walls beside them.
-    """
+    """The grid without stray returns, and free only in rooms, not where beams pass a gap or a window."""
     occupied = large_parts(grid.occupied, SMALLEST_BLOB_CELLS, np.ones((3, 3)))
     free = ndimage.binary_opening(grid.free, np.ones((2, 2)))
     return replace(grid, occupied=occupied, free=large_parts(free, SMALLEST_ROOM_M2 / grid.resolution_m**2))

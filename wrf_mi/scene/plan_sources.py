@@ -195,7 +195,17 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         known = values[~np.isnan(values)]
         if known.size and (known.min() < 0 or known.max() > 1):
             values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
-        return grid_from_probability(values, resolution_m, row_0 or _stated_row_0(content, path), origin, str(path))
+        if row_0 is None:
+            if "row_0" not in content:
+                way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
+                raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
+            stated = content["row_0"]
+            word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
+            row_0 = next((side for side in get_args(Row0) if side == word.strip().lower()), None)
+            if row_0 is None:
+                text = f"row_0 is {one_line(word)[:40]!r}"
+                raise InputError(f"{path}: {text}; give top (largest y) or bottom (smallest y)")
+        return grid_from_probability(values, resolution_m, row_0, origin, str(path))
     if "xy_m" in numbers:
         if row_0 is not None:
             raise _no_rows(path, "it holds points, which have no rows")
@@ -206,18 +216,6 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
             raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
         return PlanPoints(xy, time)
     raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
-
-
-def _stated_row_0(content: dict[str, NDArray[Any]], path: Path) -> Row0:
-    if "row_0" not in content:
-        way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, bottom if the smallest"
-        raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
-    stated = content["row_0"]
-    word = str(stated.astype(str).reshape(-1)[0]).strip().lower() if stated.size == 1 else str(stated.tolist())
-    for side in get_args(Row0):
-        if word == side:
-            return side
-    raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
 
 
 def _no_rows(path: Path, why: str) -> InputError:

@@ -79,21 +79,17 @@ def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
         walls = [run.ends_m @ rotation_2d(angle).T for run in _tidy(runs, turned(grid, angle))]
         pieces = [run.ends_m @ rotation_2d(angle).T for run in runs]
         found += walls
-        left = _unexplained(left, np.array(pieces + walls))
+        # The occupied cells that lie at these walls are explained.
+        lines = shapely.STRtree(shapely.linestrings(np.array(pieces + walls)))
+        cells = shapely.points(left.centres_m(left.occupied))
+        near, occupied = lines.query(cells, predicate="dwithin", distance=CLEARED_M)[0], left.occupied.copy()
+        row, column = np.nonzero(occupied)
+        occupied[row[near], column[near]] = False
+        left = without_specks(replace(left, occupied=occupied))
     if not found:
         raise InputError(f"{name}: no straight wall was found; is the resolution right, and is it a plan of walls?")
     walls_m = _without_clutter(joined(np.array(found)))
     return walls_m[np.argsort(-np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=-1), kind="stable")]
-
-
-def _unexplained(grid: PlanGrid, walls_m: FloatArray) -> PlanGrid:
-    """The grid without the occupied cells that lie at walls."""
-    row, column = np.nonzero(grid.occupied)
-    lines = shapely.STRtree(shapely.linestrings(walls_m))
-    near = lines.query(shapely.points(grid.centres_m(grid.occupied)), predicate="dwithin", distance=CLEARED_M)[0]
-    occupied = grid.occupied.copy()
-    occupied[row[near], column[near]] = False
-    return without_specks(replace(grid, occupied=occupied))
 
 
 def joined(walls_m: FloatArray, reach_m: float = REACH_M) -> FloatArray:

@@ -80,7 +80,15 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
         raise InputError("the scene has no wall that positions could cross; leave out --positions")
     places = _distinct(positions_m)
     lines = shapely.linestrings(_tree(places))
-    cut = shapely.STRtree(shapely.linestrings(_cut(walls, surfaces, positions_m[:, 2])))
+    heights, z_m = np.concatenate([wall.vertices_m[:, 2] for wall in walls]), positions_m[:, 2]
+    cut_m = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
+    if np.isfinite(z_m).all():
+        cut_m = float(np.median(z_m))
+    margin = EDGE_SHARE * np.ptp(heights)
+    level_m = (0, 0, float(np.clip(cut_m, heights.min() + margin, heights.max() - margin)))
+    meshes = [trimesh.Trimesh(wall.vertices_m, wall.faces, process=False) for wall in walls]
+    pieces = np.concatenate([trimesh.intersections.mesh_plane(mesh, (0, 0, 1), level_m) for mesh in meshes])
+    cut = shapely.STRtree(shapely.linestrings(pieces[..., :2]))
     crossings = len(np.unique(cut.query(lines, predicate="intersects")[0]))
     level = [surface for surface in surfaces if surface.kind in ("floor", "ceiling")]
     if not level:
@@ -176,15 +184,3 @@ def _tree(places_m: FloatArray) -> FloatArray:
     row = np.broadcast_to(np.arange(n)[:, None], other.shape)
     tree = minimum_spanning_tree(sparse.csr_array((length[near], (row[near], other[near])), shape=(n, n))).tocoo()
     return np.stack([places_m[tree.row], places_m[tree.col]], axis=1)
-
-
-def _cut(walls: Sequence[Surface], surfaces: Sequence[Surface], z_m: FloatArray) -> FloatArray:
-    """End points [m, 2, 2] of the walls cut at the height of the positions, or at `WALKING_HEIGHT_M`."""
-    heights = np.concatenate([wall.vertices_m[:, 2] for wall in walls])
-    at = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
-    if np.isfinite(z_m).all():
-        at = float(np.median(z_m))
-    margin = EDGE_SHARE * np.ptp(heights)
-    at = float(np.clip(at, heights.min() + margin, heights.max() - margin))
-    meshes = [trimesh.Trimesh(wall.vertices_m, wall.faces, process=False) for wall in walls]
-    return np.concatenate([trimesh.intersections.mesh_plane(mesh, (0, 0, 1), (0, 0, at)) for mesh in meshes])[..., :2]

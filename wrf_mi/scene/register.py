@@ -156,12 +156,8 @@ def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatA
 
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """The turn about z and shift [4, 4] in which points [n, 2] fit walls [m, 2, 2] best, however badly."""
-    pose, _ = _find_poses(_thinned(points_m), walls_m)[0]
+    pose, _ = _find_poses(points_m, walls_m)[0]
     return _motion(rotation_2d(pose[2]), pose[:2])
-
-
-def _thinned(points_m: FloatArray) -> FloatArray:
-    return points_m[:: -(-len(points_m) // MOST_POINTS)]
 
 
 def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> Registration:
@@ -182,7 +178,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     points, walls = np.asarray(points_m, float)[:, :2], np.asarray(walls_m, float)
     if len(points) < 3 or not len(walls):
         raise InputError(f"{name}: registration to walls needs points and walls, got {len(points)} and {len(walls)}")
-    points = _thinned(points)
+    points = points[:: -(-len(points) // MOST_POINTS)]
     fits = _find_poses(points, walls)
     pose, score = fits[0]
     residual = distance_to_walls(_moved(points, pose), walls)
@@ -245,6 +241,7 @@ def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
 
 def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray, float]]:
     """Poses (x, y, angle) of points [n, 2] that fit walls [m, 2, 2], and their agreement 0 to 1, the best first."""
+    points = points[:: -(-len(points) // MOST_POINTS)]
     middle = points.mean(axis=0)
     centred = points - middle
     targets = sample_walls(walls)

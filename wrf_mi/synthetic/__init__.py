@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from ..core import Record
@@ -28,12 +30,8 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     Raises:
         InputError: as `wrf_mi.datasets.load`.
     """
-    if not Path(name_or_folder).is_dir():
-        if name_or_folder == LABORATORY:
-            return laboratory_record(progress=progress)
-        if name_or_folder == ROOM:
-            return traced_room(progress=progress)[0]
-        place = str(name_or_folder).removeprefix(PREFIX)
-        if place in PLACES and place != str(name_or_folder):
-            return walked_channels(place, progress=progress)
+    makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: lambda **kw: traced_room(**kw)[0]}
+    makers |= {f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES}
+    if not Path(name_or_folder).is_dir() and str(name_or_folder) in makers:
+        return makers[str(name_or_folder)](progress=progress)
     return load(name_or_folder)

@@ -126,7 +126,18 @@ def walked_channels(
     folder, plan = Path(folder), PLACES[place]()
     with tempfile.TemporaryDirectory() as work:
         write_scene(Path(work), plan.parts, f"{place.capitalize()} of several rooms", "wrf_mi_scenes.floor_plans")
-        recipe = _recipe(place, plan, content_sha256(Path(work), "scene.xml"), walk)
+        facts = {
+            "format": FORMAT,
+            "place": place,
+            "scene_sha256": content_sha256(Path(work), "scene.xml"),
+            "station_m": list(plan.station_m),
+            "routes_m": [[list(corner) for corner in route] for route in plan.routes],
+            **asdict(walk),
+            "frequency_hz": CARRIER_HZ,
+            "subcarrier_spacing_hz": SPACING_HZ,
+            "sionna_rt": version("sionna-rt"),
+        }
+        recipe = yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)
         if not is_made(folder, recipe) or not (folder / MEASURED / "scene.yml").is_file():
             logger.info("tracing channels in the %s into %s", place, folder)
             record = _trace(Path(work), name, plan, walk, progress)
@@ -190,18 +201,3 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     )
     split = make_splits(record, "random", seed=walk.seed)[0]
     return replace(record, official=(split.all_train, split.test))
-
-
-def _recipe(place: str, plan: FloorPlan, scene_sha256: str, walk: Walk) -> str:
-    facts = {
-        "format": FORMAT,
-        "place": place,
-        "scene_sha256": scene_sha256,
-        "station_m": list(plan.station_m),
-        "routes_m": [[list(corner) for corner in route] for route in plan.routes],
-        **asdict(walk),
-        "frequency_hz": CARRIER_HZ,
-        "subcarrier_spacing_hz": SPACING_HZ,
-        "sionna_rt": version("sionna-rt"),
-    }
-    return yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)

@@ -43,7 +43,7 @@ from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
 from ..tracing.solve import trace_paths
 from ..tracing.surfaces import scene_surfaces
-from .laboratory import FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SPACING_M, is_made, scan_file
+from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SPACING_M, is_made, scan_file
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +114,8 @@ def traced_room(
         The record and the folder of the measured room's scene, the input of models.
     """
     folder = user_cache() / NAME if folder is None else Path(folder)
-    recipe = _recipe(room)
+    facts = {"format": FORMAT, **asdict(room), "frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
+    recipe = yaml.safe_dump(facts | {"sionna_rt": version("sionna-rt")}, sort_keys=False)
     if not is_made(folder, recipe):
         logger.info("tracing %d spectra of the furnished room into %s", room.train + room.test, folder)
         with tempfile.TemporaryDirectory() as work:
@@ -204,15 +205,3 @@ def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
         official=(rows[: room.train], rows[room.train :]),
         frequencies_hz=frequency_hz,
     )
-
-
-def _recipe(room: TracedRoom) -> str:
-    facts = {
-        "format": FORMAT,
-        **asdict(room),
-        "frequency_hz": FREQUENCY_HZ,
-        "array": f"4 x 4, {SPACING_M} m",
-        "receiver": [*RECEIVER.position_m.tolist(), *RECEIVER.orientation_xyzw.tolist()],
-        "sionna_rt": version("sionna-rt"),
-    }
-    return yaml.safe_dump(facts, sort_keys=False)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from wrf_mi_scenes import SceneInfo, scenes
+from wrf_mi_scenes import scenes
 
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
@@ -50,6 +50,11 @@ RECEIVER = Receiver(
     # Array's x = (0.0698, -0.9976, 0), y = up, boresight z = (-0.9976, -0.0698, 0).
     orientation_xyzw=np.array([0.51712, -0.48227, -0.48227, 0.51712]),
 )
+ARRAY_FACTS = {
+    "array": f"4 x 4, {SPACING_M} m",
+    "receiver": [*RECEIVER.position_m.tolist(), *RECEIVER.orientation_xyzw.tolist()],
+}
+"""Entries of a recipe that describe the array."""
 
 
 def transmitter_path(count: int = POSITIONS) -> FloatArray:
@@ -76,28 +81,33 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
         folder = user_cache() / NAME
     folder = Path(folder)
     info = scenes()[NAME]
-    recipe = _recipe(info)
+    facts = {
+        "format": FORMAT,
+        "scene": info.name,
+        "scene_sha256": info.sha256,
+        "frequency_hz": FREQUENCY_HZ,
+        **ARRAY_FACTS,
+        "positions": POSITIONS,
+        "scanner": [list(place) for place in SCANNER_M],
+        "scanned_rays": SCANNED_RAYS,
+        "max_depth": OPTIONS.max_depth,
+        "rays_per_source": OPTIONS.rays,
+        "seed": OPTIONS.seed,
+        "sionna_rt": version("sionna-rt"),
+    }
+    recipe = yaml.safe_dump(facts, sort_keys=False)
     if not is_made(folder, recipe):
         logger.info("tracing %d spectra in the scene %s into %s", POSITIONS, NAME, folder)
+        positions, array_m = transmitter_path(), planar_array(4, 4, SPACING_M)
+        receiver, frequency_hz = replace(RECEIVER, array_m=array_m), np.array([FREQUENCY_HZ])
+        scene = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
+        spectra = trace_spectra(scene, positions, RECEIVER, array_m, FREQUENCY_HZ, options=OPTIONS, progress=progress)
+        record = Record(NAME, "spectrum", positions, (receiver,), spectra[None], frequencies_hz=frequency_hz)
+        split = make_splits(record, "random", seed=OPTIONS.seed)[0]
+        record = replace(record, official=(split.all_train, split.test))
         extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: scan_file(info.xml, OPTIONS.seed)}
-        write_spectrum_folder(folder, _trace(info, progress), replace=True, extra=extra)
+        write_spectrum_folder(folder, record, replace=True, extra=extra)
     return read_spectrum_folder(folder, NAME)
-
-
-def _trace(info: SceneInfo, progress: bool) -> Record:
-    scene = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
-    positions, array_m = transmitter_path(), planar_array(4, 4, SPACING_M)
-    spectra = trace_spectra(scene, positions, RECEIVER, array_m, FREQUENCY_HZ, options=OPTIONS, progress=progress)
-    record = Record(
-        name=NAME,
-        task="spectrum",
-        tx_pos_m=positions,
-        receivers=(replace(RECEIVER, array_m=array_m),),
-        observation=spectra[None],
-        frequencies_hz=np.array([FREQUENCY_HZ]),
-    )
-    split = make_splits(record, "random", seed=OPTIONS.seed)[0]
-    return replace(record, official=(split.all_train, split.test))
 
 
 def is_made(folder: Path, recipe: str) -> bool:
@@ -111,22 +121,3 @@ def scan_file(xml: Path, seed: int) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, points=points.astype(np.float32))
     return stream.getvalue()
-
-
-def _recipe(info: SceneInfo) -> str:
-    facts = {
-        "format": FORMAT,
-        "scene": info.name,
-        "scene_sha256": info.sha256,
-        "frequency_hz": FREQUENCY_HZ,
-        "array": f"4 x 4, {SPACING_M} m",
-        "receiver": [*RECEIVER.position_m.tolist(), *RECEIVER.orientation_xyzw.tolist()],
-        "positions": POSITIONS,
-        "scanner": [list(place) for place in SCANNER_M],
-        "scanned_rays": SCANNED_RAYS,
-        "max_depth": OPTIONS.max_depth,
-        "rays_per_source": OPTIONS.rays,
-        "seed": OPTIONS.seed,
-        "sionna_rt": version("sionna-rt"),
-    }
-    return yaml.safe_dump(facts, sort_keys=False)
