@@ -76,7 +76,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_arrays_are_one_line(tmp_path: Path, case: str):
+def test_wrong_arrays_are_refused_in_one_line(tmp_path: Path, case: str):
     arrays, message = WRONG[case]
     np.savez(tmp_path / "hall.npz", **arrays)
     with pytest.raises(InputError, match=message) as error:
@@ -86,7 +86,7 @@ def test_wrong_arrays_are_one_line(tmp_path: Path, case: str):
     assert ";" in str(error.value), "no remedy"
 
 
-def test_damaged_and_missing_files(tmp_path: Path):
+def test_damaged_and_missing_files_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"hall\.npz: missing"):
         read_newrf(tmp_path / "hall.npz")
     with pytest.raises(InputError, match=r"one room in \.npz is read at a time, found none"):

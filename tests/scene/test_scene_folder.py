@@ -121,7 +121,7 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> No
         ("rules: {", r"not YAML"),
     ],
 )
-def test_materials_that_cannot_be_used(text: str, message: str, folder: Path) -> None:
+def test_unusable_materials_are_refused(text: str, message: str, folder: Path) -> None:
     (folder / "materials.yml").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         read_scene_folder(folder)
@@ -136,7 +136,7 @@ def test_every_material_is_known_to_sionna() -> None:
     assert {name.removeprefix("itu_") for name in THICKNESS_M} == set(ITU_MATERIALS_PROPERTIES)
 
 
-def test_incomplete_folders(folder: Path) -> None:
+def test_incomplete_folders_are_refused(folder: Path) -> None:
     (folder / "meshes" / "table.ply").unlink()
     with pytest.raises(InputError, match=r"surface 'table' has no mesh"):
         read_scene_folder(folder)
@@ -148,7 +148,7 @@ def test_incomplete_folders(folder: Path) -> None:
         read_scene_folder(folder)
 
 
-def test_nothing_is_half_written(tmp_path: Path) -> None:
+def test_scene_folder_is_written_atomically(tmp_path: Path) -> None:
     out = tmp_path / "scene"
     with pytest.raises(InputError, match=r"no surface was found"):
         write_scene(out, [], frame="", source="scan.ply")
@@ -203,7 +203,7 @@ def test_a_layout_becomes_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[0, 0, 1], [5, 4, 3.5]], atol=1e-6)
 
 
-def test_a_simulated_scan_has_the_noise_and_the_strays_that_were_asked_for(tmp_path: Path) -> None:
+def test_simulated_scan_has_the_stated_noise_and_strays(tmp_path: Path) -> None:
     xml = scene_file(tmp_path, closed_box())
     pose = np.array([2.0, 1.5, 1.3])
     points = simulate_scan(xml, pose, rays_per_pose=20_000, range_noise_m=0.02, outliers=0.05, seed=3)

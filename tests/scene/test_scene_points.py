@@ -48,12 +48,12 @@ def test_text_with_spaces_commas_comments_and_further_columns(text: str, tmp_pat
 
 
 @pytest.mark.parametrize(("units", "factor"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048)])
-def test_units(units: str, factor: float, tmp_path: Path) -> None:
+def test_units_scale_the_coordinates(units: str, factor: float, tmp_path: Path) -> None:
     np.savez(tmp_path / "cloud.npz", xyz_m=POINTS)
     np.testing.assert_allclose(read_points(tmp_path / "cloud.npz", units), POINTS * factor, rtol=1e-15)
 
 
-def test_unknown_units(tmp_path: Path) -> None:
+def test_unknown_units_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, cm, mm, ft"):
         read_points(tmp_path / "cloud.npz", "inch")
 
@@ -66,7 +66,7 @@ def test_unknown_units(tmp_path: Path) -> None:
         (0.001, r"is too small for a room; give its --units"),
     ],
 )
-def test_coordinates_that_are_not_metres(factor: float, message: str) -> None:
+def test_coordinates_that_are_not_metres_are_refused(factor: float, message: str) -> None:
     with pytest.raises(InputError, match=message):
         check_extent(sampled(closed_box(), 1000) * factor, "scan.ply")
 
@@ -88,7 +88,9 @@ def test_metres_far_from_the_origin_and_with_strays_pass() -> None:
         ("a.las", None, False),
     ],
 )
-def test_plans_are_told_from_scans(name: str, arrays: dict[str, np.ndarray] | None, plan: bool, tmp_path: Path) -> None:
+def test_plans_and_scans_are_distinguished(
+    name: str, arrays: dict[str, np.ndarray] | None, plan: bool, tmp_path: Path
+) -> None:
     if arrays:
         np.savez(tmp_path / name, **arrays)
     assert is_plan(tmp_path / name) is plan
@@ -114,7 +116,7 @@ def test_options_that_do_not_fit_the_source(tmp_path: Path) -> None:
     assert [path.name for path in out.iterdir()] == ["mine"]
 
 
-def test_a_mesh_is_mended_where_that_does_no_harm(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_degenerate_and_doubled_faces_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     box = trimesh.creation.box((2.0, 3.0, 2.5))
     faces = np.concatenate([box.faces[:, ::-1], box.faces[:2], [[0, 0, 1]]])  # inverted, doubled, degenerate
     trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "room.stl")
@@ -128,7 +130,7 @@ def test_a_mesh_is_mended_where_that_does_no_harm(tmp_path: Path, caplog: pytest
     ]
 
 
-def test_meshes_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_meshes_are_refused(tmp_path: Path) -> None:
     box = trimesh.creation.box((2000.0, 3000.0, 2500.0))
     box.export(tmp_path / "mm.stl")
     with pytest.raises(InputError, match=r"mm.stl: .* looks like millimetres; give --units mm"):

@@ -97,13 +97,13 @@ def test_paths_gaussians_and_devices_are_in_both_views():
     assert {axes.get_ylabel() for axes in figure.axes[2:]} == {"gain of a path (dB)", "signal of a Gaussian (dB)"}
 
 
-def test_bodies_of_other_makers_are_drawn_without_their_lid():
+def test_level_faces_near_the_top_are_not_drawn():
     box = np.array([[x, y, z] for z in (0, 2) for y in (0, 3) for x in (0, 4)], float)
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
     assert faces_drawn(draw_scene([Surface("mesh", "other", box, faces)])) == 4
 
 
-def test_what_cannot_be_drawn_is_refused():
+def test_scenes_without_surfaces_or_path_ends_are_refused():
     with pytest.raises(ValueError, match="no surface"):
         draw_scene([])
     with pytest.raises(ValueError, match="paths need"):

@@ -30,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_is_made_once_and_the_same_each_time(made: Path) -> None:
+def test_data_are_stored_and_reproducible(made: Path) -> None:
     before = (made / "tx_pos.csv").stat().st_mtime_ns
     record, given = traced_room(made, SMALL)
     assert (made / "tx_pos.csv").stat().st_mtime_ns == before
@@ -46,7 +46,7 @@ def test_it_is_made_once_and_the_same_each_time(made: Path) -> None:
     assert np.array_equal(record.observation, back.observation)
 
 
-def test_what_a_model_is_given_lacks_the_furniture_and_is_off() -> None:
+def test_measured_room_lacks_furniture_and_has_errors() -> None:
     full, bare = furnished_parts(), measured_parts(0.02, 1)
     assert {material for material, _ in bare.values()} == {"itu_concrete"}
     assert len({material for material, _ in full.values()}) > 5
@@ -57,7 +57,7 @@ def test_what_a_model_is_given_lacks_the_furniture_and_is_off() -> None:
     assert all(0 < abs(one) < 0.08 for one in off)  # four deviations
 
 
-def test_transmitters_stand_in_the_open(tmp_path: Path) -> None:
+def test_transmitters_are_clear_of_surfaces(tmp_path: Path) -> None:
     write_scene(tmp_path, furnished_parts(), "test")
     scene = open_scene(tmp_path, FREQUENCY_HZ)
     positions, surfaces = transmitters(scene, TracedRoom(train=300, test=100)), scene_surfaces(scene)
@@ -69,7 +69,7 @@ def test_transmitters_stand_in_the_open(tmp_path: Path) -> None:
         assert winding_number(surfaces.triangles[face], positions).max() < 0.5
 
 
-def test_specular_signals_are_those_of_the_other_direction(tmp_path: Path) -> None:
+def test_specular_signals_are_reciprocal(tmp_path: Path) -> None:
     write_scene(tmp_path, measured_parts(0.0, 0), "test")
     scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
     tx = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7]])

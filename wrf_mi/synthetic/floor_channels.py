@@ -40,12 +40,9 @@ from .laboratory import RECIPE, is_made
 logger = logging.getLogger(__name__)
 
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
-PREFIX = "traced-csi-"
-"""Prefix of the data sets' names."""
-MEASURED = "floor"
-"""Folder beside the channels with the measured floor's scene, the input of models."""
-FORMAT = 2
-"""Version of the files; to be raised when they change for equal parameters."""
+PREFIX = "traced-csi-"  # of the names of the data sets
+MEASURED = "floor"  # folder beside the channels with the measured scene, the input of models
+FORMAT = 2  # version of the files, to be raised when they change for equal parameters
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.437e9, 312.5e3, 26
 UPLINK_HZ: FloatArray = CARRIER_HZ + SPACING_HZ * np.arange(-HALF, 0, dtype=float)
@@ -60,14 +57,12 @@ class Walk:
 
     Attributes:
         rows, columns: numbers of the base station's antennas.
-        users: number of users on each route.
-        places: number of positions of each user along the route.
+        users, places: numbers of users on each route, and of positions of each user.
         wander_m: largest deviation of users from the route, along x and along y.
         height_m, sway_m: height of a user's antenna and its largest deviation.
-        depth, reflections: most interactions of a path, and most reflections among them.
-        rays: number of rays for specular paths.
-        scattered_rays: number of rays for diffuse reflection; each hit is a patch of rough surface.
-        scattered_depth: most interactions of a scattered path.
+        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
+            scattered path.
+        rays, scattered_rays: numbers of rays for specular paths and for diffuse reflection.
         scattering: share of the reflected amplitude that every surface scatters.
         snr_db: signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers.
         mesh_error_m: standard deviation of the measured walls' positions along each axis, metres.

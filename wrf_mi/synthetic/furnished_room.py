@@ -48,10 +48,8 @@ from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SPACI
 logger = logging.getLogger(__name__)
 
 NAME = "traced-room"
-MEASURED = "room"
-"""Folder beside the spectra with the measured room's scene, the input of models."""
-FORMAT = 1
-"""Version of the files; to be raised when they change for equal parameters."""
+MEASURED = "room"  # folder beside the spectra with the measured scene, the input of models
+FORMAT = 1  # version of the files, to be raised when they change for equal parameters
 SCATTERING, DIFFRACTION = 2, 8
 """Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
 
@@ -64,10 +62,9 @@ class TracedRoom:
         train, test: numbers of training and test rows.
         low_m, high_m: bounds of the transmitters' height, metres.
         clear_m, from_array_m: least distances from surfaces and from the array, metres.
-        depth, reflections: most interactions of a path, and most reflections among them.
-        rays: number of rays for specular paths and diffraction.
-        scattered_rays: number of rays for diffuse reflection; each hit is a patch of rough surface.
-        scattered_depth: most interactions of a scattered path.
+        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
+            scattered path.
+        rays, scattered_rays: numbers of rays for specular paths and diffraction, and for diffuse reflection.
         scattering: share of the reflected amplitude that every surface scatters.
         mesh_error_m: standard deviation of the measured room's planes along their normals, metres.
         seed: seed of positions, errors of the measured room, and rays.
@@ -93,8 +90,7 @@ DEFAULT = TracedRoom()
 OPAQUE = "itu_metal"
 """Material of the edges that diffract. Sionna RT treats every sheet as opaque at its edges, and so overestimates the
 diffraction of thin boards, through which most of the wave passes."""
-CHUNK_SIZE = 100
-"""Transmitters that are traced together."""
+CHUNK_SIZE = 100  # transmitters that are traced together
 
 
 def traced_room(
