@@ -53,8 +53,8 @@ ANCHORS, TRAINING, TEST = "anchors.csv", "calibration_df.csv", "test_robot_df.cs
 TAG_HEIGHT_M = 1.3
 """Height of the transmitter above the floor where the files have no column ``z`` (the data set's description)."""
 CARRIER_HZ = 2.44e9
-"""Where the files have no column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402, 2426
-and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
+"""Carrier of files without a column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402,
+2426 and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
 RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
 MOST_READINGS = 10**6
 """Largest number of readings of a row's mean."""

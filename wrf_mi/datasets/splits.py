@@ -118,7 +118,7 @@ def load_split(path: str | Path) -> Split:
 
 
 def position_folds(record: Record) -> IntArray:
-    """The spatial fold 0, 1, ... of each row, shape [n]: the record's own, or seeded k-means clusters.
+    """The spatial fold 0, 1, ... of each row, shape [n]: those of the record, or seeded k-means clusters.
 
     Raises:
         InputError: positions are not known, or there are too few distinct ones for five clusters.

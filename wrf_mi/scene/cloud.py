@@ -1,4 +1,4 @@
-"""From a point cloud to the surfaces of a building."""
+"""Surfaces of a building from a point cloud."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a scan, a plan or a mesh to a scene folder (the command ``wrf-mi mesh``)."""
+"""Scene folders from a scan, a plan or a mesh (the command ``wrf-mi mesh``)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def make_scene(
         out: path of the folder.
         units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
         materials: rules and exceptions, or a ``materials.yml`` (or scene folder) to read them from.
-        height_m: from floor to ceiling; for a plan alone, which needs it.
+        height_m: height from floor to ceiling, required for a plan and refused otherwise.
         floor_m: z of a plan's floor.
         resolution_m: side of a plan's cell; overrides that of the file.
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.

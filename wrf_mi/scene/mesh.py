@@ -101,7 +101,7 @@ def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
             raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
         faces = np.asarray(part.faces, np.int64)
         solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
-        # Copies may have vertices of their own: STL has no shared vertices.
+        # Copies may have other vertices: STL has no shared vertices.
         _, same = np.unique(vertices, axis=0, return_inverse=True)
         _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
         for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
@@ -125,7 +125,7 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     cavity: a room in a solid building.
 
     Args:
-        surfaces: of a mesh, z upwards, metres.
+        surfaces: surfaces of a mesh, z upwards, metres.
 
     Returns:
         Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.

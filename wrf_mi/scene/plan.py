@@ -1,4 +1,4 @@
-"""From a plan (occupancy grid, LiDAR returns in a plane, wall vertices) to walls, floor and ceiling of a scene."""
+"""Walls, floor and ceiling of a scene from a plan: occupancy grid, LiDAR returns in a plane, or wall vertices."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ def plan_surfaces(
     """Surfaces of a storey: walls extruded from floor to ceiling, and both of these.
 
     Args:
-        source: as in `walls_of_plan`.
-        height_m: from floor to ceiling, above zero.
+        source: the plan, as `wrf_mi.scene.plan_sources.read_plan` returns it.
+        height_m: height from floor to ceiling, above zero.
         floor_m: z of the floor.
-        resolution_m: as in `walls_of_plan`.
+        resolution_m: side of a cell to count points in.
         name: name of the source, for errors.
 
     Returns:

@@ -252,7 +252,7 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
         return distance_to_walls(_moved(centred, pose), walls)
 
     def gradient(pose: FloatArray) -> FloatArray:
-        # A distance grows along its own direction; a turn moves a point across its radius.
+        # A distance grows along its direction; a turn moves a point across its radius.
         turned = _moved(centred, np.array([0.0, 0.0, pose[2]]))
         away = _from_walls(turned + pose[:2], walls)
         unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)
