@@ -13,10 +13,10 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import element_signals
+from wrf_mi.receivers.channel import array_channels
 from wrf_mi.synthetic.furnished_room import TracedRoom, traced_room, transmitters
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.array_channels import array_channels
 from wrf_mi.tracing.devices import solids, winding_number
 from wrf_mi.tracing.surfaces import scene_surfaces
 

@@ -119,7 +119,7 @@ def test_settings_as_text_make_any_configuration(config: TrainConfig) -> None:
 
 def test_what_is_not_named_keeps_its_default() -> None:
     assert read({}) == TrainConfig()
-    config = read({"steps": 5, "density": {"grow": 0.5}})
+    config = read({"steps": 5, "density": {"growth_fraction": 0.5}})
     assert (config.steps, config.density.growth_fraction, config.density.every) == (5, 0.5, TrainConfig().density.every)
 
 

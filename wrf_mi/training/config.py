@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.settings import with_settings
-from ..gaussians.encoding import telling_scale
+from ..gaussians.encoding import unambiguous_scale
 from ..gaussians.skip import Skip
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
@@ -216,7 +216,7 @@ class TrainConfig(LoopConfig):
             tx_pos_m: training transmitters [n, 3], metres.
         """
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
-        scale = self.encoding.tx_scale_m or telling_scale(tx_pos_m, LEAST_TX_SCALE_M)
+        scale = self.encoding.tx_scale_m or unambiguous_scale(tx_pos_m, LEAST_TX_SCALE_M)
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:

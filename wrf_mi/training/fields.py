@@ -41,7 +41,7 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
     elif config.model == "wrf-gs+":
         if n.layers:
             sizes["skip"] = n.layers // 2
-        sizes["still"], sizes["phase_hz"] = n.static_geometry, n.phase_hz
+        sizes["static_geometry"], sizes["phase_hz"] = n.static_geometry, n.phase_hz
     if n.phase_hz and config.model != "wrf-gs+":
         raise InputError(f"setting network.phase_hz: {config.model} has no such phase; leave it away")
     if n.phase_hz and (components > 1 or features):

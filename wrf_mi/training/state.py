@@ -131,8 +131,13 @@ class FitState:
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        scalars = {"step": self.step, "chosen": self.chosen, "adam_step": count, "urge_steps": self.view_gradient_steps}
-        flat |= {"urge": self.view_gradient_norm.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
+        scalars = {
+            "step": self.step,
+            "chosen": self.chosen,
+            "adam_step": count,
+            "view_gradient_steps": self.view_gradient_steps,
+        }
+        flat |= {"view_gradient_norm": self.view_gradient_norm.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
         flat |= {"searched_m": self.searched_m.copy()}
         return flat | {name: np.asarray(value) for name, value in scalars.items()}
 
@@ -147,8 +152,11 @@ class FitState:
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
-        state.view_gradient_steps, state.reach_m = int(arrays["urge_steps"]), float(arrays["reach_m"])
-        state.view_gradient_norm, state.searched_m = to_float(arrays["urge"]), np.array(arrays["searched_m"])
+        state.view_gradient_steps, state.reach_m = int(arrays["view_gradient_steps"]), float(arrays["reach_m"])
+        state.view_gradient_norm, state.searched_m = (
+            to_float(arrays["view_gradient_norm"]),
+            np.array(arrays["searched_m"]),
+        )
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

@@ -39,7 +39,7 @@ MOST_BYTES = 1 << 30
 
 def stands_still(field: Any) -> bool:
     """Whether geometry and attenuation of a field are the same for all transmitters."""
-    return bool(getattr(field, "still", False))
+    return bool(getattr(field, "static_geometry", False))
 
 
 class RecordedSignals:
