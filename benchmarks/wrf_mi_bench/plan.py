@@ -10,12 +10,11 @@ import shapely
 
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.scene.plan import read_walls
+from wrf_mi.scene.plan import layout_walls
 from wrf_mi.scene.plan_align import grid_from_scans
-from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_plan
+from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
 from wrf_mi.scene.plan_walls import find_walls
-from wrf_mi.scene.register import register_walls
-from wrf_mi.scene.register_search import sample_walls
+from wrf_mi.scene.register import register_walls, sample_walls
 
 from .comparison import data_folder, line
 
@@ -50,7 +49,7 @@ def flat_plan() -> dict[str, Any]:
         ``rows`` for the table, and per source: shares, what can be seen, walls, scale of the registration, seconds.
     """
     home = data_folder("flat-ble")
-    true = read_walls(home / "layout.csv")
+    true = layout_walls(read_layout(home / "layout.csv"))
     lidar = home / "lidar"
     grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0), read_plan(lidar / "points.npz")
     if not isinstance(grid, PlanGrid) or not isinstance(returns, PlanPoints) or returns.time_s is None:

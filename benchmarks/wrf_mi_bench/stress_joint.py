@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from wrf_mi_scenes.build_laboratory import Mesh, sheet
-from wrf_mi_scenes.furnished import write_scene
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import Antenna, Receiver, pixel_directions

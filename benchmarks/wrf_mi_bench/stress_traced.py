@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
 from wrf_mi_scenes.build_laboratory import sheet
-from wrf_mi_scenes.furnished import write_scene
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.backend.device import on_device, to_float, to_tensor
 from wrf_mi.core import Antenna

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from wrf_mi_scenes.build_laboratory import sheet
-from wrf_mi_scenes.furnished import write_scene
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import atomic_folder, one_line, write_atomically

@@ -1,10 +1,8 @@
 """Builds the `laboratory` scene: a room of 9 x 7 x 3 m with furniture and a small inner room.
 
-Run ``python -m wrf_mi_scenes.build_laboratory`` after a change; it rewrites ``laboratory/``. Nothing here
-was measured or taken from anywhere: the room is made up, so that a machine without data can still trace one.
-
-Walls, boards and panes are single sheets, because Sionna RT treats a surface as a slab whose thickness
-belongs to the material (`mitsuba_xml.THICKNESS_M`); only the metal cabinets are closed boxes.
+Run ``python -m wrf_mi_scenes.build_laboratory`` after a change; it rewrites ``laboratory/``. The room is made up.
+Walls, boards and panes are single sheets, because Sionna RT treats a surface as a slab whose thickness belongs to the
+material (`mitsuba_xml.THICKNESS_M`); only the metal cabinets are closed boxes.
 """
 
 from __future__ import annotations
@@ -15,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-import yaml
 
-from .mitsuba_xml import THICKNESS_M, scene_xml
-from .registry import content_sha256
+from .mitsuba_xml import Parts, write_scene
 
 LENGTH, WIDTH, HEIGHT = 9.0, 7.0, 3.0
 """The room's inner size along x, y and z in metres; the origin is the floor's south-west corner."""
@@ -78,7 +74,7 @@ def shelf(x: Span, y: Span, boards: Iterable[float], top: float, back_axis: int,
     return trimesh.util.concatenate([back, *(sheet(2, z, x, y) for z in boards)])
 
 
-def laboratory_parts() -> dict[str, tuple[str, Mesh]]:
+def laboratory_parts() -> Parts:
     """Name of each part with its material and mesh, in metres."""
     x, y, z = (0.0, LENGTH), (0.0, WIDTH), (0.0, HEIGHT)
     windows = [((1.0, 3.4), (0.9, 2.4)), ((4.0, 5.4), (0.9, 2.4))]
@@ -135,30 +131,13 @@ def laboratory_parts() -> dict[str, tuple[str, Mesh]]:
 
 
 def build(folder: Path) -> None:
-    """Write the scene's files into ``folder``: ``laboratory.xml``, ``meshes/*.ply`` and ``scene.yml``."""
-    parts = laboratory_parts()
-    meshes = folder / "meshes"
-    meshes.mkdir(parents=True, exist_ok=True)
-    for name, (_, mesh) in parts.items():
-        mesh.export(meshes / f"{name}.ply", vertex_normal=False)
-    materials = {name: material for name, (material, _) in parts.items()}
-    (folder / "laboratory.xml").write_text(scene_xml(materials), encoding="utf-8", newline="\n")
-    facts = {
-        "description": "Made-up laboratory, 9 x 7 x 3 m: brick walls, windows, tables, metal shelves, an inner room",
-        "licence": "MIT",
-        "origin": "made by wrf_mi_scenes.build_laboratory",
-        "frame": "right-handed; x east, y north, z up; origin at the floor's south-west corner",
-        "units": "m",
-        "xml": "laboratory.xml",
-        "thickness_m": {material: THICKNESS_M[material] for material in THICKNESS_M if material in materials.values()},
-        "sha256": content_sha256(folder, "laboratory.xml"),
-    }
-    text = yaml.safe_dump(facts, sort_keys=False, width=110)
-    (folder / "scene.yml").write_text(text, encoding="utf-8", newline="\n")
+    """Write the scene's files into a folder: ``laboratory.xml``, ``meshes/*.ply`` and ``scene.yml``."""
+    description = "Made-up laboratory, 9 x 7 x 3 m: brick walls, windows, tables, metal shelves, an inner room"
+    write_scene(folder, laboratory_parts(), description, "wrf_mi_scenes.build_laboratory", "laboratory.xml")
 
 
 def main() -> None:
-    """Write the scene into the package, or into the folder that is given."""
+    """Write the scene into the package, or into another folder."""
     parser = argparse.ArgumentParser(description="Build the laboratory scene.")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "laboratory")
     build(parser.parse_args().out)

@@ -1,4 +1,4 @@
-"""Rooms of any number of triangles, for measuring what a mesh costs: the same walls divided ever finer, or clutter."""
+"""Rooms of any number of triangles, for measuring the cost of a mesh: finely divided walls, or clutter."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ import trimesh
 from .build_laboratory import HEIGHT, LENGTH, WIDTH, Mesh
 
 CLUTTER_M2 = 60.0
-"""Surface of all clutter together, a quarter of the room's own: so the free way of a ray is as long at every number."""
+"""Total surface of the clutter, a quarter of the room's, so that the free path of rays does not depend on the
+number."""
 CLEAR_M = 1.0
-"""From the places that are kept free."""
+"""Distance from points that are kept free."""
 
 
 def divided_room(triangles: int) -> Mesh:
-    """The laboratory's shell, its six sides divided into equal cells of two triangles: as many planes at every number.
-
-    Args:
-        triangles: at least so many.
-    """
+    """The laboratory's shell, its sides divided into equal cells of two triangles, at least ``triangles`` in all."""
     cells = max(1, int(np.ceil(np.sqrt(triangles / 12))))
     steps = np.linspace(0, 1, cells + 1)
     u, v = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
@@ -36,12 +33,9 @@ def divided_room(triangles: int) -> Mesh:
 
 
 def cluttered_room(triangles: int, clear: np.ndarray, seed: int = 0) -> Mesh:
-    """The laboratory's shell and boxes turned at random in it: the more the smaller, every side a plane of its own.
+    """The laboratory's shell with boxes turned at random, the smaller the more of them, about ``triangles`` in all.
 
-    Args:
-        triangles: about so many; 24 at least.
-        clear: places [n, 3] that boxes keep away from, metres.
-        seed: of places and turns.
+    Boxes keep away from the points ``clear`` [n, 3].
     """
     count, rng = max(1, (triangles - 12) // 12), np.random.default_rng(seed)
     side = np.sqrt(CLUTTER_M2 / 6 / count)
@@ -50,10 +44,10 @@ def cluttered_room(triangles: int, clear: np.ndarray, seed: int = 0) -> Mesh:
         drawn = rng.uniform(0, [LENGTH, WIDTH, HEIGHT], (2 * count, 3))
         far = np.linalg.norm(drawn[:, None] - clear, axis=-1).min(axis=1) > CLEAR_M + side
         place = np.concatenate([place, drawn[far]])[:count]
-    one = trimesh.creation.box((side, side, side))
+    box = trimesh.creation.box((side, side, side))
     turn = np.linalg.qr(rng.standard_normal((count, 3, 3)))[0]
-    corners = np.einsum("vj,nij->nvi", np.asarray(one.vertices), turn) + place[:, None]
-    faces = np.asarray(one.faces)[None] + np.arange(count)[:, None, None] * corners.shape[1]
+    corners = np.einsum("vj,nij->nvi", np.asarray(box.vertices), turn) + place[:, None]
+    faces = np.asarray(box.faces)[None] + np.arange(count)[:, None, None] * corners.shape[1]
     shell = divided_room(12)
     boxes = Mesh(vertices=corners.reshape(-1, 3), faces=faces.reshape(-1, 3), process=False)
     return trimesh.util.concatenate([shell, boxes])

@@ -1,6 +1,6 @@
 """Two made-up floors of several rooms, a flat and an office, for channels between a base station and walking users.
 
-Walls, boards and panes are single sheets, as in `build_laboratory`. Nothing here was measured or taken from anywhere.
+Walls, boards and panes are single sheets, as in `build_laboratory`.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import trimesh
 
 from .build_laboratory import Mesh, Span, box, sheet, table, wall
 from .furnished import GENERIC
+from .mitsuba_xml import Parts
 
 Point = tuple[float, float]
 Opening = tuple[Span, Span]
-Parts = Mapping[str, tuple[str, Mesh]]
 
 DOOR_M = 2.1
-"""Height of every door; they stand open."""
+"""Height of the doors, which are open."""
 
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """A floor, where the base station hangs and where users walk.
+    """A floor with a base station and walking users.
 
     Attributes:
         parts: radio material and mesh of each part by its name, metres.
-        bare: names of the parts that are left of an empty floor: its floor, ceiling, walls and panes.
+        bare: names of the parts of the empty floor: its floor, ceiling, walls and panes.
         station_m: middle of the base station's array, which looks along +x.
-        routes: closed polylines of places (x, y) in metres that users walk round, clear of all that is in the way.
+        routes: closed polylines of points (x, y) in metres that users walk along, clear of furniture and walls.
     """
 
     parts: Parts
@@ -40,13 +40,7 @@ class FloorPlan:
 
 
 def measured(plan: FloorPlan, error_m: float, seed: int) -> Parts:
-    """The bare floor with the measurement's error, all of `GENERIC`: what a model is given.
-
-    Args:
-        plan: what was measured.
-        error_m: standard deviation of each part's displacement along x, y and z, metres.
-        seed: of the displacements.
-    """
+    """The bare floor, all of `GENERIC`, each part displaced by errors of a standard deviation in metres."""
     off = np.random.default_rng(seed).normal(0, error_m, (len(plan.bare), 3))
     moved = {name: plan.parts[name][1].copy() for name in plan.bare}
     for mesh, by in zip(moved.values(), off, strict=True):
@@ -79,7 +73,7 @@ def _shell(length: float, width: float, height: float, windows: Mapping[str, Ite
 
 
 def _doors(*along: Span) -> list[Opening]:
-    return [(one, (0.0, DOOR_M)) for one in along]
+    return [(span, (0.0, DOOR_M)) for span in along]
 
 
 def flat() -> FloorPlan:

@@ -1,9 +1,18 @@
-"""The Mitsuba scene file that Mitsuba and Sionna RT both open, and the radio materials that it may name."""
+"""Scene folders that Mitsuba and Sionna RT both open, and their radio materials."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
+
+import trimesh
+import yaml
+
+from .registry import content_sha256
+
+Parts = Mapping[str, tuple[str, trimesh.Trimesh]]
+"""Radio material and mesh of each part of a scene by its name."""
 
 THICKNESS_M: Mapping[str, float] = MappingProxyType(
     {
@@ -42,13 +51,13 @@ COLOURS: Mapping[str, str] = MappingProxyType(
         "itu_metal": "0.35 0.36 0.40",
     }
 )
-"""What common materials look like when Mitsuba renders the scene."""
+"""Colours of common materials in Mitsuba's pictures."""
 
 OTHER_COLOUR = "0.60 0.60 0.60"
 
 PERFECT = "perfect"
-"""Name of a perfect conductor, which reflects without loss and lets nothing pass: what image-method tracers without
-materials assume, but for the sign of the field."""
+"""Name of a perfect conductor, which image-method tracers without materials assume, except for the sign of the
+field."""
 PERFECT_CONDUCTIVITY = 1e13
 """Siemens per metre: so high that the reflection coefficients are -1 and +1 to single precision."""
 PERFECT_THICKNESS_M = 0.1
@@ -57,9 +66,9 @@ PERFECT_THICKNESS_M = 0.1
 def scene_xml(materials: Mapping[str, str]) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
 
-    The BSDF names ``mat-itu_*`` are what Sionna RT turns into its ITU radio materials; Mitsuba itself sees
-    plain two-sided diffuse ones. `PERFECT` is no material of ITU-R P.2040, so it is Sionna RT's own BSDF with explicit
-    constants, which Mitsuba knows after ``import sionna.rt``.
+    Sionna RT replaces the BSDFs ``mat-itu_*`` by its ITU radio materials; Mitsuba uses plain two-sided diffuse BSDFs.
+    `PERFECT` is no material of ITU-R P.2040, so it is a BSDF of Sionna RT with explicit constants, which Mitsuba knows
+    after ``import sionna.rt``.
 
     Args:
         materials: radio material (``itu_*`` or `PERFECT`) of each part, by the part's name.
@@ -90,3 +99,39 @@ def scene_xml(materials: Mapping[str, str]) -> str:
             "    </shape>",
         ]
     return "\n".join([*lines, "</scene>", ""])
+
+
+def write_scene(
+    folder: Path, parts: Parts, description: str, origin: str = "wrf_mi_scenes.furnished", xml: str = "scene.xml"
+) -> Path:
+    """Write parts as a scene folder: the scene file, ``meshes/`` and ``scene.yml``.
+
+    Args:
+        folder: path of the folder.
+        parts: radio material and mesh of each part by its name.
+        description: one line.
+        origin: module that made the parts.
+        xml: name of the scene file.
+
+    Returns:
+        Path of the scene file.
+    """
+    meshes = folder / "meshes"
+    meshes.mkdir(parents=True, exist_ok=True)
+    for name, (_, mesh) in parts.items():
+        mesh.export(meshes / f"{name}.ply", vertex_normal=False)
+    materials = {name: material for name, (material, _) in parts.items()}
+    (folder / xml).write_text(scene_xml(materials), encoding="utf-8", newline="\n")
+    facts = {
+        "description": description,
+        "licence": "MIT",
+        "origin": f"made by {origin}",
+        "frame": "right-handed; x east, y north, z up; origin at the floor's south-west corner",
+        "units": "m",
+        "xml": xml,
+        "thickness_m": {material: THICKNESS_M[material] for material in THICKNESS_M if material in materials.values()},
+        "sha256": content_sha256(folder, xml),
+    }
+    text = yaml.safe_dump(facts, sort_keys=False, width=110)
+    (folder / "scene.yml").write_text(text, encoding="utf-8", newline="\n")
+    return folder / xml

@@ -1,4 +1,4 @@
-"""The scenes that come with the package, with their licence, checksum, frame and units."""
+"""The scenes of the package, with their licence, checksum, frame and units."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import yaml
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """One scene folder: Mitsuba XML and PLY meshes that Mitsuba and Sionna RT both open.
+    """A scene folder: Mitsuba XML and PLY meshes that Mitsuba and Sionna RT both open.
 
     Attributes:
-        name: the folder's name, unique.
-        folder: where it is.
-        xml: the scene file.
+        name: name of the folder, unique.
+        folder: path of the folder.
+        xml: path of the scene file.
         description: one line.
         licence: SPDX name.
-        origin: who made it and how.
+        origin: module that made it.
         frame: axes and origin of the coordinates.
-        units: of the coordinates, ``"m"``.
+        units: unit of the coordinates, ``"m"``.
         thickness_m: slab thickness of each radio material (``itu_*``) in metres; Mitsuba XML cannot hold it.
-        sha256: of the scene file and its meshes, as `content_sha256` computes it.
+        sha256: checksum of the scene file and its meshes (`content_sha256`).
     """
 
     name: str
@@ -39,7 +39,7 @@ class SceneInfo:
     sha256: str
 
     def is_intact(self) -> bool:
-        """Whether the files still have the checksum that the registry states."""
+        """Whether the files have the stated checksum."""
         return content_sha256(self.folder, self.xml.name) == self.sha256
 
 

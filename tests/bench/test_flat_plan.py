@@ -19,8 +19,7 @@ def test_walls_from_a_robots_map_agree_with_the_layout():
     from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 
     from wrf_mi.scene.plan_sources import read_plan
-    from wrf_mi.scene.register import register_walls
-    from wrf_mi.scene.register_search import sample_walls
+    from wrf_mi.scene.register import register_walls, sample_walls
 
     home = Path(DATA, "flat-ble")
     grid = read_plan(home / "lidar" / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0)

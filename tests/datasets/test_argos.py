@@ -230,7 +230,7 @@ WRONG: dict[str, tuple[Callable[[Path], Path], str]] = {
     "pilots not UTF-8": (lambda path: sounder(path, PILOT_SEQ_TYPE=np.array([b"\xff\xfe"])), r"pilots .*xff.* of 64"),
     "many users": (
         lambda path: argos(path, num_mob_ant=np.full(500, -1)),
-        r"attribute num_mob_ant is array\(\[-1, -1,.*\.\.\.; it must tell",
+        r"attribute num_mob_ant is array\(\[-1, -1,.*\.\.\.; it must state",
     ),
     "longer symbols": (lambda path: sounder(path, FFT_SIZE=2048), "of 2048 samples; the long training symbol"),
     "half a pair": (

@@ -202,7 +202,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_one_line_with_file_and_row(folder: Path, case: str):
+def test_wrong_input_is_refused_with_file_and_row(folder: Path, case: str):
     change, file, message = WRONG[case]
     change(folder)
     with pytest.raises(InputError, match=message) as error:
@@ -328,7 +328,7 @@ def test_readings_stated_in_one_file_are_refused(folder: Path):
         read_ble_folder(folder)
 
 
-def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
+def test_written_record_is_read_again(folder: Path, tmp_path: Path):
     own = read_ble_folder(with_noise(with_columns(folder, pattern=["", "dipole"], tx_polarization=["H", "H"])))
     named = tuple(
         replace(one, name=name) for one, name in zip(own.receivers, ("hall, upper", "anchorage"), strict=True)
@@ -355,7 +355,7 @@ def test_a_record_that_is_written_is_read_again(folder: Path, tmp_path: Path):
         ({"array_m": np.zeros((1, 3))}, "receiver anchor3: it states no array"),
     ],
 )
-def test_what_the_layout_does_not_state_is_not_written(folder: Path, change: dict, message: str, tmp_path: Path):
+def test_attributes_beyond_the_layout_are_not_written(folder: Path, change: dict, message: str, tmp_path: Path):
     record = read_ble_folder(folder)
     first = record.receivers[0]
     if "name of a receiver" in change:

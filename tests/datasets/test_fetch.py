@@ -16,8 +16,7 @@ import pytest
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
 from wrf_mi.datasets.fetch import download
-from wrf_mi.datasets.newrf import arrays_sha256
-from wrf_mi.datasets.newrf_original import convert_newrf
+from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DataSet, RemoteFile, known, remote_files
 
 DATA = os.environ.get("WRF_MI_DATA")
@@ -108,7 +107,7 @@ def test_a_corrupted_file_is_refused_and_nothing_is_left(server: tuple[str, Path
     assert list((tmp_path / "home").iterdir()) == []
 
 
-def test_a_missing_file_is_one_line(server: tuple[str, Path], tmp_path: Path):
+def test_missing_remote_file_is_reported_in_one_line(server: tuple[str, Path], tmp_path: Path):
     url, root = server
     entries = manifest(small_folder(root / "abc123"))
     (root / "abc123" / "spectrum" / "00002.png").unlink()
@@ -117,7 +116,7 @@ def test_a_missing_file_is_one_line(server: tuple[str, Path], tmp_path: Path):
     assert list((tmp_path / "home").iterdir()) == []
 
 
-def test_without_network_one_line_says_so(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_network_is_reported_in_one_line(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))  # bound and not listening: connections are refused
@@ -128,7 +127,7 @@ def test_without_network_one_line_says_so(home: Path, monkeypatch: pytest.Monkey
     assert list((home / "cache").iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written(tmp_path: Path):
+def test_unwritable_folder_is_reported(tmp_path: Path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match="cannot be written"):
         fetch("rfid-lab", home=tmp_path / "file", base_url="http://127.0.0.1:9", progress=False)
@@ -141,7 +140,7 @@ def test_names_that_cannot_be_fetched(home: Path):
         fetch("laboratory")
 
 
-def test_where_a_data_set_is_looked_for(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_data_sets_are_located_in_order(home: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(InputError, match="run `wrf-mi data fetch rfid-lab`"):
         load("rfid-lab")
     with pytest.raises(InputError, match="traces it"):
@@ -298,13 +297,13 @@ def test_fetch_flat_ble_from_a_copy(server: tuple[str, Path], home: Path, capsys
 
 @needs_data
 @pytest.mark.parametrize("name", ["rfid-lab", "flat-ble", "newrf-conference", "newrf-office"])
-def test_what_is_there_is_checked_and_needs_no_network(name: str):
+def test_existing_copy_is_checked_without_network(name: str):
     folder = fetch(name, home=DATA, base_url="http://127.0.0.1:9", retries=0, progress=False)
     assert folder.parent == Path(DATA or "")
 
 
 @needs_data
-def test_what_the_files_of_rfid_lab_do_not_tell():
+def test_rfid_lab_has_its_carrier_and_array():
     record = load("rfid-lab")
     assert record.frequencies_hz == [920e6]
     np.testing.assert_allclose(

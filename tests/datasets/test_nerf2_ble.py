@@ -52,7 +52,7 @@ def test_rows_that_no_gateway_received_are_in_no_split(folder: Path) -> None:
     assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1], [3])
 
 
-def test_columns_go_by_name_or_else_by_place(folder: Path) -> None:
+def test_columns_are_assigned_by_name_or_else_by_order(folder: Path) -> None:
     expected = read_nerf2_ble(folder).observation
     path = folder / "gateway_rssi.csv"
     swapped = "\n".join(",".join(reversed(line.split(","))) for line in POWERS.splitlines())
@@ -66,7 +66,7 @@ def test_columns_go_by_name_or_else_by_place(folder: Path) -> None:
     np.testing.assert_array_equal(read_nerf2_ble(folder).tx_pos_m[1], [1.75, 0.25, 1])
 
 
-def test_what_pandas_writes_of_arrays_without_names_is_read(folder: Path) -> None:
+def test_numbered_headers_of_pandas_are_read(folder: Path) -> None:
     expected = read_nerf2_ble(folder)
     (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "0,1"))
     (folder / "tx_pos.csv").write_text(POSITIONS.replace("x,y,z", "0,1,2"))
@@ -84,7 +84,7 @@ def test_what_pandas_writes_of_arrays_without_names_is_read(folder: Path) -> Non
     np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected.observation[::-1])
 
 
-def test_columns_without_names_of_their_own_go_by_place(folder: Path) -> None:
+def test_unnamed_columns_follow_the_order_of_gateways(folder: Path) -> None:
     expected = read_nerf2_ble(folder).observation
     (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "dBm,dBm"))
     np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected)
@@ -172,10 +172,10 @@ WRONG = {
         "row 2: gateway2 is '1e39'; give a finite number of single pre",
     ),
     "power missing": (text(RSSI, "-61", ""), RSSI, "row 2: gateway2 is ''"),
-    "deaf gateway": (
+    "gateway without reception": (
         lambda folder: (folder / RSSI).write_text("gateway1,gateway2\n" + "-50,-100\n" * 4) and None,
         RSSI,
-        "column gateway2: every row is -100, so gateway gateway2 got nothing; remove it",
+        "column gateway2: every row is -100, so gateway gateway2 received nothing; remove it",
     ),
     "one row": (one_row, POS, "1 row; give 2 at least"),
     "index out of range": (text("train_index.txt", "3", "4"), "train_index.txt", "row 4 is out of range.*rows 0 to 3"),

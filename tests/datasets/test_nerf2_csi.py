@@ -79,14 +79,14 @@ def test_splits_without_positions(folder: Path) -> None:
     assert [split.test.tolist() for split in blocked] == [[0, 2, 4], [1, 3, 5]]
 
 
-def test_what_the_layout_does_not_state_is_not_written(folder: Path, tmp_path: Path) -> None:
+def test_attributes_beyond_the_layout_are_not_written(folder: Path, tmp_path: Path) -> None:
     record = read_nerf2_csi(folder)
     with pytest.raises(InputError, match="has folds, which this layout does not state; set"):
         write_nerf2_csi(tmp_path / "new", replace(record, folds=np.zeros(len(record), np.int64)))
     assert not (tmp_path / "new").exists()
 
 
-def test_what_is_written_is_read_again(folder: Path, tmp_path: Path) -> None:
+def test_written_record_is_read_again(folder: Path, tmp_path: Path) -> None:
     asked = 2.4e9 + 1e6 * np.arange(2.0 * HALF)
     plain = read_nerf2_csi(folder, frequencies_hz=asked)
     turned = replace(plain.receivers[0], orientation_xyzw=np.array([0.5, 0.5, 0.5, 0.5]))

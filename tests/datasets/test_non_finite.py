@@ -97,7 +97,7 @@ def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> N
         evaluate(broken, split, lambda rows, receiver: broken.observation[receiver, rows])
 
 
-def test_what_is_finite_or_missing_stays(two_gateways: Record) -> None:
+def test_finite_and_missing_observations_stay(two_gateways: Record) -> None:
     missed = changed(two_gateways, ((0, 3), np.nan)).observation
     kept, count = scorable(missed)
     assert kept is missed

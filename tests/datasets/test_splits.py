@@ -45,12 +45,12 @@ def assert_partition(split: Split, rows: int, all_rows: bool = True) -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("folds", [True, False])
-def test_every_row_has_one_place(rule: str, folds: bool):
+def test_every_row_is_in_exactly_one_part(rule: str, folds: bool):
     for split in make_splits(make_record(folds=folds), rule, seed=1):
         assert_partition(split, 50)
 
 
-def test_rules():
+def test_split_rules_select_the_stated_rows():
     record = make_record()
     (official,) = make_splits(record, "official")
     np.testing.assert_array_equal(official.test, np.sort(record.official[1]))
@@ -116,7 +116,7 @@ def test_a_part_that_was_not_received_at_all_is_refused():
         make_splits(deaf, "official")
 
 
-def test_seed_decides():
+def test_splits_depend_on_the_seed():
     record = make_record(200, folds=False)
     for rule in ("random", "trajectory"):
         again, same, other = (make_splits(record, rule, seed=seed)[0] for seed in (5, 5, 6))
@@ -185,7 +185,7 @@ def test_fractions_count_from_the_rows_of_each_split():
         ({"name": "random", "validation_fraction": 1.0}, "validation fraction"),
     ],
 )
-def test_bad_arguments(arguments: dict, message: str):
+def test_bad_arguments_are_refused(arguments: dict, message: str):
     with pytest.raises(InputError, match=message) as error:
         make_splits(make_record(), **arguments)
     assert "\n" not in str(error.value)
@@ -213,15 +213,15 @@ def test_a_split_is_stored_with_arrays_only(tmp_path: Path):
         assert sorted(file) == ["format", "name", "seed", "test", "train", "validation"]
 
 
-def test_bad_split_files(tmp_path: Path):
+def test_bad_split_files_are_refused(tmp_path: Path):
     path = tmp_path / "split.npz"
     with pytest.raises(InputError, match="missing"):
         load_split(path)
     path.write_text("no npz")
-    with pytest.raises(InputError, match="not a split file"):
+    with pytest.raises(InputError, match="not readable"):
         load_split(path)
     np.savez(path, train=np.arange(3))
-    with pytest.raises(InputError, match="not a split file"):
+    with pytest.raises(InputError, match="not readable"):
         load_split(path)
     rows = np.arange(3)
     head = {"format": 1, "name": "a", "seed": 0, "train": rows}

@@ -12,7 +12,7 @@ from made_flat import NAMED_ANCHORS_M
 
 from wrf_mi.core import Record
 from wrf_mi.datasets import load, write_spectrum_folder
-from wrf_mi.datasets.csv_table import read_csv
+from wrf_mi.datasets.folder_files import read_csv
 from wrf_mi.runs.api import train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.prediction_file import read_inputs, write_prediction_file

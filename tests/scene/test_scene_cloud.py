@@ -13,7 +13,7 @@ from made_rooms import attic, by_kind, closed_box, l_shape, sampled, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
-from wrf_mi.scene import packages
+from wrf_mi.scene import points
 from wrf_mi.scene.cloud import surfaces_from_points
 from wrf_mi.scene.surfaces import Surface
 
@@ -117,7 +117,7 @@ def test_the_shadow_of_a_cupboard_is_filled_and_a_window_is_not() -> None:
     assert abs(wall.area_m2 - (5 * 2.8 - 1.2 * 1.0)) < 4.4 * EDGE_M
 
 
-@settings(max_examples=4, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=3, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @given(
     yaw_deg=st.floats(-180, 180),
     shift=st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-100, 1000)),
@@ -134,7 +134,7 @@ def test_a_turned_and_moved_room_gives_turned_and_moved_surfaces(
     assert np.linalg.norm(back[:, None] - corners, axis=-1).min(axis=1).max() < 3 * PLANE_M
 
 
-def test_what_is_no_room() -> None:
+def test_clouds_without_planes_are_refused() -> None:
     rng = np.random.default_rng(1)
     with pytest.raises(InputError, match="no plane was found"):
         surfaces_from_points(rng.uniform(0, 5, (5000, 3)))
@@ -142,11 +142,11 @@ def test_what_is_no_room() -> None:
         surfaces_from_points(rng.uniform(0, 5, (12, 3)))
 
 
-def test_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_open3d_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    assert packages.import_module is importlib.import_module
-    monkeypatch.setattr(packages, "import_module", missing)
+    assert points.import_module is importlib.import_module
+    monkeypatch.setattr(points, "import_module", missing)
     with pytest.raises(InputError, match=r"need open3d: pip install 'wrf-mi\[lidar\]'"):
         surfaces_from_points(np.zeros((100, 3)))

@@ -11,8 +11,7 @@ from calling import call
 from made_rooms import Mesh, attic, by_kind, l_shape
 
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.mesh import read_mesh
-from wrf_mi.scene.mesh_planes import planes_of_mesh
+from wrf_mi.scene.mesh import planes_of_mesh, read_mesh
 from wrf_mi.scene.surfaces import Surface
 
 
@@ -106,7 +105,7 @@ def test_a_turned_fine_mesh_far_from_the_origin_gives_the_same_room() -> None:
     assert split(mesh)[0] == EMPTY
 
 
-def test_what_is_no_building_stays_as_it_is(tmp_path: Path) -> None:
+def test_meshes_without_a_building_stay_unchanged(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(3, 1.0)
     ball.export(tmp_path / "ball.stl")
     (given,) = read_mesh(tmp_path / "ball.stl")

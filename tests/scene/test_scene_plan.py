@@ -17,10 +17,10 @@ from made_plans import (
 )
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan import floor_of, layout_walls, make_plan, plan_surfaces
+from wrf_mi.scene.plan import floor_of, layout_walls, plan_surfaces, walls_of_plan
 from wrf_mi.scene.plan_align import grid_from_scans, sensor_of
 from wrf_mi.scene.plan_lines import dominant_direction
-from wrf_mi.scene.plan_sources import PlanPoints, grid_from_points, grid_from_probability
+from wrf_mi.scene.plan_sources import PlanPoints, grid_from_points, grid_from_probability, read_layout
 from wrf_mi.scene.plan_walls import find_walls, joined
 
 CLOSE_M = 0.1
@@ -61,7 +61,7 @@ def test_points_alone_cannot_tell_furniture_from_walls():
     assert distance([4.33, 2.23], walls) > 0.4
 
 
-def test_noise_and_strays_do_no_harm():
+def test_walls_are_found_in_spite_of_noise_and_strays():
     rng = np.random.default_rng(3)
     clouds = scans(TWO_ROOMS_M, noise_m=0.03)
     points = np.concatenate([*clouds, rng.uniform([0, 0], [6, 4], (60, 2))])
@@ -134,7 +134,7 @@ def test_scans_with_wrong_poses_are_aligned():
     grid = grid_from_scans(xy, time)
     blurred = grid_from_points(xy)
     assert np.count_nonzero(grid.occupied) < 0.5 * np.count_nonzero(blurred.occupied)
-    walls = make_plan(PlanPoints(xy, time)).walls_m
+    walls = find_walls(grid)
     # In its own frame, off by the mean error of the poses.
     found, right = agreement(walls, TWO_ROOMS_M, 0.25)
     assert found > 0.95
@@ -145,7 +145,7 @@ def test_scans_with_wrong_poses_are_aligned():
 def test_good_poses_stay():
     clouds = scans(TWO_ROOMS_M)
     time = np.concatenate([np.full(len(c), 30.0 * i) for i, c in enumerate(clouds)])
-    walls = find_walls(grid_from_scans(np.concatenate(clouds), time))
+    walls = walls_of_plan(PlanPoints(np.concatenate(clouds), time))
     assert min(agreement(walls, TWO_ROOMS_M, CLOSE_M)) > 0.95
 
 
@@ -164,7 +164,7 @@ def test_layout_is_extruded_as_it_is(tmp_path):
     doubled = np.array([[0, 0], [4, 0], [4, 3], [2, 3], [2, 1], [2, 3], [0, 3], [0, 0]], float)
     file = tmp_path / "layout.csv"
     file.write_text("x,y\n" + "\n".join(f"{x},{y}" for x, y in doubled) + "\n")
-    surfaces = plan_surfaces(file, height_m=2.5, floor_m=0.2)
+    surfaces = plan_surfaces(read_layout(file), height_m=2.5, floor_m=0.2)
     kinds = [s.kind for s in surfaces]
     assert kinds[:2] == ["floor", "ceiling"]
     assert sum(s.area_m2 for s in surfaces if s.kind == "wall") == pytest.approx(2.5 * (4 + 3 + 4 + 3 + 2))

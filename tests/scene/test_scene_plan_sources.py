@@ -24,7 +24,7 @@ def test_grid_of_log_odds(tmp_path):
     assert read_plan(file, 0.1).resolution_m == 0.1
 
 
-def test_row_0_of_a_grid_is_what_the_file_states_unless_the_caller_states_it(tmp_path):
+def test_row_0_of_the_caller_overrides_that_of_the_file(tmp_path):
     file = tmp_path / "map.npz"
     upwards = [[False, False, True], [False, False, True]], [[True, True, False], [True, False, False]]
     as_stored = upwards[0], upwards[1][::-1]
@@ -51,7 +51,7 @@ def test_row_0_is_refused_where_the_format_fixes_it(tmp_path):
             read_plan(tmp_path / name, 0.1, "top")
 
 
-def test_probabilities_are_told_from_log_odds(tmp_path):
+def test_probabilities_and_log_odds_are_distinguished(tmp_path):
     file = tmp_path / "map.npz"
     np.savez(file, log_odds=np.array([[0.0, 0.5, 1.0]]), resolution_m=0.1, row_0="top")
     grid = read_plan(file)
@@ -70,7 +70,7 @@ def test_points_with_and_without_times(tmp_path):
     assert source.time_s is None
 
 
-def test_map_of_ros(tmp_path):
+def test_ros_map_is_read(tmp_path):
     # 205 is what map_server writes where nothing is known: neither occupied nor free.
     Image.fromarray(np.array([[254, 205, 0]], np.uint8)).save(tmp_path / "flat.pgm")
     (tmp_path / "flat.yaml").write_text("image: flat.pgm\nresolution: 0.05\norigin: [-1.0, 2.0, 0.0]\nnegate: 0\n")
@@ -82,7 +82,7 @@ def test_map_of_ros(tmp_path):
         assert grid.origin_m.tolist() == [-1, 2]
 
 
-def test_layout(tmp_path):
+def test_layout_vertices_are_read(tmp_path):
     file = tmp_path / "layout.csv"
     file.write_text("x,y\n0,0\n2.5,0\n2.5,1\n")
     assert read_layout(file).tolist() == [[0, 0], [2.5, 0], [2.5, 1]]
@@ -106,7 +106,7 @@ def test_layout(tmp_path):
         ({"other": np.zeros(2)}, "neither log_odds nor xy_m but other"),
     ],
 )
-def test_arrays_that_are_no_plan(tmp_path, arrays, line):
+def test_arrays_without_a_plan_are_refused(tmp_path, arrays, line):
     np.savez(tmp_path / "plan.npz", **arrays)
     with pytest.raises(InputError, match=line) as caught:
         read_plan(tmp_path / "plan.npz")
@@ -117,10 +117,10 @@ def test_arrays_that_are_no_plan(tmp_path, arrays, line):
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
-        ("a.csv", "a,b\n0,0\n1,1\n", "line 1: the header is not x,y"),
-        ("a.csv", "", "line 1: the header"),
-        ("a.csv", "x,y\n0,0\n1\n", "line 3: expected two numbers"),
-        ("a.csv", "x,y\n0,0\n1,nan\n", "line 3: expected two numbers"),
+        ("a.csv", "a,b\n0,0\n1,1\n", "line 1: header is .a,b.; it must be x,y"),
+        ("a.csv", "", "empty; give a header"),
+        ("a.csv", "x,y\n0,0\n1\n", "row 2: 1 field, but the header has 2"),
+        ("a.csv", "x,y\n0,0\n1,nan\n", "row 2: y is .nan.; give a finite number"),
         ("a.csv", "x,y\n1,1\n1,1\n", "no wall"),
         ("a.csv", "x,y\n1,1\n", "no wall"),
         ("a.xyz", "1 2\n1 2 3\n", "line 2: expected two numbers"),
@@ -134,7 +134,7 @@ def test_arrays_that_are_no_plan(tmp_path, arrays, line):
         ("a.dwg", "", "unknown ending"),
     ],
 )
-def test_files_that_are_no_plan(tmp_path, name, text, line):
+def test_files_without_a_plan_are_refused(tmp_path, name, text, line):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=line) as caught:
         read_plan(tmp_path / name)

@@ -12,9 +12,10 @@ import trimesh
 from made_rooms import closed_box, sampled
 
 from wrf_mi.core import InputError
+from wrf_mi.scene import points
 from wrf_mi.scene.make import is_plan, make_scene
 from wrf_mi.scene.mesh import read_mesh
-from wrf_mi.scene.points import check_extent, read_points
+from wrf_mi.scene.points import check_extent, lidar_package, read_points
 
 POINTS = np.array([[0.5, 1.25, -2.0], [3.0, 4.5, 5.0], [6.0, -7.75, 8.0]])
 GRID = np.array([500_000.0, 5_400_000.0, 120.0])
@@ -47,12 +48,12 @@ def test_text_with_spaces_commas_comments_and_further_columns(text: str, tmp_pat
 
 
 @pytest.mark.parametrize(("units", "factor"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048)])
-def test_units(units: str, factor: float, tmp_path: Path) -> None:
+def test_units_scale_the_coordinates(units: str, factor: float, tmp_path: Path) -> None:
     np.savez(tmp_path / "cloud.npz", xyz_m=POINTS)
     np.testing.assert_allclose(read_points(tmp_path / "cloud.npz", units), POINTS * factor, rtol=1e-15)
 
 
-def test_unknown_units(tmp_path: Path) -> None:
+def test_unknown_units_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, cm, mm, ft"):
         read_points(tmp_path / "cloud.npz", "inch")
 
@@ -65,7 +66,7 @@ def test_unknown_units(tmp_path: Path) -> None:
         (0.001, r"is too small for a room; give its --units"),
     ],
 )
-def test_coordinates_that_are_not_metres(factor: float, message: str) -> None:
+def test_coordinates_that_are_not_metres_are_refused(factor: float, message: str) -> None:
     with pytest.raises(InputError, match=message):
         check_extent(sampled(closed_box(), 1000) * factor, "scan.ply")
 
@@ -87,7 +88,9 @@ def test_metres_far_from_the_origin_and_with_strays_pass() -> None:
         ("a.las", None, False),
     ],
 )
-def test_plans_are_told_from_scans(name: str, arrays: dict[str, np.ndarray] | None, plan: bool, tmp_path: Path) -> None:
+def test_plans_and_scans_are_distinguished(
+    name: str, arrays: dict[str, np.ndarray] | None, plan: bool, tmp_path: Path
+) -> None:
     if arrays:
         np.savez(tmp_path / name, **arrays)
     assert is_plan(tmp_path / name) is plan
@@ -113,7 +116,7 @@ def test_options_that_do_not_fit_the_source(tmp_path: Path) -> None:
     assert [path.name for path in out.iterdir()] == ["mine"]
 
 
-def test_a_mesh_is_mended_where_that_does_no_harm(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_degenerate_and_doubled_faces_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     box = trimesh.creation.box((2.0, 3.0, 2.5))
     faces = np.concatenate([box.faces[:, ::-1], box.faces[:2], [[0, 0, 1]]])  # inverted, doubled, degenerate
     trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "room.stl")
@@ -127,7 +130,7 @@ def test_a_mesh_is_mended_where_that_does_no_harm(tmp_path: Path, caplog: pytest
     ]
 
 
-def test_meshes_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_meshes_are_refused(tmp_path: Path) -> None:
     box = trimesh.creation.box((2000.0, 3000.0, 2500.0))
     box.export(tmp_path / "mm.stl")
     with pytest.raises(InputError, match=r"mm.stl: .* looks like millimetres; give --units mm"):
@@ -149,3 +152,16 @@ def test_meshes_that_cannot_be_used(tmp_path: Path) -> None:
         read_mesh(tmp_path / "junk.glb")
     with pytest.raises(InputError, match=r"none.stl: no such file"):
         read_mesh(tmp_path / "none.stl")
+
+
+def test_missing_package_and_missing_library_have_their_own_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"need no_such_package: pip install 'wrf-mi\[lidar\]'"):
+        lidar_package("no_such_package")
+
+    def unlinked(name: str) -> None:
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr(points, "import_module", unlinked)
+    with pytest.raises(InputError, match=r"open3d cannot be loaded \(libusb.*apt-get install libusb-1.0-0") as caught:
+        lidar_package("open3d")
+    assert "\n" not in str(caught.value)

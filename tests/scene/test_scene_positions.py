@@ -100,7 +100,7 @@ def test_a_door_lets_pass_at_its_height_and_the_wall_above_it_does_not() -> None
     x = np.arange(0.2, 6, 0.25)
     for y, z, expected in ((1.5, np.nan, 0), (1.5, 1.2, 0), (1.5, 2.2, 1), (3.0, np.nan, 1)):
         places = np.column_stack([x, np.full(len(x), y), np.full(len(x), z)])
-        assert conflicts(places, [wall]).crossings == expected
+        assert conflicts(places, [wall])[0] == expected
     with pytest.raises(InputError, match="no wall"):
         conflicts(places, [])
 

@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
-from made_plans import L_ROOM_M, TWO_ROOMS_M
+from made_plans import L_ROOM_M
 from matplotlib.collections import LineCollection, PolyCollection
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from PIL import Image
 
 from wrf_mi.core.paths import Paths
-from wrf_mi.scene.plan import Plan, floor_of, plan_surfaces
+from wrf_mi.scene.plan import plan_surfaces
 from wrf_mi.scene.preview import GaussianCloud, draw_preview, draw_scene
 from wrf_mi.scene.surfaces import Surface
 
 
 def room():
-    return plan_surfaces(Plan(TWO_ROOMS_M, floor_of(TWO_ROOMS_M)), height_m=2.5)
+    return plan_surfaces(L_ROOM_M, height_m=2.5)
 
 
 def cloud(n=5):
@@ -55,8 +55,8 @@ def test_plan_shows_the_walls_where_they_are():
     cuts = [c for c in plan.collections if isinstance(c, LineCollection)]
     shown = np.concatenate([segment for c in cuts for segment in c.get_segments()])
     assert shown.min(axis=0) == pytest.approx([0, 0])
-    assert shown.max(axis=0) == pytest.approx([6, 4])
-    assert len(cuts) == len(TWO_ROOMS_M)
+    assert shown.max(axis=0) == pytest.approx([5, 4.5])
+    assert len(cuts) == len(L_ROOM_M) - 1
 
 
 def faces_drawn(figure):
@@ -82,7 +82,6 @@ def test_paths_gaussians_and_devices_are_in_both_views():
         transmitters_m=tx,
         receivers_m=rx,
         gaussians=cloud(),
-        materials={s.name: "itu_brick" for s in room()},
         title="all",
     )
     slant, plan = figure.axes[:2]
@@ -94,17 +93,17 @@ def test_paths_gaussians_and_devices_are_in_both_views():
     assert np.abs(outline).max(axis=0) == pytest.approx([0.3, 0.2], rel=0.02)
     assert len(ellipses) == 5
     assert {c.zorder for c in slant.collections} >= {1, 2, 5, 6}
-    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["itu_brick", "transmitter", "receiver"]
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["floor", "wall", "transmitter", "receiver"]
     assert {axes.get_ylabel() for axes in figure.axes[2:]} == {"gain of a path (dB)", "signal of a Gaussian (dB)"}
 
 
-def test_bodies_of_other_makers_are_drawn_without_their_lid():
+def test_level_faces_near_the_top_are_not_drawn():
     box = np.array([[x, y, z] for z in (0, 2) for y in (0, 3) for x in (0, 4)], float)
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
     assert faces_drawn(draw_scene([Surface("mesh", "other", box, faces)])) == 4
 
 
-def test_what_cannot_be_drawn_is_refused():
+def test_scenes_without_surfaces_or_path_ends_are_refused():
     with pytest.raises(ValueError, match="no surface"):
         draw_scene([])
     with pytest.raises(ValueError, match="paths need"):

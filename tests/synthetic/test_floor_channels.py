@@ -10,7 +10,8 @@ import pytest
 import trimesh
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
-from wrf_mi_scenes.furnished import measured_parts, write_scene
+from wrf_mi_scenes.furnished import measured_parts
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
@@ -44,7 +45,7 @@ def record(folder: Path) -> Record:
     return walked_channels("flat", folder, SMALL)
 
 
-def test_it_is_made_once_and_the_same_each_time(folder: Path, record: Record, tmp_path: Path) -> None:
+def test_data_are_stored_and_reproducible(folder: Path, record: Record, tmp_path: Path) -> None:
     before = (folder / "csidata.npy").stat().st_mtime_ns
     again = walked_channels("flat", folder, SMALL)
     assert (folder / "csidata.npy").stat().st_mtime_ns == before
@@ -57,7 +58,7 @@ def test_it_is_made_once_and_the_same_each_time(folder: Path, record: Record, tm
         np.testing.assert_array_equal(getattr(back, key), getattr(record, key))
 
 
-def test_what_it_holds(record: Record) -> None:
+def test_record_has_the_stated_shapes_and_splits(record: Record) -> None:
     rows = len(PLACES["flat"]().routes) * SMALL.places
     assert (record.name, record.task, len(record)) == ("traced-csi-flat", "csi", rows)
     assert record.truth is not None
@@ -77,7 +78,7 @@ def test_what_it_holds(record: Record) -> None:
             assert len(split.all_train) == 5
 
 
-def test_scores_are_held_against_the_channel_without_noise(record: Record) -> None:
+def test_scores_compare_with_the_channel_without_noise(record: Record) -> None:
     (split,) = make_splits(record, "official")
     assert record.truth is not None
     truth, observed = record.truth, record.observation
@@ -88,7 +89,7 @@ def test_scores_are_held_against_the_channel_without_noise(record: Record) -> No
     assert SMALL.snr_db - 6 < noisy["cea_db"]["median"] < SMALL.snr_db + 3
 
 
-def test_noise_is_as_strong_as_stated() -> None:
+def test_noise_has_the_stated_snr() -> None:
     rng = np.random.default_rng(3)
     channel = (rng.standard_normal((2, 100, 100)) + 1j) * np.array([1.0, 1e-5])[:, None, None]
     noise = with_noise(channel, 25.0, rng) - channel
@@ -115,7 +116,7 @@ def ends_of(users: np.ndarray) -> list[Receiver]:
 OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
 
 
-def test_specular_channels_are_those_of_the_other_direction(tmp_path: Path) -> None:
+def test_specular_channels_are_reciprocal(tmp_path: Path) -> None:
     scene, receiver, array_m, users = bare_room(tmp_path)
     frequencies = np.concatenate([UPLINK_HZ[::5], DOWNLINK_HZ[::5]])
     there = trace_paths(scene, users, receiver, OPTIONS).paths
@@ -137,7 +138,7 @@ def test_channels_are_those_traced_to_each_element(tmp_path: Path) -> None:
     assert np.abs(found - expected).max() < MIDDLE * np.abs(expected).max()
 
 
-def test_a_tracer_of_the_same_floor_reports_much_of_it(record: Record, tmp_path: Path) -> None:
+def test_ray_tracing_of_the_same_floor_explains_most_of_the_channel(record: Record, tmp_path: Path) -> None:
     """By another way: rays from the other side, waves by their arrival; what it lacks is diffuse reflection."""
     write_scene(tmp_path, PLACES["flat"]().parts, "test")
     options = TraceOptions(transmission=True, max_depth=SMALL.depth, max_reflections=SMALL.reflections, rays=SMALL.rays)

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_scenes.furnished import furnished_parts, measured_parts, write_scene
+from wrf_mi_scenes.furnished import furnished_parts, measured_parts
+from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import element_signals
-from wrf_mi.synthetic.furnished_room import TracedRoom, array_signals, traced_room, transmitters
+from wrf_mi.receivers.channel import array_channels
+from wrf_mi.synthetic.furnished_room import TracedRoom, traced_room, transmitters
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.devices import solids, winding_number
@@ -28,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_is_made_once_and_the_same_each_time(made: Path) -> None:
+def test_data_are_stored_and_reproducible(made: Path) -> None:
     before = (made / "tx_pos.csv").stat().st_mtime_ns
     record, given = traced_room(made, SMALL)
     assert (made / "tx_pos.csv").stat().st_mtime_ns == before
@@ -44,7 +46,7 @@ def test_it_is_made_once_and_the_same_each_time(made: Path) -> None:
     assert np.array_equal(record.observation, back.observation)
 
 
-def test_what_a_model_is_given_lacks_the_furniture_and_is_off() -> None:
+def test_measured_room_lacks_furniture_and_has_errors() -> None:
     full, bare = furnished_parts(), measured_parts(0.02, 1)
     assert {material for material, _ in bare.values()} == {"itu_concrete"}
     assert len({material for material, _ in full.values()}) > 5
@@ -55,7 +57,7 @@ def test_what_a_model_is_given_lacks_the_furniture_and_is_off() -> None:
     assert all(0 < abs(one) < 0.08 for one in off)  # four deviations
 
 
-def test_transmitters_stand_in_the_open(tmp_path: Path) -> None:
+def test_transmitters_are_clear_of_surfaces(tmp_path: Path) -> None:
     write_scene(tmp_path, furnished_parts(), "test")
     scene = open_scene(tmp_path, FREQUENCY_HZ)
     positions, surfaces = transmitters(scene, TracedRoom(train=300, test=100)), scene_surfaces(scene)
@@ -67,7 +69,7 @@ def test_transmitters_stand_in_the_open(tmp_path: Path) -> None:
         assert winding_number(surfaces.triangles[face], positions).max() < 0.5
 
 
-def test_specular_signals_are_those_of_the_other_direction(tmp_path: Path) -> None:
+def test_specular_signals_are_reciprocal(tmp_path: Path) -> None:
     write_scene(tmp_path, measured_parts(0.0, 0), "test")
     scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
     tx = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7]])
@@ -77,7 +79,7 @@ def test_specular_signals_are_those_of_the_other_direction(tmp_path: Path) -> No
     there = trace_paths(scene, tx, RECEIVER, options).paths
     back = trace_paths(scene, RECEIVER.position_m, ends, TraceOptions(max_depth=2, rays=1 << 14)).paths
     expected = element_signals(there, RECEIVER, array_m, FREQUENCY_HZ)[0]
-    found = array_signals(back, RECEIVER, array_m, FREQUENCY_HZ)
+    found = array_channels(back, RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
@@ -88,7 +90,7 @@ def test_scattered_waves_come_from_their_last_point(tmp_path: Path) -> None:
     options = TraceOptions(scattering=True, max_depth=1, rays=1 << 8)
     paths = trace_paths(scene, RECEIVER.position_m, ends, options).paths
     one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
-    found = array_signals(one, RECEIVER, array_m, FREQUENCY_HZ)[0]
+    found = array_channels(one, RECEIVER, array_m, FREQUENCY_HZ)[0, :, 0]
     point = one.vertices_m[0, 0]
     elements = RECEIVER.position_m + array_m @ RECEIVER.to_world.T
     wavenumber = 2 * np.pi * FREQUENCY_HZ / 299792458.0

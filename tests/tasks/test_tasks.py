@@ -155,7 +155,7 @@ def test_instruments_need_positions_carrier_and_arrays() -> None:
 
 def test_a_folder_shows_its_layout_by_its_files(tmp_path: Path) -> None:
     assert layouts.layout_of(tmp_path) is layouts.SPECTRA
-    for layout in layouts.OWN:
+    for layout in layouts.BUILT_IN:
         folder = tmp_path / layout.name
         folder.mkdir()
         name = layout.files[0] if layout.files else f"data{layout.suffixes[0]}"

@@ -242,7 +242,7 @@ def test_laboratory_is_cached_and_reproducible(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("traced although it was kept")
 
-    monkeypatch.setattr("wrf_mi.synthetic.laboratory._trace", refuse)
+    monkeypatch.setattr("wrf_mi.synthetic.laboratory.trace_spectra", refuse)
     monkeypatch.delenv("WRF_MI_DATA", raising=False)
     for module in (registry, __import__("wrf_mi.synthetic.laboratory", fromlist=["user_cache"])):
         monkeypatch.setattr(module, "user_cache", lambda: folder.parent)

@@ -1,4 +1,4 @@
-"""Measurements: records, their files, their public originals and their splits."""
+"""Measurements: layouts of files, public data sets and splits."""
 
 from .argos import read_argos
 from .ble_folder import read_ble_folder, write_ble_folder

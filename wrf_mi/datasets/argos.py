@@ -29,8 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
+from ..core.antenna import UPRIGHT
 from ..core.files import one_line
-from .folder_files import shown
+from .folder_files import shown, single_file
 
 SUFFIXES = (".hdf5", ".h5")
 PILOTS = "Pilot_Samples"
@@ -42,30 +43,20 @@ SUBCARRIERS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)])
 _SIGNS = "++--++-+-++++++--++-+-++++" + "+--++-+-+-----++--+-+-++++"
 TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
 ARGOS_START, ARGOS_SYMBOLS = 47, 2
-"""Of the first pilot symbol in a user's slot, and how many there are (RENEWLab, ``samps2csi``)."""
+"""First sample of the first pilot symbol in a user's slot, and number of symbols (RENEWLab, ``samps2csi``)."""
 FULL_SCALE = 2.0**15
 CHUNK_SIZE = 1 << 26
-"""Bytes of samples read at once."""
+"""Bytes of samples in a chunk."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the pilots are.
-
-    Attributes:
-        users, antennas: how many.
-        slot: samples of a user in a frame.
-        starts: first sample of each pilot symbol in a slot.
-        carrier_hz: or None.
-        rate_hz: samples per second, or None.
-    """
+    """Numbers of users and antennas, samples of a user's slot, and first sample of each pilot symbol in it."""
 
     users: int
     antennas: int
     slot: int
     starts: tuple[int, ...]
-    carrier_hz: float | None
-    rate_hz: float | None
 
 
 def read_argos(
@@ -78,12 +69,12 @@ def read_argos(
     """Read and check a capture of a many-antenna base station (see this module's head).
 
     Args:
-        path: the ``.hdf5`` file, or a folder that holds one.
-        name: the record's name; the file's own without its ending by default.
-        frames: that are read, such as ``slice(0, 4000, 10)``; all by default. A record takes 416 bytes for each
+        path: path of the ``.hdf5`` file, or of a folder with such a file.
+        name: name of the record; by default that of the file without its ending.
+        frames: frames that are read, such as ``slice(0, 4000, 10)``; by default all. A record takes 416 bytes for each
             frame, user and antenna.
-        cell: base station, from 0, where the capture holds several.
-        start: of the first pilot symbol in a user's slot, in samples, where another than the layout's.
+        cell: number of the base station, from 0, if the capture holds several.
+        start: first sample of the first pilot symbol in a user's slot; by default that of the layout.
 
     Returns:
         A record with ``task="csi"`` and one receiver, whose position is not known: ``observation``
@@ -93,7 +84,7 @@ def read_argos(
     Raises:
         InputError: h5py is not installed, or anything is missing, unreadable or inconsistent, with the file.
     """
-    file = capture_file(Path(path))
+    file = single_file(Path(path), SUFFIXES, "one capture in HDF5")
     try:
         import h5py
     except ModuleNotFoundError:
@@ -113,35 +104,21 @@ def read_argos(
         text = f"{len(channel) - np.count_nonzero(silent)} of {len(channel)} samples hold a signal"
         raise InputError(f"{file}: {text}; two at least are needed, to train on and to score")
     channel[silent] = np.nan
+    carrier_hz, rate_hz = _number(attributes, "FREQ"), _number(attributes, "RATE")
     frequencies = None
-    if layout.carrier_hz is not None and layout.rate_hz is not None:
-        frequencies = layout.carrier_hz + SUBCARRIERS * layout.rate_hz / FFT
+    if carrier_hz is not None and rate_hz is not None:
+        frequencies = carrier_hz + SUBCARRIERS * rate_hz / FFT
     return Record(
         name=name or file.stem,
         task="csi",
         tx_pos_m=np.full((len(channel), 3), np.nan),
-        receivers=(Receiver("base-station", np.full(3, np.nan), np.array([0.0, 0.0, 0.0, 1.0])),),
+        receivers=(Receiver("base-station", np.full(3, np.nan), np.array(UPRIGHT)),),
         observation=channel[None, :, :, HALF:],
         frequencies_hz=None if frequencies is None else frequencies[HALF:],
         uplink=channel[:, :, :HALF],
         uplink_hz=None if frequencies is None else frequencies[:HALF],
         source=str(file),
     )
-
-
-def capture_file(path: Path) -> Path:
-    """The one HDF5 file of a folder, or the file itself.
-
-    Raises:
-        InputError: none, or several.
-    """
-    if not path.is_dir():
-        return path
-    found = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES)
-    if len(found) != 1:
-        names = ", ".join(one.name for one in found) or "none"
-        raise InputError(f"{path}: one capture in HDF5 is read at a time, found {names}; give the file itself")
-    return found[0]
 
 
 def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
@@ -159,7 +136,7 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
 def _open(
     file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
 ) -> tuple[_Layout, Iterator[NDArray[Any]]]:
-    """The layout and the samples in parts, each [frames, users, antennas, slot, 2]."""
+    """The layout, and chunks of samples [frames, users, antennas, slot, 2]."""
     shape = tuple(int(size) for size in pilots.shape)
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
@@ -172,19 +149,21 @@ def _open(
     if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
         text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
         raise InputError(f"{file}: {text}; give start")
-    which = _cell(file, shape, cell) if len(shape) == 5 else None
+    if len(shape) == 5 and cell is None and shape[1] > 1:
+        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+    if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:
+        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
 
     def parts() -> Iterator[NDArray[Any]]:
         step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
         for first in range(0, len(asked), step):
-            own = asked[first : first + step]
-            rows = slice(own.start, own[-1] + 1, own.step)
-            if which is None:
+            chunk = asked[first : first + step]
+            rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
+            if len(shape) == 4:
                 values = pilots[rows][:, :, : layout.users * layout.slot]
-                values = values.reshape(len(own), layout.antennas, layout.users, layout.slot, 2)
-                yield values.swapaxes(1, 2)
+                yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
             else:
-                yield pilots[rows, which].reshape(len(own), layout.users, layout.antennas, layout.slot, 2)
+                yield pilots[rows, cell or 0].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
 
     return layout, parts()
 
@@ -196,14 +175,20 @@ def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start
         raise InputError(f"{file}: {text}; correct num_mob_ant or samples_per_user")
     first = ARGOS_START if start is None else start
     starts = tuple(first + k * FFT for k in range(ARGOS_SYMBOLS))
-    return _Layout(users, shape[1], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
+    return _Layout(users, shape[1], slot, starts)
 
 
 def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
     if shape[4] % 2:
         raise InputError(f"{file}: {PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
-    size, text = _number(attributes, "FFT_SIZE"), _text(file, attributes, "PILOT_SEQ_TYPE", "lts")
+    found = np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))
+    word = found[0] if len(found) else ""
+    text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
+    if not text or not isinstance(word, bytes | str):
+        what = "empty" if not text else shown(word)
+        raise InputError(f"{file}: attribute PILOT_SEQ_TYPE is {what}; it must be lts")
+    size = _number(attributes, "FFT_SIZE")
     if size not in (None, FFT) or text.lower() != "lts":
         other = f"pilots {text!r} of {size or FFT:g} samples"
         raise InputError(f"{file}: {other}; the long training symbol (lts) of {FFT} is read")
@@ -211,25 +196,7 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
     first = _whole(file, attributes, "PREFIX_LEN") + guard if start is None else start
     room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
     starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
-    return _Layout(shape[2], shape[3], slot, starts, _number(attributes, "FREQ"), _number(attributes, "RATE"))
-
-
-def _cell(file: Path, shape: tuple[int, ...], cell: int | None) -> int:
-    if cell is None and shape[1] > 1:
-        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
-    if not 0 <= (cell or 0) < shape[1]:
-        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
-    return cell or 0
-
-
-def _text(file: Path, attributes: dict[str, Any], key: str, default: str) -> str:
-    """A word; what is not UTF-8 stands in escapes."""
-    found = np.ravel(attributes.get(key, default))
-    word = found[0] if len(found) else ""
-    text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
-    if not text or not isinstance(word, bytes | str):
-        raise InputError(f"{file}: attribute {key} is {'empty' if not text else shown(word)}; it must be {default}")
-    return text
+    return _Layout(shape[2], shape[3], slot, starts)
 
 
 def _number(attributes: dict[str, Any], key: str) -> float | None:
@@ -244,7 +211,7 @@ def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
     value = _number(attributes, key)
     if value is None or value < 0 or value != int(value):
         found = f"is {shown(attributes[key])}" if key in attributes else "is missing"
-        raise InputError(f"{file}: attribute {key} {found}; it must tell how {PILOTS} is laid out")
+        raise InputError(f"{file}: attribute {key} {found}; it must state the layout of {PILOTS}")
     return int(value)
 
 

@@ -10,14 +10,13 @@ learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.54575
 - ``calibration_df.csv``: one row per measurement: ``x``, ``y`` of the transmitter in metres, ``rssi_<id>`` at each
   receiver in dBm, empty where nothing was received. These rows train.
   Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Optional and
-  ours, of every receiver or of none: ``count_<id>``, the number of readings of which ``rssi_<id>`` is the mean (0 or
+  ours, for all receivers or none: ``count_<id>``, the number of readings of which ``rssi_<id>`` is the mean (0 or
   empty where nothing was received), and ``std_<id>``, the standard deviation of that mean's noise in dB (empty where
   nothing was received); and ``frequency_hz``, the carrier of the row. Other columns (``ts``, the time) are not used.
 - ``test_robot_df.csv``: the same for another run; these rows test. An optional column is in both files or in neither.
 
 Without a column ``z`` the height is that of the published data, whose transmitter stood on a pole 1.3 m above the
-floor. Nothing is known of the receivers' antennas but that each has two, perpendicular to each other, whose powers are
-averaged: their orientation is the identity.
+floor. Each receiver averages the powers of two perpendicular antennas; their orientation is the identity.
 """
 
 from __future__ import annotations
@@ -37,8 +36,16 @@ from ..core.antenna import ANTENNA, UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line
 from ..core.types import IntArray
-from .csv_table import CsvTable, read_csv
-from .folder_files import TX_ANTENNA_WORDS, carriers_of, read_antenna, refuse_unstated, shown
+from .folder_files import (
+    TX_ANTENNA_WORDS,
+    CsvTable,
+    carriers_of,
+    data_folder,
+    read_antenna,
+    read_csv,
+    refuse_unstated,
+    shown,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -46,25 +53,25 @@ ANCHORS, TRAINING, TEST = "anchors.csv", "calibration_df.csv", "test_robot_df.cs
 TAG_HEIGHT_M = 1.3
 """Height of the transmitter above the floor where the files have no column ``z`` (the data set's description)."""
 CARRIER_HZ = 2.44e9
-"""Where the files have no column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402, 2426
-and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
+"""Carrier of files without a column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402,
+2426 and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
 RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
 MOST_READINGS = 10**6
-"""Readings that a row's mean may be of."""
+"""Largest number of readings of a row's mean."""
 COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
-"""Of ``anchors.csv``."""
+"""Columns of ``anchors.csv``."""
 WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
 """A whole number, also as pandas writes it in a column of floats: ``3``, ``3.0``."""
 NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
-"""A number that counts nothing, or pandas' mark of a missing value."""
+"""A number with decimals, or pandas' mark of a missing value."""
 
 
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of the BLE data (see this module's head).
 
     Args:
-        path: the folder.
-        name: the record's name; the folder's own by default.
+        path: path of the folder.
+        name: name of the record; by default that of the folder.
 
     Returns:
         A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received; the rows of
@@ -73,9 +80,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give one that holds {ANCHORS}, {TRAINING} and {TEST}")
+    folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
     anchors = read_csv(folder / ANCHORS)
     ids, anchors_m = _read_anchors(anchors)
     tables = [read_csv(folder / file) for file in (TRAINING, TEST)]
@@ -94,23 +99,28 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         np.concatenate(strengths, axis=1),
         *(_of_anchors(kind, tables, ids, strengths) for kind in (COUNT, STD)),
     )
-    deaf = np.flatnonzero(np.isnan(strength).all(axis=1))
-    if len(deaf):
-        text = f"{RSSI}{ids[deaf[0]]} is empty in every row, in {TEST} too"
+    silent = np.flatnonzero(np.isnan(strength).all(axis=1))
+    if len(silent):
+        text = f"{RSSI}{ids[silent[0]]} is empty in every row, in {TEST} too"
         raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
+    tx_antennas = _antennas(anchors, TX)
+    for row, antenna in enumerate(tx_antennas, start=1):
+        if antenna != tx_antennas[0]:
+            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
+            raise InputError(f"{anchors.path}: {text}; there is one transmitter: state the same in every row")
     record = Record(
         name=name or folder.resolve().name,
         task="rssi",
         tx_pos_m=np.stack([x, y, height], axis=-1),
         receivers=tuple(
-            Receiver(_name(anchor), position, np.array([0.0, 0.0, 0.0, 1.0]), antenna)
+            Receiver(_name(anchor), position, np.array(UPRIGHT), antenna)
             for anchor, position, antenna in zip(ids, anchors_m, _antennas(anchors, ""), strict=True)
         ),
         observation=strength,
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=_in_both("heading", tables),
-        tx_antenna=_tx_antenna(anchors),
+        tx_antenna=tx_antennas[0],
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=std,
         source=str(folder),
@@ -119,17 +129,16 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
 
 
 def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
-    """Write signal strengths in the layout of the BLE data; the folder appears complete or not at all.
+    """Write signal strengths atomically in the layout of the BLE data.
 
     Args:
-        path: the folder to make.
-        record: of ``task="rssi"``. Its official split tells which rows lie in which file, so that they are read in
-            the order of that split.
-        replace: take the place of an existing folder.
+        path: path of the folder.
+        record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
+            of that split.
+        replace: replace an existing folder.
 
     Raises:
-        InputError: the folder exists or cannot be written, or the record lacks what the layout holds, or has what it
-            cannot state.
+        InputError: the folder exists or cannot be written, or the record does not fit the layout.
     """
     official, ids = _writable(path, record)
     carriers, hz = record.carriers_hz, record.frequencies_hz
@@ -138,13 +147,13 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
     with atomic_folder(Path(path), replace) as part:
         antennas = {TX: [record.tx_antenna] * len(ids), "": [receiver.antenna for receiver in record.receivers]}
         stated = {
-            prefix + word: [getattr(one, word) for one in own]
-            for prefix, own in antennas.items()
+            prefix + word: [getattr(antenna, word) for antenna in group]
+            for prefix, group in antennas.items()
             for word in TX_ANTENNA_WORDS
-            if any(one != ANTENNA for one in own)
+            if any(antenna != ANTENNA for antenna in group)
         }
-        places = zip("xyz", np.stack([one.position_m for one in record.receivers]).T.tolist(), strict=True)
-        _write_csv(part / ANCHORS, {"id": ids, **dict(places), **stated})
+        positions = np.stack([receiver.position_m for receiver in record.receivers])
+        _write_csv(part / ANCHORS, {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated})
         for file, rows in zip((TRAINING, TEST), official, strict=True):
             columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
             if record.tx_heading_rad is not None:
@@ -153,13 +162,13 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
                 columns[FREQUENCY] = carriers[rows].tolist()
             for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
                 if values is not None:
-                    columns |= {prefix + anchor: own[rows] for anchor, own in zip(ids, values, strict=True)}
+                    columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
             _write_csv(part / file, columns)
     return Path(path)
 
 
 def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArray], list[str]]:
-    """The official split of a record that the layout can state, and the receivers' ids."""
+    """The official split and the receivers' ids of a record, checked to fit the layout."""
     text, rows = f"{path}: {record.name} cannot be written in the layout of {ANCHORS}", np.arange(len(record))
     if record.task != "rssi" or record.official is None:
         raise InputError(f"{text}: it needs signal strengths with an official split; set Record.official")
@@ -169,79 +178,68 @@ def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArra
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
     refuse_unstated(path, record, "folds", "truth", "uplink")
     numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
-    if not all(np.isfinite(one).all() for one in numbers) or np.isinf(record.observation).any():
+    if not all(np.isfinite(values).all() for values in numbers) or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
     ids: list[str] = []
-    for one in record.receivers:
-        if one.array_m is not None or one.orientation_xyzw.tolist() != list(UPRIGHT) or one.antenna.frame != "world":
+    for rx in record.receivers:
+        if rx.array_m is not None or rx.orientation_xyzw.tolist() != list(UPRIGHT) or rx.antenna.frame != "world":
             what = "it states no array, orientation or frame of an antenna"
-            raise InputError(f"{text}: receiver {one.name}: {what}; set those of the world")
-        anchor = number if _name(number := one.name.removeprefix("anchor")) == one.name else one.name
-        wrong = _wrong_id(anchor, ids) or ("" if _name(_id(anchor)) == one.name else "would be read as another")
+            raise InputError(f"{text}: receiver {rx.name}: {what}; set those of the world")
+        anchor = number if _name(number := rx.name.removeprefix("anchor")) == rx.name else rx.name
+        wrong = _wrong_id(anchor, ids) or ("" if _name(_id(anchor)) == rx.name else "would be read as another")
         if wrong:
-            raise InputError(f"{text}: the name of receiver {shown(one.name)} {wrong}; rename it")
+            raise InputError(f"{text}: the name of receiver {shown(rx.name)} {wrong}; rename it")
         ids.append(anchor)
     return record.official, ids
 
 
 def _write_csv(path: Path, columns: dict[str, Any]) -> None:
-    """Columns of texts or numbers, to the last digit of their type; NaN, and a count of zero, are empty fields."""
+    """Write columns of texts or numbers to their last digit; NaN, and a count of zero, are empty fields."""
     with path.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
         out.writerow(columns)
         for row in zip(*columns.values(), strict=True):
-            out.writerow(["" if (isinstance(one, np.integer) and not one) or one != one else one for one in row])
+            out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
 
 
 def _read_anchors(table: CsvTable) -> tuple[list[str], FloatArray]:
     """Ids and positions [anchors, 3]."""
     if unused := [column for column in table.header if column not in COLUMNS]:
-        logger.warning(
-            "%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), ", ".join(COLUMNS)
-        )
+        known = ", ".join(COLUMNS)
+        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         found = _id(text)
         if wrong := _wrong_id(found, ids):
-            raise InputError(
-                f"{table.path}: row {row}: id {shown(text)} {wrong}; give each anchor a number or a name of its own"
-            )
+            remedy = "give each anchor a number or name that no other has"
+            raise InputError(f"{table.path}: row {row}: id {shown(text)} {wrong}; {remedy}")
         ids.append(found)
     return ids, np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
 
 
 def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
-    """The antenna of each row; an empty field, like a column that is not there, is the default."""
+    """The antenna of each row; an empty field or a missing column is the default."""
     stated = {key: table.texts(prefix + key) for key in TX_ANTENNA_WORDS if prefix + key in table.header}
-    antennas = []
-    for row in range(len(table.rows)):
-        own = {key: texts[row].strip() for key, texts in stated.items() if texts[row].strip()}
-        antennas.append(read_antenna(table.path, f"row {row + 1}: {prefix}antenna", own))
-    return antennas
-
-
-def _tx_antenna(table: CsvTable) -> Antenna:
-    antennas = _antennas(table, TX)
-    for row, antenna in enumerate(antennas, start=1):
-        if antenna != antennas[0]:
-            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
-            raise InputError(f"{table.path}: {text}; there is one transmitter: state the same in every row")
-    return antennas[0]
+    entries = [{key: texts[row].strip() for key, texts in stated.items()} for row in range(len(table.rows))]
+    return [
+        read_antenna(table.path, f"row {row}: {prefix}antenna", {key: text for key, text in entry.items() if text})
+        for row, entry in enumerate(entries, start=1)
+    ]
 
 
 def _id(text: str) -> str:
-    """An id in one form: a whole number without leading zeros and decimals, anything else as it stands."""
+    """Normal form of an id: a whole number without leading zeros and decimals, any other text unchanged."""
     number = WHOLE.fullmatch(text.strip())
     return text.strip() if number is None else number[1].replace("+", "") + number[2]
 
 
 def _name(anchor: str) -> str:
-    """The receiver's name."""
+    """Name of the receiver of an id."""
     return f"anchor{anchor}" if WHOLE.fullmatch(anchor) else anchor
 
 
 def _wrong_id(anchor: str, before: list[str]) -> str | None:
-    """What is wrong with an id that follows others, or None."""
+    """Reason why an id cannot follow others, or None."""
     if not anchor:
         return "is empty"
     if not anchor.isprintable():
@@ -250,18 +248,14 @@ def _wrong_id(anchor: str, before: list[str]) -> str | None:
         return "cannot name a file"
     if NO_NAME.fullmatch(anchor):
         return "is neither a whole number nor a name"
-    names = [_name(one) for one in before]
+    names = [_name(other) for other in before]
     if _name(anchor) in names:
         return f"gives the name {_name(anchor)}, as row {names.index(_name(anchor)) + 1} does"
     return None
 
 
 def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
-    """An optional column of all tables, one after the other; None where none has it.
-
-    Raises:
-        InputError: one of them has it and another has not.
-    """
+    """An optional column of all tables, concatenated; None where no table has it."""
     having = [table for table in tables if column in table.header]
     if not having:
         return None
@@ -273,11 +267,7 @@ def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
 
 
 def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
-    """Columns of a table that begin with a prefix, by the anchor that they name.
-
-    Raises:
-        InputError: two columns of one anchor.
-    """
+    """Columns of a table that begin with a prefix, by the anchor that they name."""
     found: dict[str, str] = {}
     for column in table.header:
         if column.startswith(prefix):
@@ -291,10 +281,8 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
-    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated.
-
-    Raises:
-        InputError: a column that is missing in some of the files, or a value that does not fit the signal strength.
+    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None if not
+    stated.
     """
     found = [_by_anchor(prefix, table) for table in tables]
     if not any(anchor in columns for columns in found for anchor in ids):

@@ -1,8 +1,7 @@
-"""Downloading known data sets: from their public originals, at fixed commits, checked by SHA-256.
+"""Download of known data sets from their public originals at fixed commits, checked by SHA-256.
 
-Where ours is made from an original file of which only the content is known (the pickles of NeWRF), the arrays that it
-gives are checked in place of the file. Such a pickle is not unpickled: `wrf_mi.datasets.pickled_table` reads it as data
-and runs nothing of what it names. It is not kept.
+For converted files (the pickles of NeWRF, `wrf_mi.datasets.newrf`) the resulting arrays are checked in place
+of the original, which is not kept.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import hashlib
 import logging
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from importlib.resources import files
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -22,16 +20,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_arrays
-from .newrf import KEYS, arrays_sha256, read_arrays
-from .newrf_original import convert_newrf
-from .registry import DATA_VARIABLE, DataSet, RemoteFile, data_home, known, locate, remote_files
+from .newrf import KEYS, arrays_sha256, convert_newrf, read_arrays
+from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, known, locate, remote_files
 
 THREADS = 8
-"""Downloads under way at once: the files are small, so waiting is what takes the time."""
+"""Number of simultaneous downloads."""
 RETRIES = 2
-"""How often a file is tried again after a failure."""
+"""Number of further attempts after a failure."""
 TIMEOUT_S = 30
-"""Seconds without an answer after which a download counts as failed."""
+"""Seconds without an answer after which a download fails."""
 
 
 def fetch(
@@ -42,20 +39,19 @@ def fetch(
     retries: int = RETRIES,
     progress: bool = True,
 ) -> Path:
-    """Download a known data set, or check it where it is there already.
+    """Download a known data set atomically, or check an existing copy.
 
-    Every file, or the arrays in it where it is converted, must have the published SHA-256. The folder appears complete
-    or not at all.
+    Every file, or the arrays of a converted file, must have the published SHA-256.
 
     Args:
-        name: of a known data set.
-        home: folder to put ``<name>/`` in; by default that of ``WRF_MI_DATA``, or else the user's cache.
-        base_url: a mirror of the public original.
-        retries: how often a file is tried again.
-        progress: show a progress bar, and what a user has to know of the data, on standard error.
+        name: name of a known data set.
+        home: folder for ``<name>/``; by default that of ``WRF_MI_DATA``, or else the user's cache.
+        base_url: URL of a mirror of the public original.
+        retries: number of further attempts after a failure.
+        progress: show a progress bar, and the note of the data set, on standard error.
 
     Returns:
-        The data set's folder.
+        The folder of the data set.
 
     Raises:
         InputError: unknown name, no network, a file that is not the published one, or a folder that cannot be written.
@@ -63,8 +59,8 @@ def fetch(
     dataset = known(name)
     if dataset.base_url is None:
         raise InputError(f"data set {name}: is not downloaded but {dataset.origin}")
-    place = Path(home) if home else data_home()
-    target = locate(name, place) or place / name
+    parent = Path(home) if home else data_home()
+    target = locate(name, parent) or parent / name
     folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
     if progress and dataset.note:
         print(f"{name}: {dataset.note}", file=sys.stderr)
@@ -79,7 +75,7 @@ def download(
     retries: int = RETRIES,
     progress: bool = False,
 ) -> Path:
-    """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds; see `fetch`."""
+    """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds, as `fetch` does."""
     if target.exists():
         damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry)]
         if damaged:
@@ -97,15 +93,14 @@ def download(
             if entry.converted:
                 _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
         if dataset.folds is not None:
-            folds = (files(__package__) / "data" / dataset.folds).read_bytes()
-            (part / "blocked_folds.txt").write_bytes(folds)
+            (part / "blocked_folds.txt").write_bytes((FOLDER / dataset.folds).read_bytes())
         source = f"{dataset.name}: {dataset.origin}\nLicence: {dataset.licence}\n{dataset.note}".strip()
         (part / "SOURCE.txt").write_text(f"{source}\n", encoding="utf-8")
     return target
 
 
 def _convert(path: Path, entry: RemoteFile, source: str) -> None:
-    """Put our file in the place of the original's."""
+    """Replace an original file by the converted file."""
     remedy = f"nothing was kept; set {DATA_VARIABLE} to a folder that holds {path.name} in this form"
     try:
         arrays = convert_newrf(path)
@@ -130,25 +125,24 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
         jobs = {pool.submit(store.fetch, path, downloader=downloader): path for path in store.registry}
         try:
             for job in as_completed(jobs):
-                _result(job.exception(), name, store.get_url(jobs[job]))
+                error, url = job.exception(), store.get_url(jobs[job])
+                if isinstance(error, requests.exceptions.HTTPError):
+                    raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
+                if isinstance(error, requests.exceptions.RequestException):
+                    remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
+                    raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
+                if isinstance(error, ValueError):  # raised by pooch for a wrong hash
+                    text = f"{url} has not the published SHA-256, nothing was kept"
+                    raise InputError(f"data set {name}: {text}; try again") from None
+                if isinstance(error, OSError):
+                    text = f"cannot be written ({one_line(error)})"
+                    raise InputError(f"data set {name}: {text}; choose another folder") from None
+                if error is not None:
+                    raise error
                 bar.advance(task)
         finally:
             pool.shutdown(cancel_futures=True)
             logger.setLevel(level)
-
-
-def _result(error: BaseException | None, name: str, url: str) -> None:
-    if isinstance(error, requests.exceptions.HTTPError):
-        raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
-    if isinstance(error, requests.exceptions.RequestException):
-        remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
-        raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
-    if isinstance(error, ValueError):  # how pooch reports a wrong hash
-        raise InputError(f"data set {name}: {url} has not the published SHA-256, nothing was kept; try again") from None
-    if isinstance(error, OSError):
-        raise InputError(f"data set {name}: cannot be written ({one_line(error)}); choose another folder") from None
-    if error is not None:
-        raise error
 
 
 def _is_intact(path: Path, entry: RemoteFile) -> bool:

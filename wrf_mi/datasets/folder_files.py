@@ -1,8 +1,9 @@
-"""Files that several layouts share: positions, index files and YAML, with errors that name the line."""
+"""Files shared by several layouts: CSV, positions, index files and YAML, with errors that name the line."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import csv
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,20 @@ from ..core.files import one_line, text_lines
 from ..core.types import IntArray
 
 POSITIONS = "tx_pos.csv"
-AXES = ("x", "y", "z")
+AXES = "x,y,z"
 """Columns of positions, metres."""
 INDEX_FILES = ("train_index.txt", "test_index.txt")
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
-"""What may be stated of a transmitter's antenna: its frame is always the world, turned with the heading."""
+"""Keys of a transmitter's antenna, whose frame is always the world, turned with the heading."""
 SINGLE_MAX = float(np.finfo(np.float32).max)
-"""Largest number that single precision holds, in which everything computes."""
+"""Largest number in single precision, in which everything is computed."""
 DIGITS = 18
-"""Of a whole number at most: more may not fit into 64 bits."""
+"""Most digits of a whole number; more may not fit into 64 bits."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Says where a value stands that looks like a date or a number and cannot be one."""
+    """Names the line of a value that looks like a date or a number and is none."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
@@ -45,11 +46,30 @@ class _Loader(yaml.SafeLoader):
         return value
 
 
+def data_folder(path: str | Path, content: str) -> Path:
+    """The path of a folder; an `InputError` that ends with ``content`` if it is none."""
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: not a folder; give one that holds {content}")
+    return folder
+
+
+def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
+    """The only file of a folder with one of some suffixes, or the path itself where it is no folder."""
+    if not path.is_dir():
+        return path
+    found = sorted(file for file in path.iterdir() if file.suffix in suffixes)
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found) or "none"
+        raise InputError(f"{path}: {what} is read at a time, found {names}; give the file itself")
+    return found[0]
+
+
 def read_yaml(path: Path) -> dict[Any, Any]:
     """The mapping of a YAML file; empty where it holds anything else.
 
     Raises:
-        InputError: missing, not text, not YAML, or with a date or number in it that is none.
+        InputError: missing, not text, not YAML, or with an impossible date or number.
     """
     text = "\n".join(text_lines(path))
     try:
@@ -60,11 +80,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
 
 
 def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:
-    """A list of ``count`` finite numbers from YAML, shape [count].
-
-    Raises:
-        InputError: it is anything else, or single precision does not hold it.
-    """
+    """A list of finite numbers from YAML, shape [count]; an `InputError` for anything else."""
     values = numbers_of(value)
     if values.shape != (count,) or not fits_single(values):
         raise InputError(f"{path}: {one_line(what)} is {shown(value)}; give a list of {count} finite numbers")
@@ -72,7 +88,7 @@ def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArr
 
 
 def numbers_of(value: object) -> FloatArray:
-    """An array of numbers from YAML or from a call; empty where it is none."""
+    """An array of numbers from YAML or from a call; empty where the value is none."""
     try:
         return np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -80,43 +96,28 @@ def numbers_of(value: object) -> FloatArray:
 
 
 def fits_single(values: FloatArray) -> bool:
-    """Whether all are finite, in single precision too."""
+    """Whether all values are finite in single precision."""
     return bool((np.abs(values) <= SINGLE_MAX).all())
 
 
 def shown(value: object) -> str:
-    """A value for a message: on one line and not long."""
+    """Text of a value for a message, on one line of at most 60 characters."""
     text = one_line(repr(value))
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 
 def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
-    """An orientation from YAML: a unit quaternion x, y, z, w.
-
-    Raises:
-        InputError: it is none.
-    """
+    """An orientation from YAML: a unit quaternion x, y, z, w; an `InputError` for anything else."""
     orientation = finite_numbers(path, f"{name}: orientation", value, 4)
     norm = float(np.linalg.norm(orientation))
     if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
-        raise InputError(
-            f"{path}: {one_line(name)}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w"
-        )
+        text = f"{one_line(name)}: quaternion of norm {norm:.4g}"
+        raise InputError(f"{path}: {text}; orientation must be a unit x, y, z, w")
     return orientation
 
 
 def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS) -> Antenna:
-    """An antenna from YAML: a mapping with some of ``pattern``, ``polarization`` and ``frame``; None: the default.
-
-    Args:
-        path: of the file, for messages.
-        name: of the entry, for messages.
-        value: from the file.
-        words: keys that may be given.
-
-    Raises:
-        InputError: anything else.
-    """
+    """An antenna from YAML: a mapping with some of ``words``, or None for the default; else an `InputError`."""
     if value is None:
         return ANTENNA
     if not isinstance(value, dict) or not set(value) <= set(words):
@@ -129,74 +130,108 @@ def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = 
 
 
 def antenna_entry(antenna: Antenna) -> dict[str, str]:
-    """What `read_antenna` reads: all that is not the default."""
+    """Entry for `read_antenna`: the attributes that differ from the default."""
     return {key: value for key, value in asdict(antenna).items() if value != getattr(ANTENNA, key)}
 
 
-def read_positions(path: Path) -> FloatArray:
-    """Positions [n, 3] in metres of a CSV file with the header ``x,y,z``.
+@dataclass(frozen=True)
+class CsvTable:
+    """A CSV file: names of the columns, and the text of each field, a list per row."""
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+
+    def numbers(self, column: str, may_be_empty: bool = False, index: int | None = None) -> FloatArray:
+        """Numbers of a column, shape [rows]; an empty field or ``nan`` is NaN if it is allowed.
+
+        With an ``index`` the column is found by it, and ``column`` is its name in messages.
+
+        Raises:
+            InputError: no such column, or a field that is not a finite number, in single precision too.
+        """
+        index = self._index(column) if index is None else index
+        values = np.full(len(self.rows), np.nan)
+        for row, fields in enumerate(self.rows):
+            text = fields[index].strip()
+            if may_be_empty and text.lower() in ("", "nan"):
+                continue
+            try:
+                values[row] = float(text)
+            except ValueError:
+                values[row] = np.nan
+            if not abs(values[row]) <= SINGLE_MAX:
+                remedy = "give a finite number" + (" of single precision" if np.isfinite(values[row]) else "")
+                remedy += ", or leave it empty" if may_be_empty else ""
+                raise InputError(f"{self.path}: row {row + 1}: {one_line(column)} is {text[:40]!r}; {remedy}")
+        return values
+
+    def texts(self, column: str) -> list[str]:
+        """Fields of a column as text."""
+        index = self._index(column)
+        return [fields[index] for fields in self.rows]
+
+    def _index(self, column: str) -> int:
+        if self.header.count(column) != 1:
+            what = "has no column" if column not in self.header else "has twice the column"
+            text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
+            raise InputError(f"{self.path}: {text}; the first line must name each column once")
+        return self.header.index(column)
+
+
+def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
+    """Read a CSV file whose first line is its header.
+
+    Blank lines are refused, or skipped and not counted, as pandas does.
 
     Raises:
-        InputError: another header, no rows, or a row that is not three finite numbers.
+        InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
     """
-    return _read_columns(path, (AXES,))
+    lines = [line for line in text_lines(path) if line.strip() or not skip_blank]
+    if not lines:
+        raise InputError(f"{path}: empty; give a header and one row per measurement")
+    try:
+        header, *rows = csv.reader(lines, strict=True)
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({one_line(error)}); correct it") from None
+    if not rows:
+        raise InputError(f"{path}: no rows below the header; give one per measurement")
+    for row, fields in enumerate(rows, start=1):
+        if len(fields) != len(header):
+            text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
+            raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
+    return CsvTable(path, [name.strip() for name in header], rows)
 
 
-def read_positions_and_carriers(path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z,frequency_hz``.
-
-    Returns:
-        Carriers are None where the header is ``x,y,z``.
+def read_columns(path: Path, *headers: str) -> FloatArray:
+    """Numbers [rows, columns] of a CSV file with one of some headers, such as ``x,y,z``.
 
     Raises:
-        InputError: another header, no rows, a row that is not of finite numbers, or a carrier that is not positive.
+        InputError: another header, or as `read_csv` and `CsvTable.numbers`.
     """
-    values = _read_columns(path, (AXES, (*AXES, FREQUENCY)))
+    table = read_csv(path)
+    found = ",".join(table.header)
+    if found.lower() not in headers:
+        raise InputError(f"{path}: line 1: header is {found[:40]!r}; it must be {' or '.join(headers)}")
+    return np.stack([table.numbers(name, index=index) for index, name in enumerate(table.header)], axis=-1)
+
+
+def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z`` or `FREQUENCY` too."""
+    values = read_columns(path, AXES, f"{AXES},{FREQUENCY}")
     return values[:, :3], carriers_of(path, values[:, 3]) if values.shape[1] > 3 else None
 
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
-    """Carriers [n] of a file's column `FREQUENCY`, checked.
-
-    Raises:
-        InputError: one that is not positive.
-    """
+    """Carriers [n] of a file's column `FREQUENCY`; an `InputError` if one is not positive."""
     if len(bad := np.flatnonzero(~(carriers_hz > 0))):
         text = f"row {bad[0] + 1}: {FREQUENCY} is {carriers_hz[bad[0]]:g}"
         raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
     return carriers_hz
 
 
-def _read_columns(path: Path, headers: tuple[tuple[str, ...], ...]) -> FloatArray:
-    """Finite numbers [n, columns] of a CSV file with one of some headers."""
-    first, *rows = text_lines(path) or [""]
-    header = tuple(column.strip().lower() for column in first.split(","))
-    if header not in headers:
-        known = " or ".join(",".join(one) for one in headers)
-        raise InputError(f"{path}: line 1: header is {first[:40]!r}; it must be {known}")
-    if not rows:
-        raise InputError(f"{path}: no positions in it; give one row x,y,z in metres per sample")
-    values, count = np.empty((len(rows), len(header))), len(header)
-    for row, text in enumerate(rows, start=1):
-        try:
-            # A single number would be taken for all columns.
-            values[row - 1] = np.reshape([float(value) for value in text.split(",", count)], count)
-        except ValueError:
-            numbers = "three numbers x,y,z in metres" if count == 3 else f"{count} numbers {','.join(header)}"
-            raise InputError(f"{path}: row {row}: {text[:60]!r}; give {numbers}") from None
-    bad = np.flatnonzero(~(np.abs(values) <= SINGLE_MAX).all(axis=1))
-    if len(bad):
-        what = "is not finite" if not np.isfinite(values[bad[0]]).all() else "is too large for single precision"
-        raise InputError(f"{path}: row {bad[0] + 1}: {rows[bad[0]][:60]!r} {what}; correct or remove the row")
-    return values
-
-
 def whole_number(path: Path, line: int, text: str) -> int:
-    """A whole number from 0 that stands alone on a line.
-
-    Raises:
-        InputError: the line holds anything else.
-    """
+    """The whole number from 0 on a line; an `InputError` for anything else."""
     digits = text.strip()
     if not (digits.isascii() and digits.isdecimal()):
         raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
@@ -206,26 +241,19 @@ def whole_number(path: Path, line: int, text: str) -> int:
 
 
 def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) -> tuple[IntArray, IntArray] | None:
-    """Training and test rows, from 0, of a folder's index files; None where it has neither.
-
-    Args:
-        folder: that may hold them.
-        rows: of the data.
-        first: number of the first row in these files: 1 where they name images ``00001.png``, 0 where they count.
-        source: the file whose rows are meant, for messages.
+    """Training and test rows, from 0, of a folder's index files, which begin with ``first``; None without these files.
 
     Raises:
-        InputError: one of the two is missing, or a line is no row, out of range, twice, or in both.
+        InputError: one of the two is missing, or a line is no row of ``source``, out of range, twice, or in both.
     """
-    train_file, test_file = (folder / name for name in INDEX_FILES)
-    if not train_file.exists() and not test_file.exists():
+    files = [folder / name for name in INDEX_FILES]
+    if not any(file.exists() for file in files):
         return None
-    train, test = (_read_index(path, rows, first, source) for path in (train_file, test_file))
+    train, test = (_read_index(path, rows, first, source) for path in files)
     both = np.intersect1d(train, test)
     if len(both):
-        raise InputError(
-            f"{test_file}: row {both[0] + first} is in {train_file.name} as well; remove it from one of them"
-        )
+        text = f"row {both[0] + first} is in {files[0].name} as well"
+        raise InputError(f"{files[1]}: {text}; remove it from one of them")
     return train, test
 
 
@@ -245,26 +273,27 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
 
 
 def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
-    """Refuse to write a record with parts of these names, which a layout does not state.
-
-    Raises:
-        InputError: naming the first that the record has.
-    """
+    """Refuse to write a record with one of some attributes, which a layout does not state."""
     for name in names:
         if getattr(record, name) is not None:
             remedy = f"set Record.{name} to None, or use another layout"
             raise InputError(f"{path}: {record.name} has {name}, which this layout does not state; {remedy}")
 
 
+def write_official(folder: Path, record: Record, first: int, digits: int = 1) -> None:
+    """Write the index files of a record's official split, if it has one; `read_official` reads them."""
+    for file, rows in zip(INDEX_FILES, record.official or (), strict=False):
+        write_lines(folder / file, [f"{row + first:0{digits}d}" for row in rows])
+
+
 def write_lines(path: Path, lines: list[str]) -> None:
-    """Write lines of text, each ended."""
+    """Write lines of text, each with a line end."""
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
 def write_positions(path: Path, positions_m: FloatArray, carriers_hz: FloatArray | None = None) -> None:
-    """Write positions [n, 3] and carriers [n] as `read_positions_and_carriers` reads them, to the last digit."""
-    header: tuple[str, ...] = AXES
-    values = positions_m
+    """Write positions [n, 3] and carriers [n] to the last digit; `read_positions` reads them."""
+    header, values = AXES, positions_m
     if carriers_hz is not None:
-        header, values = (*AXES, FREQUENCY), np.column_stack([positions_m, carriers_hz])
-    write_lines(path, [",".join(header), *(",".join(repr(float(v)) for v in row) for row in values)])
+        header, values = f"{AXES},{FREQUENCY}", np.column_stack([positions_m, carriers_hz])
+    write_lines(path, [header, *(",".join(repr(float(v)) for v in row) for row in values)])

@@ -13,9 +13,8 @@ world), ``frequencies_hz`` of all subcarriers, and ``antenna`` and ``tx_antenna`
 `wrf_mi.datasets.spectrum_folder`); ``tx_pos.csv`` with the positions of the moving ends;
 ``downlink_truth.npy``, the downlink without noise [n, antennas, subcarriers / 2], where it is synthetic.
 
-NeRF2 divides all coefficients, test rows included, by the largest magnitude among them, and takes each antenna for a
-sample of its own with real and imaginary parts side by side. Neither is done here: a record holds what was measured,
-and normalising belongs to a method, from its training rows alone.
+NeRF2 divides all coefficients, test rows included, by the largest magnitude among them, and treats each antenna as a
+sample. Neither is done here: a record holds measured values, and a model normalises by its training rows alone.
 """
 
 from __future__ import annotations
@@ -31,38 +30,40 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
+from ..core.antenna import UPRIGHT
 from ..core.files import atomic_folder, one_line
 from .folder_files import (
-    INDEX_FILES,
+    AXES,
     POSITIONS,
     TX_ANTENNA_WORDS,
     antenna_entry,
+    data_folder,
     fits_single,
     numbers_of,
     read_antenna,
+    read_columns,
     read_official,
-    read_positions,
     read_yaml,
     refuse_unstated,
     shown,
     unit_quaternion,
-    write_lines,
+    write_official,
     write_positions,
 )
 
 CHANNELS, STATION, TRUTH = "csidata.npy", "base-station.yml", "downlink_truth.npy"
 FEWEST = 2
-"""Samples: one to train on and one to score."""
-IDENTITY = (0.0, 0.0, 0.0, 1.0)
+"""Least number of samples: one to train on and one to score."""
 
 
 def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's channel coefficients (see this module's head).
 
     Args:
-        path: the folder.
-        name: the record's name; the folder's own by default.
-        frequencies_hz: of all subcarriers, uplink and downlink, in Hz, where ``base-station.yml`` does not tell.
+        path: path of the folder.
+        name: name of the record; by default that of the folder.
+        frequencies_hz: frequencies of all subcarriers, uplink and downlink, in Hz, in place of those of
+            ``base-station.yml``.
 
     Returns:
         A record with ``task="csi"`` and one receiver at the middle of the antennas: ``observation``
@@ -72,10 +73,8 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the sample.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give one that holds {CHANNELS} and {STATION}")
-    channel = read_channels(folder / CHANNELS)
+    folder = data_folder(path, f"{CHANNELS} and {STATION}")
+    channel = _read_channels(folder / CHANNELS)
     n, antennas, subcarriers = channel.shape
     if n < FEWEST:
         raise InputError(f"{folder / CHANNELS}: {n} sample; give {FEWEST} at least, to train on and to score")
@@ -86,19 +85,37 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     station = folder / STATION
     info = read_yaml(station)
     receiver = _read_station(station, info, antennas)
-    asked = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
-    frequencies = None if asked is None else _frequencies(station, asked, subcarriers)
+    stated = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
+    frequencies = None if stated is None else numbers_of(stated)
+    if frequencies is not None:
+        if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
+            raise InputError(f"{station}: frequencies_hz is {shown(stated)}; give a list of frequencies in Hz")
+        if len(frequencies) != subcarriers:
+            text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
+            raise InputError(f"{station}: {text}; give one for each, the uplink's first")
+    positions = np.full((n, 3), np.nan)
+    if (folder / POSITIONS).exists():
+        positions = read_columns(folder / POSITIONS, AXES)
+        if len(positions) != n:
+            text = f"{len(positions)} rows, but {CHANNELS} has {n} samples"
+            raise InputError(f"{folder / POSITIONS}: {text}; give one for each")
+    truth = None
+    if (folder / TRUTH).exists():
+        truth = _read_channels(folder / TRUTH)[None]
+        if truth.shape[1:] != (n, antennas, half):
+            text = f"shape {list(truth.shape[1:])}, expected {[n, antennas, half]}"
+            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}")
     return Record(
         name=name or folder.resolve().name,
         task="csi",
-        tx_pos_m=_read_places(folder / POSITIONS, n),
+        tx_pos_m=positions,
         receivers=(receiver,),
         observation=channel[None, :, :, half:],
         official=read_official(folder, n, first=0, source=CHANNELS),
         frequencies_hz=None if frequencies is None else frequencies[half:],
         uplink=channel[:, :, :half],
         uplink_hz=None if frequencies is None else frequencies[:half],
-        truth=_read_truth(folder / TRUTH, (n, antennas, half)),
+        truth=truth,
         tx_antenna=read_antenna(station, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS),
         source=str(folder),
     )
@@ -107,17 +124,17 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
 def write_nerf2_csi(
     path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str] | None = None
 ) -> Path:
-    """Write a record in the layout of NeRF2's channel coefficients; the folder appears complete or not at all.
+    """Write a record atomically in the layout of NeRF2's channel coefficients.
 
     Args:
-        path: the folder to make.
-        record: of ``task="csi"`` with one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
+        path: path of the folder.
+        record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
             the downlink.
-        replace: take the place of an existing folder.
-        extra: further text files to put into the folder, by their names.
+        replace: replace an existing folder.
+        extra: text of further files by their names.
 
     Raises:
-        InputError: the folder exists or cannot be written, or the record lacks what the layout holds.
+        InputError: the folder exists or cannot be written, or the record does not fit the layout.
     """
     down, up, array_m = record.observation, record.uplink, record.receivers[0].array_m
     if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
@@ -141,31 +158,25 @@ def write_nerf2_csi(
             write_positions(part / POSITIONS, record.tx_pos_m)
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
-        if record.official is not None:
-            for file, rows in zip(INDEX_FILES, record.official, strict=True):
-                write_lines(part / file, [str(row) for row in rows])
+        write_official(part, record, first=0)
         for file, content in (extra or {}).items():
             (part / file).write_text(content, encoding="utf-8")
     return Path(path)
 
 
-def read_channels(path: Path) -> NDArray[np.complex64]:
-    """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file.
-
-    Raises:
-        InputError: missing, damaged, of another shape or type, or not finite, in single precision too.
-    """
+def _read_channels(path: Path) -> NDArray[np.complex64]:
+    """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file, finite in single precision."""
     try:
         values = np.load(path, allow_pickle=False)
     except FileNotFoundError:
         raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
     except Exception as error:  # numpy raises several kinds on damaged files
         raise InputError(f"{path}: not readable as .npy ({one_line(error)}); write it again with numpy.save") from None
+    wanted = "give complex numbers [samples, antennas, subcarriers]"
     if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:
-        shape = list(getattr(values, "shape", ()))
-        raise InputError(f"{path}: shape {shape}; give complex numbers [samples, antennas, subcarriers]")
+        raise InputError(f"{path}: shape {list(getattr(values, 'shape', ()))}; {wanted}")
     if values.dtype.kind != "c":
-        raise InputError(f"{path}: holds {values.dtype}; give complex numbers [samples, antennas, subcarriers]")
+        raise InputError(f"{path}: holds {values.dtype}; {wanted}")
     with np.errstate(over="ignore"):
         single = values.astype(np.complex64)
     bad = ~np.isfinite(single)
@@ -186,35 +197,7 @@ def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> Receiver:
     if len(elements) != antennas:
         text = f"{len(elements)} positions in base_station, but {CHANNELS} has {antennas} antennas"
         raise InputError(f"{path}: {text}; give one for each")
-    orientation = unit_quaternion(path, "base_station", info.get("orientation", list(IDENTITY)))
+    orientation = unit_quaternion(path, "base_station", info.get("orientation", list(UPRIGHT)))
     antenna = read_antenna(path, "antenna", info.get("antenna"))
     receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
     return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
-
-
-def _frequencies(path: Path, values: object, subcarriers: int) -> FloatArray:
-    frequencies = numbers_of(values)
-    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
-        raise InputError(f"{path}: frequencies_hz is {shown(values)}; give a list of frequencies in Hz")
-    if len(frequencies) != subcarriers:
-        text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
-        raise InputError(f"{path}: {text}; give one for each, the uplink's first")
-    return frequencies
-
-
-def _read_places(path: Path, rows: int) -> FloatArray:
-    if not path.exists():
-        return np.full((rows, 3), np.nan)
-    positions = read_positions(path)
-    if len(positions) != rows:
-        raise InputError(f"{path}: {len(positions)} rows, but {CHANNELS} has {rows} samples; give one for each")
-    return positions
-
-
-def _read_truth(path: Path, shape: tuple[int, int, int]) -> NDArray[np.complex64] | None:
-    if not path.exists():
-        return None
-    truth = read_channels(path)
-    if truth.shape != shape:
-        raise InputError(f"{path}: shape {list(truth.shape)}, expected {list(shape)}, as the downlink of {CHANNELS}")
-    return truth[None]

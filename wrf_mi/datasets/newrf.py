@@ -1,6 +1,6 @@
 """The layout of the NeWRF rooms: channels computed by an image-method ray tracer, one ``.npz`` file per room.
 
-Format of ``<room>.npz`` (ours, from the pickles of https://github.com/LuHaofan/NeWRF, see `newrf_original`), with the
+Format of ``<room>.npz`` (ours, converted from the pickles of https://github.com/LuHaofan/NeWRF), with the
 room's mesh beside it as ``<room>.stl``, metres:
 
 - ``tx_pos`` [3] and ``rx_pos`` [n, 3], metres; ``frequency_hz``, a number;
@@ -8,13 +8,26 @@ room's mesh beside it as ``<room>.stl``, metres:
 - for each path ``path_gain`` [p] complex and ``path_last_point`` [p, 3], its last interaction point (the
   transmitter's position for the line of sight); receiver i has paths ``path_offsets[i]:path_offsets[i + 1]``.
 
-Here the *receiver* moves. By reciprocity the record's transmitter is that moving end, and its one receiver stands at
-the file's ``tx_pos``.
+The *receiver* of these data moves. By reciprocity the record's transmitter is the moving end, and its receiver stands
+at the file's ``tx_pos``.
+
+Original: ``data/dataset_<room>_ch1_rt_image_fc.pkl`` of https://github.com/LuHaofan/NeWRF, a pickled pandas table that
+their ``simulator/mat2pkl.py`` wrote, one row per receiver. ``TxPos``, ``RxPos`` (m), ``Frequency`` (GHz), ``CSI``,
+``LastXPts`` [3, p], ``RxChanPerRay`` [p, 1] and ``LineOfSight`` are used. Receivers without a path have no numbers and
+are left out, as their ``loaders.py`` does.
+
+Python's pickle calls whatever a file names. Here every name becomes an inert object (`_Named`) that holds its
+arguments: nothing is looked up, imported or called. The columns are rebuilt from these objects, out of NumPy arrays
+of plain numbers. Format: pickle as of Python's ``pickletools``; a ``DataFrame`` as pandas 1.4 and later write it
+(blocks of columns with their indices), arrays as NumPy writes them (``_reconstruct`` up to protocol 4,
+``_frombuffer`` from protocol 5).
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
+import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,20 +36,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
-from ..core.files import one_line
+from ..core.antenna import UPRIGHT
+from ..core.files import one_line, readable, stored_arrays
+from .folder_files import single_file
 
 KEYS = ("tx_pos", "rx_pos", "frequency_hz", "csi", "line_of_sight", "path_offsets", "path_gain", "path_last_point")
 """All arrays of a room's file; a record needs the first four."""
 TEST_FRACTION = 0.2
 """Share of the rows, the last ones, that the authors hold out (their ``DatasetLoader.split_train_val``)."""
+SCALARS = ("TxID", "RxID", "Frequency", "LineOfSight")
+ARRAYS = ("TxPos", "RxPos", "CSI", "LastXPts", "RxChanPerRay")
+LARGEST_BYTES = 64 * 2**20
+"""Largest file that is read."""
+NUMBERS = frozenset("?bBhHiIlLqQefdFD")
+"""Type characters of arrays of plain numbers."""
+PLAIN = (int, float, complex, type(None))
+"""Types of fields beside arrays in a column of objects."""
 
 
 def read_newrf(path: str | Path, name: str | None = None) -> Record:
     """Read and check one room.
 
     Args:
-        path: ``<room>.npz``, or a folder that holds one such file.
-        name: the record's name; the file's own without its ending by default.
+        path: path of ``<room>.npz``, or of a folder with such a file.
+        name: name of the record; by default that of the file without its ending.
 
     Returns:
         A record with ``task="csi"``: ``observation`` [1, n, 1] complex64, ``tx_pos_m`` the file's ``rx_pos``.
@@ -44,7 +67,7 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file, the array and the row.
     """
-    file = room_file(Path(path))
+    file = single_file(Path(path), (".npz",), "one room in .npz")
     arrays = read_arrays(file, KEYS[:4])
     _check(file, arrays)
     n = len(arrays["rx_pos"])
@@ -55,7 +78,7 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
         name=name or file.stem,
         task="csi",
         tx_pos_m=arrays["rx_pos"].astype(float),
-        receivers=(Receiver("access-point", arrays["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0])),),
+        receivers=(Receiver("access-point", arrays["tx_pos"].astype(float), np.array(UPRIGHT)),),
         observation=arrays["csi"].astype(np.complex64)[None, :, None],
         official=(np.arange(n - n_test), np.arange(n - n_test, n)),
         frequencies_hz=np.array([float(arrays["frequency_hz"])]),
@@ -63,23 +86,8 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     )
 
 
-def room_file(path: Path) -> Path:
-    """The one ``.npz`` file of a folder, or the file itself.
-
-    Raises:
-        InputError: none, or several.
-    """
-    if not path.is_dir():
-        return path
-    rooms = sorted(path.glob("*.npz"))
-    if len(rooms) != 1:
-        found = ", ".join(room.name for room in rooms) or "none"
-        raise InputError(f"{path}: one room in .npz is read at a time, found {found}; give the file itself")
-    return rooms[0]
-
-
 def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 (hex) over the arrays of a room: their names, types, shapes and bytes, whatever file holds them."""
+    """SHA-256 (hex) over the names, types, shapes and bytes of a room's arrays."""
     digest = hashlib.sha256()
     for key in KEYS:
         values = np.asarray(arrays[key])
@@ -90,20 +98,12 @@ def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def read_arrays(file: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays of a room's file as they are there.
-
-    Raises:
-        InputError: missing or damaged, or one of the arrays is missing.
-    """
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in keys}
-    except FileNotFoundError:
-        raise InputError(f"{file}: missing; give a room's .npz file") from None
-    except KeyError as error:
-        raise InputError(f"{file}: no array ({one_line(error)}); a room needs {', '.join(keys)}") from None
-    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{file}: not readable as .npz ({one_line(error)}); convert or fetch it again") from None
+    """Some arrays of a room's file; an `InputError` if the file or an array is missing."""
+    with readable(file, f"{file}: missing; give a room's .npz file", "convert or fetch it again"):
+        arrays = stored_arrays(file)
+    if lacking := [key for key in keys if key not in arrays]:
+        raise InputError(f"{file}: no array {lacking[0]}; a room needs {', '.join(keys)}")
+    return {key: arrays[key] for key in keys}
 
 
 def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -120,3 +120,151 @@ def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             raise InputError(f"{file}: {key}, row {bad[0] + 1}: not finite; correct or remove the row")
     if not arrays["frequency_hz"] > 0:
         raise InputError(f"{file}: frequency_hz is {arrays['frequency_hz']}; give the carrier in Hz")
+
+
+def convert_newrf(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a room's ``.npz`` file from the authors' pickle, of which nothing is run.
+
+    Raises:
+        InputError: not their pickle.
+    """
+    columns = read_pickled_table(path)
+    lacking = sorted(set(SCALARS + ARRAYS) - set(columns))
+    if lacking:
+        raise InputError(f"{path}: no column {lacking[0]}; give a data set of NeWRF for a single frequency")
+    try:
+        return _convert(columns)
+    except (ValueError, TypeError, IndexError) as error:
+        raise InputError(f"{path}: not in the form of NeWRF's data ({one_line(error)}); fetch it again") from None
+
+
+def _convert(columns: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    scalars = {key: np.asarray(columns[key], float) for key in SCALARS}
+    rows = np.flatnonzero(np.isfinite(np.stack(list(scalars.values()))).all(axis=0))
+    tx_pos, frequency_ghz = (
+        np.unique(np.stack([np.asarray(values[r], float) for r in rows]), axis=0)
+        for values in (columns["TxPos"], scalars["Frequency"])
+    )
+    if len(tx_pos) != 1 or len(frequency_ghz) != 1:
+        raise ValueError(f"{len(tx_pos)} transmitters and {len(frequency_ghz)} frequencies")
+    gains = [np.asarray(columns["RxChanPerRay"][r], complex).ravel() for r in rows]
+    points = [np.asarray(columns["LastXPts"][r], float).T.reshape(-1, 3) for r in rows]
+    if any(len(g) != len(p) for g, p in zip(gains, points, strict=True)):
+        raise ValueError("a receiver with another number of gains than of points")
+    return {
+        "tx_pos": tx_pos[0].reshape(3),
+        "rx_pos": np.stack([np.asarray(columns["RxPos"][r], float).reshape(3) for r in rows]),
+        "frequency_hz": np.asarray(frequency_ghz[0] * 1e9),
+        "csi": np.concatenate([np.asarray(columns["CSI"][r], complex).reshape(1) for r in rows]),
+        "line_of_sight": scalars["LineOfSight"][rows] > 0,
+        "path_offsets": np.concatenate([[0], np.cumsum([len(g) for g in gains])]),
+        "path_gain": np.concatenate(gains),
+        "path_last_point": np.concatenate(points),
+    }
+
+
+class _Named:
+    """An object named in a pickle, with its arguments and state."""
+
+    name = ""
+    args: tuple[Any, ...]
+    state: Any
+
+    def __new__(cls, *args: Any, **_: Any) -> _Named:
+        made = super().__new__(cls)
+        made.args, made.state = args, None
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> type[_Named]:
+        return type("_Named", (_Named,), {"name": f"{module}.{name}"})
+
+
+def read_pickled_table(path: Path) -> dict[str, list[Any] | NDArray[Any]]:
+    """The columns of a pickled ``DataFrame``: NumPy arrays of numbers, or lists of fields that are arrays.
+
+    Raises:
+        InputError: missing, too large, damaged, or not a table of numbers and arrays of numbers.
+    """
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_BYTES:
+            raise ValueError(f"{size / 2**20:.0f} MiB, where a table has {LARGEST_BYTES // 2**20} at most")
+        with path.open("rb") as stream:
+            return _columns(_Unpickler(stream).load())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({one_line(error)}); fetch it again") from None
+    except Exception as error:  # a damaged or hostile pickle raises nearly every kind
+        raise InputError(f"{path}: not the pickle of a table of numbers ({one_line(error)}); fetch it again") from None
+
+
+def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
+    state = _named(frame, "DataFrame").state
+    manager = _named(state.get("_mgr") if isinstance(state, dict) else None, "BlockManager")
+    blocks, axes = _arguments(manager, 2)
+    _, index = _arguments(_named(axes[0], "_new_Index"), 2)
+    names = _array(index.get("data")) if isinstance(index, dict) else np.zeros(0)
+    if not all(isinstance(name, str) for name in names):
+        raise ValueError("columns without names")
+    columns: dict[str, list[Any] | NDArray[Any]] = {}
+    for block in blocks:
+        values, places, _ = _arguments(_named(block, "_unpickle_block"), 3)
+        rows = _array(values)
+        if _is(places, "slice"):
+            numbers = list(range(*_arguments(places, 3))[: len(rows) + 1])
+        else:
+            numbers = _array(places).tolist()
+        if len(numbers) != len(rows):
+            raise ValueError(f"{len(rows)} columns with {len(numbers)} numbers")
+        for number, row in zip(numbers, rows, strict=True):
+            plain = row.dtype != object
+            columns[names[number]] = row if plain else [f if isinstance(f, PLAIN) else _array(f) for f in row]
+    return columns
+
+
+def _array(described: Any) -> NDArray[Any]:
+    """The NumPy array of a description: by its bytes, or by a list where it holds objects."""
+    if _is(described, "_frombuffer"):
+        data, dtype, shape, order = _arguments(described, 4)
+    else:
+        state = _named(described, "_reconstruct").state
+        if not isinstance(state, tuple) or len(state) != 5:
+            raise ValueError("an array without content")
+        _, shape, dtype, fortran, data = state
+        order = "F" if fortran else "C"
+    code, *_ = _named(dtype, "dtype").args
+    if code == "O8":
+        if not isinstance(data, list):
+            raise ValueError("an array of objects without a list")
+        flat = np.empty(len(data), object)
+        flat[:] = data
+    else:
+        endian = dtype.state[1] if isinstance(dtype.state, tuple) else "|"
+        if endian not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
+            raise ValueError(f"an array of type {code}")
+        if not isinstance(data, bytes | bytearray):
+            raise ValueError("an array of numbers without bytes")
+        flat = np.frombuffer(data, f"{endian}{code}").copy()
+    if math.prod(shape) != len(flat):
+        raise ValueError(f"{len(flat)} values for the shape {shape}")
+    return flat.reshape(shape, order=order)
+
+
+def _is(value: Any, name: str) -> bool:
+    return isinstance(value, _Named) and value.name.rpartition(".")[2] == name
+
+
+def _named(value: Any, name: str) -> _Named:
+    if not _is(value, name):
+        raise ValueError(f"{getattr(value, 'name', type(value).__name__)} where {name} belongs")
+    return value
+
+
+def _arguments(value: _Named, count: int) -> tuple[Any, ...]:
+    if len(value.args) != count:
+        raise ValueError(f"{value.name} of {len(value.args)} arguments")
+    return value.args

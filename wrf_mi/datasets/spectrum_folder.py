@@ -36,28 +36,29 @@ from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
 from ..core.types import IntArray
 from .folder_files import (
-    INDEX_FILES,
     POSITIONS,
     TX_ANTENNA_WORDS,
     antenna_entry,
+    data_folder,
     finite_numbers,
     read_antenna,
     read_official,
-    read_positions_and_carriers,
+    read_positions,
     read_yaml,
     refuse_unstated,
     shown,
     unit_quaternion,
     whole_number,
     write_lines,
+    write_official,
     write_positions,
 )
 
 CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 """Keys under which a file may state carriers."""
-GATEWAYS, TX_ANTENNA = "gateway_info.yml", "tx_antenna"
+GATEWAYS, FOLDS, TX_ANTENNA = "gateway_info.yml", "blocked_folds.txt", "tx_antenna"
 RESERVED = ("array", TX_ANTENNA)
-"""Mappings of the file that are no receivers, so names that no receiver can have."""
+"""Mappings of the file that are no receivers; receivers cannot have these names."""
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -66,8 +67,8 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the NeRF2 spectrum layout (see this module's head).
 
     Args:
-        path: the folder.
-        name: the record's name; the folder's own by default.
+        path: path of the folder.
+        name: name of the record; by default that of the folder.
 
     Returns:
         A record with ``task="spectrum"``, positions [n, 3] in metres and ``observation`` [n_rx, n, height, width]
@@ -76,27 +77,25 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give one that holds {GATEWAYS}, tx_pos.csv and spectrum/")
+    folder = data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
     info = read_yaml(gateways)
     receivers = _receivers(gateways, info, _array(gateways, info, "array"))
-    positions, carriers = read_positions_and_carriers(folder / POSITIONS)
+    positions, carriers = read_positions(folder / POSITIONS)
     stated = _frequency(gateways, info)
     if stated is not None and carriers is not None:
         text = f"line 1: column frequency_hz, but {GATEWAYS} states a carrier too"
         raise InputError(f"{folder / POSITIONS}: {text}; remove one of them")
-    images = folder / "spectrum"
-    places = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
+    images, folds = folder / "spectrum", folder / FOLDS
+    image_folders = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
     record = Record(
         name=name or folder.resolve().name,
         task="spectrum",
         tx_pos_m=positions,
         receivers=receivers,
-        observation=_read_images(places, len(positions)),
+        observation=_read_images(image_folders, len(positions)),
         official=read_official(folder, len(positions), first=1),
-        folds=_read_folds(folder / "blocked_folds.txt", len(positions)),
+        folds=parse_folds(folds, len(positions)) if folds.exists() else None,
         frequencies_hz=stated,
         tx_antenna=read_antenna(gateways, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS),
         source=str(folder),
@@ -111,18 +110,18 @@ def write_spectrum_folder(
     replace: bool = False,
     extra: Mapping[str, str | bytes] | None = None,
 ) -> Path:
-    """Write a record in the NeRF2 spectrum layout; the folder appears complete or not at all.
+    """Write a record atomically in the NeRF2 spectrum layout.
 
     Args:
-        path: the folder to make.
-        record: its ``observation`` [n_rx, n, height, width] must lie in 0..1; it is rounded to grey levels.
-        bits: 8 or 16 per pixel.
-        replace: take the place of an existing folder.
-        extra: further files to put into the folder, by their place in it.
+        path: path of the folder.
+        record: record with ``observation`` [n_rx, n, height, width] in 0..1, which is rounded to grey levels.
+        bits: bits per pixel, 8 or 16.
+        replace: replace an existing folder.
+        extra: content of further files by their paths in the folder.
 
     Raises:
-        InputError: the folder exists, cannot be written, or the record holds no spectra in 0..1, or what the layout
-            does not state: truth, headings, or frequencies of subcarriers.
+        InputError: the folder exists or cannot be written, or the record holds no spectra in 0..1 or values that the
+            layout does not state: truth, headings, or frequencies of subcarriers.
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
@@ -146,16 +145,24 @@ def write_spectrum_folder(
             images.mkdir(parents=True)
             for row, image in enumerate(spectra, start=1):
                 Image.fromarray(image).save(images / f"{row:05d}.png")
-        entries = {receiver.name: _entry(receiver) for receiver in record.receivers}
-        content = {"dataset_name": record.name, **entries, **_instrument(record)}
+        content: dict[str, Any] = {"dataset_name": record.name}
+        for rx in record.receivers:
+            entry = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
+            if antenna := antenna_entry(rx.antenna):
+                entry["antenna"] = antenna
+            if rx.array_m is not None:
+                entry["array"] = {"elements_m": rx.array_m.tolist()}
+            content[rx.name] = entry
+        if antenna := antenna_entry(record.tx_antenna):
+            content[TX_ANTENNA] = antenna
+        if record.frequencies_hz is not None:
+            content["frequency_hz"] = float(record.frequencies_hz[0])
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
         write_positions(part / POSITIONS, record.tx_pos_m, record.carriers_hz)
-        if record.official is not None:
-            for file, index in zip(INDEX_FILES, record.official, strict=True):
-                write_lines(part / file, [f"{row + 1:05d}" for row in index])
+        write_official(part, record, first=1, digits=5)
         if record.folds is not None:
-            write_lines(part / "blocked_folds.txt", [str(fold) for fold in record.folds])
+            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
         for name, data in (extra or {}).items():
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(data.encode() if isinstance(data, str) else data)
@@ -163,16 +170,15 @@ def write_spectrum_folder(
 
 
 def parse_folds(path: Path, rows: int) -> IntArray:
-    """Read the spatial fold of each of ``rows`` rows from a text file with one number per line, shape [rows].
+    """Spatial fold of each row, shape [rows], from a text file with one number per line.
 
     Raises:
-        InputError: a line that is no number, a wrong number of lines, or folds that are not 0, 1, ... in full.
+        InputError: a line that is no number, a wrong number of lines, or folds that are not 0, 1, ... without gaps.
     """
     folds = np.array([whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
     if len(folds) != rows:
         raise InputError(f"{path}: {len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv")
     present = np.unique(folds)
-    # The first number that its place in the sorted ones does not have.
     missing = np.flatnonzero(present != np.arange(len(present)))
     if len(missing) or len(present) < 2:
         what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
@@ -180,50 +186,33 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     return folds
 
 
-def _entry(receiver: Receiver) -> dict[str, Any]:
-    pose = {"position": receiver.position_m.tolist(), "orientation": receiver.orientation_xyzw.tolist()}
-    antenna = antenna_entry(receiver.antenna)
-    elements = {} if receiver.array_m is None else {"array": {"elements_m": receiver.array_m.tolist()}}
-    return pose | ({"antenna": antenna} if antenna else {}) | elements
-
-
-def _instrument(record: Record) -> dict[str, Any]:
-    known: dict[str, Any] = {}
-    if antenna := antenna_entry(record.tx_antenna):
-        known[TX_ANTENNA] = antenna
-    if record.frequencies_hz is not None:
-        known["frequency_hz"] = float(record.frequencies_hz[0])
-    return known
-
-
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
-    """The one carrier of all rows, wherever the file states it: for all receivers, or in the entries of these."""
+    """The carrier [1] of all rows, stated for all receivers or in their entries; None if it is not stated."""
     stated = {key: info[key] for key in CARRIER_KEYS if key in info}
     for name, entry in info.items():
         if isinstance(entry, dict):
             stated |= {f"{name}: {key}": entry[key] for key in CARRIER_KEYS if key in entry}
     carriers: dict[float, str] = {}
     for where, value in stated.items():
-        for one in value if isinstance(value, list) else [value]:
+        for number in value if isinstance(value, list) else [value]:
             try:
-                frequency_hz = float(one)  # YAML reads 920e6 as text
+                frequency_hz = float(number)  # YAML reads 920e6 as text
             except (TypeError, ValueError):
                 frequency_hz = np.nan
             if not 0 < frequency_hz < np.inf:
-                text = f"{one_line(where)} is {shown(value)}; give the carrier in Hz, such as 920e6"
-                raise InputError(f"{path}: {text}")
+                text = f"{one_line(where)} is {shown(value)}"
+                raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
             carriers[frequency_hz] = where
     if len(carriers) > 1:
         (a, first), (b, second) = list(carriers.items())[:2]
         text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
-        raise InputError(
-            f"{path}: {text}; give those of rows in {POSITIONS}, column frequency_hz, or make a folder for each"
-        )
+        remedy = f"give those of rows in {POSITIONS}, column frequency_hz, or make a folder for each"
+        raise InputError(f"{path}: {text}; {remedy}")
     return np.array(list(carriers)) if carriers else None
 
 
 def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
-    """Elements [m, 3] of an entry's ``array``; ``name``: of it, for messages."""
+    """Elements [m, 3] of an entry's ``array``, which messages call ``name``; None if it has none."""
     if "array" not in entry:
         return None
     array = entry["array"]
@@ -242,7 +231,7 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
 
 
 def _receivers(path: Path, info: dict[Any, Any], array_m: FloatArray | None) -> tuple[Receiver, ...]:
-    """Receivers of the file; ``array_m``: array of those that state none of their own."""
+    """Receivers of the file; ``array_m`` is the array of those that state none."""
     poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in RESERVED}
     if not poses:
         raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
@@ -253,39 +242,35 @@ def _receivers(path: Path, info: dict[Any, Any], array_m: FloatArray | None) -> 
         position = finite_numbers(path, f"{name}: position", pose.get("position"), 3)
         orientation = unit_quaternion(path, name, pose.get("orientation"))
         antenna = read_antenna(path, f"{name}: antenna", pose.get("antenna"))
-        own_m = _array(path, pose, f"{name}: array") if "array" in pose else array_m
-        receivers.append(Receiver(name, position, orientation, antenna, own_m))
+        elements_m = _array(path, pose, f"{name}: array") if "array" in pose else array_m
+        receivers.append(Receiver(name, position, orientation, antenna, elements_m))
     return tuple(receivers)
 
 
-def _read_images(places: list[Path], rows: int) -> NDArray[np.float32]:
+def _read_images(folders: list[Path], rows: int) -> NDArray[np.float32]:
     names = [f"{row:05d}.png" for row in range(1, rows + 1)]
-    for place in places:
-        if not place.is_dir():
+    for folder in folders:
+        if not folder.is_dir():
+            text = "images lie in spectrum/, or in spectrum/NAME/ for several receivers"
+            raise InputError(f"{folder}: missing folder; {text}")
+        present = {entry.name for entry in folder.iterdir() if entry.suffix.lower() == ".png"}
+        text = f"{len(present)} images for {rows} rows of tx_pos.csv"
+        if lacking := sorted(set(names) - present):
+            text += f", row {names.index(lacking[0]) + 1} has none"
+            raise InputError(f"{folder / lacking[0]}: missing ({text}); add the image or remove the row")
+        if extra := sorted(present - set(names)):
             raise InputError(
-                f"{place}: missing folder; images lie in spectrum/, or in spectrum/NAME/ for several receivers"
+                f"{folder / extra[0]}: no row belongs to it ({text}); add its position or remove the image"
             )
-        present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
-        lacking = [row for row, name in enumerate(names, start=1) if name not in present]
-        extra = sorted(present - set(names))
-        if lacking:
-            text = f"{len(present)} images for {rows} rows of tx_pos.csv, row {lacking[0]} has none"
-            raise InputError(f"{place / names[lacking[0] - 1]}: missing ({text}); add the image or remove the row")
-        if extra:
-            text = f"{len(present)} images for {rows} rows of tx_pos.csv"
-            raise InputError(f"{place / extra[0]}: no row belongs to it ({text}); add its position or remove the image")
-    observation: NDArray[np.float32] | None = None
-    for receiver, place in enumerate(places):
+    height, width = _read_grey(folders[0] / names[0], 1).shape
+    observation = np.empty((len(folders), rows, height, width), np.float32)
+    for receiver, folder in enumerate(folders):
         for row, name in enumerate(names):
-            grey = _read_grey(place / name, row + 1)
-            if observation is None:
-                observation = np.empty((len(places), rows, *grey.shape), np.float32)
-            if grey.shape != observation.shape[2:]:
-                (height, width), (first_height, first_width) = grey.shape, observation.shape[2:]
-                text = f"{width} x {height} pixels, but the first image has {first_width} x {first_height}"
-                raise InputError(f"{place / name}: row {row + 1}: {text}; give all images one size")
+            grey = _read_grey(folder / name, row + 1)
+            if grey.shape != (height, width):
+                text = f"{grey.shape[1]} x {grey.shape[0]} pixels, but the first image has {width} x {height}"
+                raise InputError(f"{folder / name}: row {row + 1}: {text}; give all images one size")
             observation[receiver, row] = grey
-    assert observation is not None  # there is one receiver and one row at least
     return observation
 
 
@@ -299,7 +284,3 @@ def _read_grey(path: Path, row: int) -> NDArray[np.float32]:
     if mode not in GREY_LEVELS:
         raise InputError(f"{path}: row {row}: image mode {mode}; give a grey PNG of 8 or 16 bits")
     return values.astype(np.float32) / np.float32(GREY_LEVELS[mode])
-
-
-def _read_folds(path: Path, rows: int) -> IntArray | None:
-    return parse_folds(path, rows) if path.exists() else None

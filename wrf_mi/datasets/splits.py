@@ -1,26 +1,25 @@
-"""Which rows train, which choose settings and which score: seeded, nested, stored with the run."""
+"""Splits of rows into training, validation and test: seeded, nested, stored with the run."""
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from scipy.cluster.vq import ClusterError, kmeans2
 
 from ..core import InputError, Record, Split
-from ..core.files import one_line, write_arrays
+from ..core.files import readable, stored_arrays, write_arrays
 from ..core.types import IntArray
 
 SPLIT_NAMES = ("official", "random", "blocked", "trajectory")
 TRAIN_FRACTION = 0.8
-"""Training share of ``random`` and ``trajectory``: that of the authors' split of rfid-lab (160 of 200)."""
+"""Training share of ``random`` and ``trajectory``, as in the authors' split of rfid-lab (160 of 200)."""
 FOLDS = 5
-"""Number of spatial blocks where the data bring none."""
+"""Number of spatial blocks of data without folds."""
 FOLD_SEED = 0
-"""Seed of the spatial blocks: they belong to the data, so a run's own seed leaves them as they are."""
+"""Seed of the spatial blocks, which belong to the data and do not depend on the seed of a run."""
 CLUSTER_STARTS = 10
-"""k-means starts, of which the tightest clusters count; a start that leaves a cluster empty does not."""
+"""Starts of k-means; the tightest clusters without an empty one are used."""
 SPLIT_FORMAT = 1
 """Version of the split file."""
 
@@ -34,26 +33,25 @@ def make_splits(
 ) -> list[Split]:
     """Split a record's rows by one of four rules.
 
-    - ``official``: the rows that came with the data.
+    - ``official``: the split of the data.
     - ``random``: seeded, 80 % train and 20 % test.
-    - ``blocked``: one split per spatial fold, which is its test set; the folds are ``record.folds`` or else five
-      k-means clusters of the positions. ``blocked:2`` is the split of fold 2 alone.
+    - ``blocked``: a split per spatial fold, which is its test set; the folds are ``record.folds`` or else five k-means
+      clusters of the positions. ``blocked:2`` is the split of fold 2 alone.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
 
     Rows that no receiver received (NaN throughout) are in no part of any split. Validation rows are a seeded draw from
-    the training rows. Subsets by ``n_train`` are nested for one seed, and so
-    are their validation rows: a smaller one's are among a larger one's.
+    the training rows. Subsets by ``n_train`` and their validation rows are nested for equal seeds.
 
     Args:
         record: any record with n rows.
         name: ``official``, ``random``, ``blocked``, ``blocked:K`` or ``trajectory``.
-        seed: of the random split, the subset and the validation rows; not of the folds.
-        n_train: training rows to keep, validation rows included: a number, or a fraction (a float up to 1) of what
-            the split has. All by default.
+        seed: seed of the random split, the subset and the validation rows; not of the folds.
+        n_train: number of training rows to keep, validation rows included, or their share (a float up to 1); by default
+            all.
         validation_fraction: share of the kept training rows that is set aside to choose settings, in [0, 1).
 
     Returns:
-        One split, or one per fold for ``blocked``; rows are sorted.
+        A single split, or a split per fold for ``blocked``; rows are sorted.
 
     Raises:
         InputError: an unknown name, a rule that the record cannot follow, a part without any row that was received, or
@@ -63,10 +61,28 @@ def make_splits(
         raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0")
-    return [
-        _finish(f"{record.name}, split {label}", label, train, test, seed, n_train, validation_fraction)
-        for label, train, test in _train_and_test(record, name, seed)
-    ]
+    splits = []
+    for label, train, test in _train_and_test(record, name, seed):
+        what = f"{record.name}, split {label}"
+        for verb, part in (("trains", train), ("scores", test)):
+            if len(part) == 0:
+                raise InputError(f"{what}: no row that was received {verb}; use another split")
+        # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it
+        # is nested in a longer one, validation rows included.
+        order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
+        count = len(order)
+        if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+            count = int(n_train)
+        elif n_train is not None:
+            count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
+        if not 1 <= count <= len(order):
+            raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
+        order = order[:count]
+        # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
+        counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
+        validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
+        splits.append(Split(label, seed, np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)))
+    return splits
 
 
 def save_split(path: str | Path, split: Split) -> None:
@@ -74,30 +90,21 @@ def save_split(path: str | Path, split: Split) -> None:
 
     Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0).
     """
-    arrays = {
-        "format": np.int64(SPLIT_FORMAT),
-        "name": np.str_(split.name),
-        "seed": np.int64(split.seed),
-        "train": split.train,
-        "validation": split.validation,
-        "test": split.test,
-    }
-    write_arrays(Path(path), arrays)
+    parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    facts = {"format": np.int64(SPLIT_FORMAT), "name": np.str_(split.name), "seed": np.int64(split.seed)}
+    write_arrays(Path(path), {**facts, **parts})
 
 
 def load_split(path: str | Path) -> Split:
-    """Read what `save_split` wrote.
+    """Read a file of `save_split`.
 
     Raises:
         InputError: missing, unreadable, of another version, or with a row in two of its parts.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {key: file[key] for key in ("format", "name", "seed", "train", "validation", "test")}
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; give a split.npz of a run folder") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a split file ({one_line(error)}); give a split.npz of a run folder") from None
+    remedy = "give a split.npz of a run folder"
+    with readable(Path(path), f"{path}: missing; {remedy}", remedy):
+        arrays = stored_arrays(Path(path))
+        content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
     if content["format"] != SPLIT_FORMAT:
         raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
     parts = [content[key] for key in ("train", "validation", "test")]
@@ -111,7 +118,7 @@ def load_split(path: str | Path) -> Split:
 
 
 def position_folds(record: Record) -> IntArray:
-    """The spatial fold 0, 1, ... of each row, shape [n]: the record's own, or seeded k-means clusters.
+    """The spatial fold 0, 1, ... of each row, shape [n]: those of the record, or seeded k-means clusters.
 
     Raises:
         InputError: positions are not known, or there are too few distinct ones for five clusters.
@@ -150,7 +157,7 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
         train, test = (part[received[part]] for part in record.official)
-        return [_with_rows(record, name, train, test)]
+        return [(name, train, test)]
     if kind == "blocked":
         folds = position_folds(record)
         count = int(folds.max()) + 1
@@ -160,47 +167,9 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
                 raise InputError(f"split {name!r}: no such fold; {record.name} has blocked:0 to blocked:{count - 1}")
             chosen = range(int(fold), int(fold) + 1)
         of_row = folds[rows]
-        return [_with_rows(record, f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
+        return [(f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [(name, order[:first], order[first:])]
-
-
-def _with_rows(record: Record, label: str, train: IntArray, test: IntArray) -> tuple[str, IntArray, IntArray]:
-    for what, part in (("trains", train), ("scores", test)):
-        if len(part) == 0:
-            raise InputError(f"{record.name}, split {label}: no row that was received {what}; use another split")
-    return label, train, test
-
-
-def _finish(
-    what: str,
-    label: str,
-    train: IntArray,
-    test: IntArray,
-    seed: int,
-    n_train: int | float | None,
-    validation_fraction: float,
-) -> Split:
-    # One seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix
-    # of it is nested in a longer one, validation rows included.
-    order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
-    order = order[: _kept(what, len(order), n_train)]
-    # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
-    counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
-    validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
-    return Split(label, seed, np.sort(order[~validates]), np.sort(order[validates]), np.sort(test))
-
-
-def _kept(what: str, available: int, n_train: int | float | None) -> int:
-    if n_train is None:
-        return available
-    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
-        count = int(n_train)
-    else:
-        count = round(float(n_train) * available) if 0 < n_train <= 1 else 0
-    if not 1 <= count <= available:
-        raise InputError(f"{what}: n_train {n_train}; choose 1 to {available} rows or a fraction in (0, 1]")
-    return count

@@ -1,1 +1,1 @@
-"""From LiDAR to a scene that Mitsuba and Sionna RT both open."""
+"""Scenes for Mitsuba and Sionna RT from LiDAR scans, plans and meshes."""

@@ -1,26 +1,21 @@
-"""From a point cloud to the surfaces of a building."""
+"""Surfaces of a building from a point cloud."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import shapely
-import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.types import IntArray
 from .classify import kinds
-from .corners import join
-from .outline import outline, polygons
+from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
-from .regular import main_heading, regular
-from .shadows import fill_shadows
+from .points import thin
 from .surfaces import KINDS, Surface, number_names
-from .thin import thin
 
 logger = logging.getLogger(__name__)
 
@@ -28,16 +23,20 @@ REACH_M = 0.15
 """Gaps and overlaps up to this are closed where walls, floor and ceiling meet."""
 STRAIGHT_M = 1e-3
 SMALLEST_M2 = 0.05
-"""Smaller planes are not worth a surface."""
+"""Least area of a surface."""
 FEWEST_POINTS = 20
 LEAST_CONTRAST = 2.0
-"""Points are at least this many times denser in a plane than beside it, or it is one by chance."""
+"""Least density of points in a plane relative to the density beside it; chance alignments have less."""
+TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
+"""Bounds of the angle by which planes are turned: a levelled scanner and its registration leave the lower."""
+ERRORS = 3.0
+"""Angle by which planes are turned, in standard errors of their direction."""
 
 
 def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
-    What is not plane (chairs, plants) is left out: a rough skin over it would reflect in directions that
+    Things that are not flat (chairs, plants) are left out: a rough skin over them would reflect in directions that
     nothing measured supports.
 
     Args:
@@ -55,23 +54,26 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     cloud = thin(points)
     planes, noise = find_planes(cloud)
     points = points.astype(np.float32)
-    planes = _refined(planes, points, noise)
     kept: list[Plane] = []
     areas, reach = [], []
-    # A point where two planes meet goes to the larger one, or a shelf would grow along the wall behind it.
+    # A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
     free = np.ones(len(points), bool)
-    for plane in planes:
-        own = np.flatnonzero(near(plane, points, 2 * noise) & free)
-        if len(own) < FEWEST_POINTS:
+    for plane in _refined(planes, points, noise):
+        index = np.flatnonzero(near(plane, points, 2 * noise) & free)
+        if len(index) < FEWEST_POINTS:
             continue
-        area, cell = outline(plane, points[own])
-        if area.area >= SMALLEST_M2 and _contrast(plane, area, points, noise) >= LEAST_CONTRAST:
+        area, cell = outline(plane, points[index])
+        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise)]))
+        inside, beside = np.count_nonzero(away < 2 * noise) / 2, np.count_nonzero(away > 3 * noise) / 3
+        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
             kept.append(plane)
             areas.append(area)
             reach.append(3 * noise + cell)
             free &= ~over(plane, area, points, BAND * noise)
+    if not kept:
+        raise InputError("no plane was found; give a denser scan of a room")
     roles = kinds(kept, areas, float(np.median(cloud.points_m[:, 2])))
-    reach = [own if kind == "other" else max(own, REACH_M) for own, kind in zip(reach, roles, strict=True)]
+    reach = [width if kind == "other" else max(width, REACH_M) for width, kind in zip(reach, roles, strict=True)]
     areas = join(kept, areas, reach)
     things = np.ones(len(cloud.points_m), bool)
     for plane, area, kind in zip(kept, areas, roles, strict=True):
@@ -79,49 +81,61 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
             things &= ~over(plane, area, cloud.points_m, BAND * noise)
     standing = cloud.points_m[things]
     areas = [fill_shadows(*each, standing, noise) for each in zip(kept, areas, roles, strict=True)]
-    areas = join(kept, areas, reach)
+    areas = [shapely.simplify(area, STRAIGHT_M) for area in join(kept, areas, reach)]
     logger.info("%d planes in %d points, noise %.1f mm", len(kept), len(points), 1e3 * noise)
-    areas = [shapely.simplify(area, STRAIGHT_M) for area in areas]
     order = sorted(range(len(kept)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
-    meshes = [_triangulated(kept[i], areas[i]) for i in order]
-    names = number_names([roles[i] for i in order])
-    if not meshes:
-        raise InputError("no plane was found; give a denser scan of a room")
-    return [
-        Surface(name, roles[i], vertices + shift, faces)
-        for name, i, (vertices, faces) in zip(names, order, meshes, strict=True)
-    ]
+    surfaces = []
+    for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
+        vertices, faces = triangulated(areas[i])
+        surfaces.append(Surface(name, roles[i], kept[i].lift(vertices) + shift, faces))
+    return surfaces
 
 
 def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:
-    """Planes fitted to all points, set square where these allow it, with their axes."""
-    own = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
+    """Planes fitted to all points, turned to right angles where these allow it, with their axes."""
+    index = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
     claims = np.zeros(len(points), np.uint8)
-    for index in own:
-        claims[index] += 1
+    for rows in index:
+        claims[rows] += 1
     # Points in the corner of two planes pull both towards the room.
-    sole = [index[claims[index] == 1] for index in own]
-    chosen = [points[s if len(s) > 0.2 * len(o) else o] for s, o in zip(sole, own, strict=True)]
-    weight = [np.ones(len(part)) for part in chosen]
-    fitted = [fit(p, w, plane, noise_m) for p, w, plane in zip(chosen, weight, planes, strict=True)]
-    square = regular(fitted, noise_m)
+    sole = [rows[claims[rows] == 1] for rows in index]
+    chosen = [points[s if len(s) > 0.2 * len(rows) else rows] for s, rows in zip(sole, index, strict=True)]
+    fitted = [fit(part, np.ones(len(part)), plane, noise_m) for part, plane in zip(chosen, planes, strict=True)]
     fitted = [
-        fit(p, w, plane, noise_m, normal=plane.normal) for p, w, plane in zip(chosen, weight, square, strict=True)
+        fit(part, np.ones(len(part)), plane, noise_m, normal=plane.normal)
+        for part, plane in zip(chosen, _regular(fitted, noise_m), strict=True)
     ]
-    heading = main_heading(fitted)
+    # The axes follow the most certain upright plane.
+    heading = next((plane.normal for plane in fitted if abs(plane.normal[2]) < 1e-6), np.array([1.0, 0.0, 0.0]))
     return [with_axes(plane, heading) for plane in fitted]
 
 
-def _contrast(plane: Plane, area: Any, points: FloatArray, noise_m: float) -> float:
-    """How many times denser points are in the plane than beside it."""
-    away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
-    inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
-    return inside / max(beside, 1)
+def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+    """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre.
 
-
-def _triangulated(plane: Plane, area: Any) -> tuple[FloatArray, IntArray]:
-    """Vertices [v, 3] and faces [f, 3] that fill an area."""
-    parts = [trimesh.creation.triangulate_polygon(part, engine="earcut") for part in polygons(area)]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    faces = [np.asarray(f, np.int64) + start for (_, f), start in zip(parts, starts[:-1], strict=True)]
-    return plane.lift(np.concatenate([np.asarray(v, float) for v, _ in parts])), np.concatenate(faces)
+    A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one standard
+    deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real slope stays.
+    """
+    up = np.array([0.0, 0.0, 1.0])
+    headings: list[FloatArray] = []
+    turned = []
+    for plane in planes:
+        side = np.ptp(plane.flat(plane.patches_m.reshape(-1, 3)), axis=0).min()
+        error = max(ERRORS * plane.angle_error_rad, noise_m / max(side, noise_m))
+        tolerance = float(np.clip(error, *TOLERANCE_RANGE_RAD))
+        n = plane.normal
+        if np.arccos(min(abs(n @ up), 1.0)) < tolerance:
+            n = up * np.sign(n @ up)
+        elif np.arcsin(min(abs(n @ up), 1.0)) < tolerance:
+            n = n - up * (n @ up)
+            n = n / np.linalg.norm(n)
+            for heading in headings:
+                pair = np.stack([heading, np.cross(up, heading)])
+                best = pair[np.argmax(np.abs(pair @ n))]
+                if np.arccos(min(abs(best @ n), 1.0)) < tolerance:
+                    n = best * np.sign(best @ n)
+                    break
+            else:
+                headings.append(n)
+        turned.append(replace(plane, normal=n, offset_m=float(n @ plane.centre_m)))
+    return turned

@@ -1,7 +1,7 @@
-"""Scene folders: one room as meshes, materials and a file that Mitsuba and Sionna RT both open.
+"""Scene folders: a room as meshes, materials and a file that Mitsuba and Sionna RT both open.
 
-``scene.xml`` and ``meshes/*.ply`` are the scene, ``materials.yml`` the file to edit, ``scene.yml`` what is known about
-it, ``preview.png`` a picture.
+``scene.xml`` and ``meshes/*.ply`` are the scene, ``materials.yml`` is the file to edit, ``scene.yml`` holds source,
+frame and counts, and ``preview.png`` is a picture.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -20,8 +19,8 @@ from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.files import atomic_folder, one_line, text_lines, write_atomically
+from ..core.files import atomic_folder, one_line, write_atomically
+from ..datasets.folder_files import read_yaml
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .surfaces import Surface
@@ -35,26 +34,11 @@ PREVIEW_FILE = "preview.png"
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """A scene folder that was read.
-
-    Attributes:
-        folder: where it is.
-        xml: its scene file, for ``mi.load_file`` and ``sionna.rt.load_scene``.
-        materials: complete: every rule, surface and thickness.
-        description: one line.
-        frame: axes and origin of the coordinates.
-        source: the file it was made from.
-        registration: 4 x 4 matrix that took the source's frame to the scene's, or None.
-        counts: numbers of surfaces, faces and, of a scan, points.
-    """
+    """Content of a scene folder: scene file for Mitsuba and Sionna RT, complete materials, and counts of its parts."""
 
     folder: Path
     xml: Path
     materials: Materials
-    description: str
-    frame: str
-    source: str
-    registration: FloatArray | None
     counts: Mapping[str, int]
 
     @property
@@ -76,26 +60,26 @@ def write_scene(
     counts: Mapping[str, int] | None = None,
     replace: bool = False,
 ) -> Path:
-    """Write a scene folder whole or not at all.
+    """Write a scene folder atomically.
 
     Args:
-        folder: to make.
-        surfaces: in the scene's frame, metres.
+        folder: path of the folder.
+        surfaces: surfaces in the scene's frame, metres.
         frame: axes and origin of the coordinates, one line.
-        source: the file that the surfaces were made from.
+        source: file that the surfaces were made from.
         materials: rules and exceptions; None takes the default rules.
         registration: 4 x 4 matrix from the source's frame to the scene's that has been applied already, or None.
         description: one line.
         points_m: a sample of the scan [n, 3] or [n, 2] in the scene's frame for the preview.
-        counts: further numbers to state.
-        replace: let it take the place of an existing folder.
+        counts: further numbers for ``scene.yml``.
+        replace: replace an existing folder.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names a surface
-            that is not there.
+        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names an unknown
+            surface.
     """
     from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
 
@@ -128,23 +112,26 @@ def write_scene(
         for surface in surfaces:
             mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
             mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
-        _write(part / XML_FILE, _xml(full))
-        _write(part / MATERIALS_FILE, materials_text(full))
-        _write(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
+        write_atomically(part / XML_FILE, scene_xml(full.by_surface()))
+        write_atomically(part / MATERIALS_FILE, materials_text(full))
+        write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
     return folder
 
 
 def read_scene_folder(folder: str | Path) -> SceneFolder:
-    """Read a scene folder and let ``scene.xml`` follow ``materials.yml``.
+    """Read a scene folder.
 
-    Where the two name different materials, ``scene.xml`` is written anew (and what was added to it by hand is lost).
+    If ``scene.xml`` and ``materials.yml`` name different materials, ``scene.xml`` is written anew; additions by hand
+    are lost.
 
     Raises:
         InputError: a file is missing or damaged, a surface has no mesh, or the scene file cannot be written.
     """
     folder = Path(folder)
-    facts = _facts(folder / FACTS_FILE)
+    facts = read_yaml(folder / FACTS_FILE)
+    if "xml" not in facts:
+        raise InputError(f"{folder / FACTS_FILE}: no xml in it; write the scene anew")
     materials = read_materials(folder / MATERIALS_FILE)
     xml = folder / facts["xml"]
     meshes = {path.stem for path in (folder / "meshes").glob("*.ply")}
@@ -152,40 +139,14 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
         raise InputError(f"{folder}: surface {odd[0]!r} has {which}; write the scene anew")
     full = materials.complete(materials.surfaces)
-    if _materials_in(xml) != {name: full.of(name, "other") for name in full.surfaces}:
+    if _materials_in(xml) != full.by_surface():
         logger.info("%s: materials changed in %s, written anew", xml, MATERIALS_FILE)
         try:
-            write_atomically(xml, _xml(full))
+            write_atomically(xml, scene_xml(full.by_surface()))
         except OSError as error:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
-    registration = facts.get("registration")
-    return SceneFolder(
-        folder=folder,
-        xml=xml,
-        materials=full,
-        description=str(facts["description"]),
-        frame=str(facts["frame"]),
-        source=str(facts["source"]),
-        registration=None if registration is None else np.asarray(registration, float),
-        counts=facts.get("counts", {}),
-    )
-
-
-def _xml(materials: Materials) -> str:
-    return scene_xml({name: materials.of(name, "other") for name in materials.surfaces})
-
-
-def _facts(path: Path) -> dict[str, Any]:
-    try:
-        facts = yaml.safe_load("\n".join(text_lines(path)))
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({one_line(error)})") from None
-    if not isinstance(facts, dict):
-        facts = {}
-    if missing := [key for key in ("description", "frame", "xml", "source") if key not in facts]:
-        raise InputError(f"{path}: no {missing[0]} in it; write the scene anew")
-    return facts
+    return SceneFolder(folder, xml, full, facts.get("counts", {}))
 
 
 def _materials_in(xml: Path) -> dict[str, str]:
@@ -196,7 +157,3 @@ def _materials_in(xml: Path) -> dict[str, str]:
         return {}
     references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in shapes}
     return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")

@@ -1,26 +1,25 @@
-"""From a scan, a plan or a mesh to a scene folder: what the command ``wrf-mi mesh`` does."""
+"""Scene folders from a scan, a plan or a mesh (the command ``wrf-mi mesh``)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
-from .mesh import SUFFIXES, read_mesh
-from .packages import lidar_package
-from .plan_sources import PlanGrid, Row0, read_plan
-from .points import check_extent, read_points
-from .surfaces import Surface, moved, moved_points
+from .plan_sources import PlanGrid, Row0, read_layout, read_plan
+from .points import check_extent, lidar_package, read_points
+from .surfaces import Surface, moved
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
 RIGID = 1e-6
-"""Largest departure of a registration's rotation from orthonormal."""
+"""Largest deviation of a registration's rotation from orthonormal."""
 
 
 def make_scene(
@@ -42,55 +41,60 @@ def make_scene(
 
     Args:
         points_file: a 3D scan, z upwards (`wrf_mi.scene.points.read_points`); a plan in two dimensions
-            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; a mesh with faces, whose
-            triangles are taken as they are.
-        out: folder to make.
-        units: of a scan's or mesh's coordinates: m, cm, mm or ft.
+            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, whose
+            triangles are used as they are.
+        out: path of the folder.
+        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
         materials: rules and exceptions, or a ``materials.yml`` (or scene folder) to read them from.
-        height_m: from floor to ceiling; needed for a plan and for nothing else.
+        height_m: height from floor to ceiling, required for a plan and refused otherwise.
         floor_m: z of a plan's floor.
-        resolution_m: side of a plan's cell, where the file does not tell or tells wrongly.
-        registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None leaves the frame.
-        register_walls_of: a layout file whose walls the scene's walls are to lie on (`wrf_mi.scene.plan.read_walls`,
-            `wrf_mi.scene.register.register_walls`), in place of ``registration``.
+        resolution_m: side of a plan's cell; overrides that of the file.
+        registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.
+        register_walls_of: a layout file (`wrf_mi.scene.plan_sources.read_layout`) to whose walls the scene is
+            registered (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
         positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
             source whose walls they cross, or that they fit better when mirrored, is refused.
-        row_0: side of the plan where the first row of an NPZ grid lies, where the file does not tell or tells wrongly.
-        replace: let the folder take the place of an existing one.
+        row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
+        replace: replace an existing folder.
 
     Returns:
-        The folder, read back.
+        The content of the folder.
 
     Raises:
-        InputError: a file that cannot be read or used, a package that is missing, options that do not fit the
-            source, or a folder that exists.
+        InputError: an unusable file, a missing package, options that do not fit the source, or an existing folder.
     """
     file, out = Path(points_file), Path(out)
     if out.exists() and not replace:
-        # Before a minute's work, not after.
         raise InputError(f"{out}: exists; remove it or choose another folder")
     if isinstance(materials, str | Path):
         materials = read_materials(materials)
     if registration is not None and register_walls_of is not None:
         raise InputError(f"{file}: registration by pairs and to walls: give one of them")
-    matrix = None if registration is None else _rigid(registration)
+    matrix = None if registration is None else np.asarray(registration, float)
+    if matrix is not None:
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+            raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
+        rotation = matrix[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
+            raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     for name in ("shapely", "mapbox_earcut"):
         lidar_package(name)
-    from .plan import read_walls
+    from .plan import layout_walls
     from .positions import check_positions, read_positions, reflections
     from .register import register_walls, wall_points
 
     measured = None if positions is None else read_positions(positions)
-    known_walls = None if register_walls_of is None else read_walls(register_walls_of)
+    known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     surfaces, points, grid = _surfaces(file, units, height_m, floor_m, resolution_m, row_0)
     if known_walls is not None:
         matrix = register_walls(wall_points(surfaces), known_walls, str(file)).matrix
-    counts = {} if points is None else {"points": len(points)}
-    sample = None if points is None else _some(points)
-    placed = surfaces
-    if matrix is not None:
-        placed = moved(surfaces, matrix)
-        sample = None if sample is None else moved_points(sample, matrix)
+    motion = np.eye(4) if matrix is None else matrix
+    placed = moved(surfaces, motion)
+    sample, counts = None, {}
+    if points is not None:
+        # Every k-th point would show the scanner's pattern.
+        chosen = np.random.default_rng(1).integers(len(points), size=min(PREVIEW_POINTS, len(points)))
+        sample, counts = trimesh.transform_points(points[chosen], motion), {"points": len(points)}
     if measured is not None:
         mirrored = reflections(surfaces, file, grid, matrix, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
@@ -116,9 +120,9 @@ def _surfaces(
     resolution_m: float | None,
     row_0: Row0 | None,
 ) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
-    """The surfaces of a source, its points if it is a scan, and its cells if it is an occupancy grid."""
+    """The surfaces of a source, the points of a scan, and the cells of an occupancy grid."""
     from .cloud import surfaces_from_points
-    from .mesh_planes import planes_of_mesh
+    from .mesh import planes_of_mesh, read_mesh
     from .plan import plan_surfaces
 
     if is_plan(file):
@@ -153,32 +157,17 @@ def is_plan(path: str | Path) -> bool:
                 rows = (line.split("#")[0].replace(",", " ").split() for line in stream)
                 return len(next((row for row in rows if row), [])) == 2
     except (OSError, ValueError):
-        return False  # the reader of points says what is wrong with it
+        pass  # the reader of points raises
     return False
 
 
 def _has_faces(file: Path) -> bool:
     """Whether a file is a mesh and not a cloud; PLY may be either."""
-    if file.suffix.lower() not in SUFFIXES or not file.is_file():
-        return False
-    if file.suffix.lower() != ".ply":
-        return True
+    from .mesh import SUFFIXES
+
+    suffix = file.suffix.lower()
+    if suffix != ".ply" or not file.is_file():
+        return suffix in SUFFIXES and file.is_file()
     with file.open("rb") as stream:
         head = stream.read(1 << 16).split(b"end_header")[0].split()
     return b"face" in head and head[head.index(b"face") + 1] != b"0"
-
-
-def _some(points_m: FloatArray) -> FloatArray:
-    """A sample for the preview; every k-th point would show the scanner's pattern."""
-    rng = np.random.default_rng(1)
-    return points_m[rng.integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
-
-
-def _rigid(registration: ArrayLike) -> FloatArray:
-    matrix = np.asarray(registration, float)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
-    rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
-        raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
-    return matrix

@@ -1,47 +1,90 @@
-"""Meshes that others made (CAD, photogrammetry), checked before a ray tracer sees them."""
+"""Meshes of others (CAD, photogrammetry), checked, and split into floor, ceiling, walls and the rest."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 import trimesh
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from ..core import InputError
+from ..core.angles import FloatArray
 from ..core.files import one_line
-from .points import UNITS_M, check_extent
-from .surfaces import Surface
+from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
+from .planes import THICKEST_M, Plane, with_axes
+from .points import UNITS_M, check_extent, source_file
+from .surfaces import KINDS, Kind, Surface, number_names
 
 logger = logging.getLogger(__name__)
 
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
 SMALLEST_FACE_M2 = 1e-10
-"""A face below that is a line or a point: nothing reflects from it, and its normal is noise."""
+"""Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
+SAME_VERTEX_M = 1e-4
+"""Nearer vertices are the same: STL has no shared vertices."""
+FLAT_M = 0.01
+"""Largest distance of the vertices of a facet's triangles from its plane."""
+PARALLEL = np.cos(np.radians(2))
+SMALLEST_M2 = 0.05
+"""Least area of a facet that bounds a room."""
+MOST_FACETS = 400
+"""Facets of a body; the rest of a curved or measured surface stays as it is."""
+INSIDE_M = 0.01
+REACHES = 0.95
+"""Least share of the room's height of a solid that is part of the building: a column, a partition."""
+LAYERS_M = 0.5
+"""Largest distance between both faces of a floor or roof."""
+
+
+@dataclass(frozen=True)
+class _Body:
+    """Triangles [f, 3, 3] that are connected by their edges; a closed body has two faces at every edge.
+
+    The volume is positive where the normals of a closed body point outwards, 0 where they disagree.
+    """
+
+    corners_m: FloatArray
+    closed: bool
+    volume_m3: float
+
+    @property
+    def bounds_m(self) -> FloatArray:
+        """Lowest and highest coordinates, shape [2, 3]."""
+        return np.stack([self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))])
+
+
+@dataclass(frozen=True)
+class _Facet:
+    """A flat part of a body, with the body's number."""
+
+    plane: Plane
+    area: Any
+    corners_m: FloatArray
+    body: int
 
 
 def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
-    """The surfaces of a mesh file, one of kind "other" per body that the file tells apart.
+    """The surfaces of a mesh file, each of kind "other": a surface per body that the file names.
 
-    What does no harm to a ray tracer is mended or left: degenerate faces and second copies of a face are dropped (a
-    copy would count each path twice), and the log says how many. Inverted normals stay, because radio materials act on
-    both sides; so do edges with one, three or more faces, because rays meet triangles and no use is made of
-    inside and outside.
+    Degenerate faces and second copies of a face, which would count each path twice, are dropped (logged). Inverted
+    normals stay, because radio materials act on both sides; so do edges with one, three or more faces.
 
     Args:
         path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with triangles.
-        units: of its coordinates, a key of `wrf_mi.scene.points.UNITS_M`.
+        units: unit of its coordinates, a key of `wrf_mi.scene.points.UNITS_M`.
 
     Raises:
         InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
             finite, or units that look like others.
     """
-    file = Path(path)
-    if units not in UNITS_M:
-        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
-    if not file.is_file():
-        raise InputError(f"{file}: no such file; give a mesh ({', '.join(SUFFIXES)})")
+    file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
     try:
         parts: list[Any] = trimesh.load_scene(str(file), process=False).dump()
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
@@ -56,25 +99,184 @@ def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         if len(bad):
             raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
-        surface = _mended(Surface(name, "other", vertices, np.asarray(part.faces, np.int64)), file)
-        if len(surface.faces):
-            surfaces.append(surface)
+        faces = np.asarray(part.faces, np.int64)
+        solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
+        # Copies may have other vertices: STL has no shared vertices.
+        _, same = np.unique(vertices, axis=0, return_inverse=True)
+        _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
+        for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
+            if count:
+                logger.warning("%s: %d %s faces of %s left out", file, count, what, name)
+        if len(first):
+            surfaces.append(Surface(name, "other", vertices, solid[np.sort(first)]))
     if not surfaces:
         raise InputError(f"{file}: every face is degenerate (no area); export it anew, or give its --units")
     check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
     return surfaces
 
 
-def _mended(surface: Surface, file: Path) -> Surface:
-    """The surface without degenerate and doubled faces."""
-    a, b, c = np.moveaxis(surface.vertices_m[surface.faces], 1, 0)
-    solid = np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2 >= SMALLEST_FACE_M2
-    faces = surface.faces[solid]
-    # Copies may have vertices of their own: STL has no shared ones.
-    _, same = np.unique(surface.vertices_m, axis=0, return_inverse=True)
-    _, first = np.unique(np.sort(same.reshape(-1)[faces], axis=1), axis=0, return_index=True)
-    kept = faces[np.sort(first)]
-    for count, what in ((np.count_nonzero(~solid), "degenerate"), (len(faces) - len(kept), "doubled")):
-        if count:
-            logger.warning("%s: %d %s faces of %s left out", file, count, what, surface.name)
-    return Surface(surface.name, surface.kind, surface.vertices_m, kept)
+def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
+    """The surfaces of a mesh split into floors, ceilings, walls and the rest.
+
+    The roles are those of planes in a scan (`wrf_mi.scene.classify.kinds`). A closed body within another body, such
+    as a cupboard, is furniture unless it reaches from floor to ceiling. The direction of normals has no influence,
+    except that a closed body with inward normals within a body with outward normals, clear of its floor and ceiling,
+    is a
+    cavity: a room in a solid building.
+
+    Args:
+        surfaces: surfaces of a mesh, z upwards, metres.
+
+    Returns:
+        Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.
+    """
+    bodies = [body for surface in surfaces for body in _bodies(surface)]
+    sheets = [sheet for index, body in enumerate(bodies) if (sheet := _slab(body, index)) is not None]
+    slabs = {sheet.body for sheet in sheets}
+    facets = [sheet for sheet in sheets if _large(sheet)]
+    slab_bounds = None
+    if sheets:
+        corners = np.concatenate([sheet.corners_m.reshape(-1, 3) for sheet in sheets])
+        slab_bounds = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    for index, body in enumerate(bodies):
+        if index not in slabs and _bounds_rooms(index, bodies, slabs, slab_bounds):
+            facets += [facet for facet in _facets(body, index) if _large(facet)]
+    if not facets:
+        return list(surfaces)
+    heights = np.concatenate([facet.corners_m[..., 2].ravel() for facet in facets])
+    middle = float(heights.min() + heights.max()) / 2
+    planes, areas = [facet.plane for facet in facets], [facet.area for facet in facets]
+    roles = _both_faces(planes, areas, kinds(planes, areas, middle))
+    if set(roles) == {"other"}:
+        return list(surfaces)
+    parts: list[tuple[Kind, FloatArray]] = []
+    taken: list[set[bytes]] = [set() for _ in bodies]
+    for role, facet in zip(roles, facets, strict=True):
+        if role != "other":
+            parts.append((role, facet.corners_m))
+            taken[facet.body] |= {corners.tobytes() for corners in facet.corners_m}
+    for body, gone in zip(bodies, taken, strict=True):
+        rest = body.corners_m[[corners.tobytes() not in gone for corners in body.corners_m]]
+        if len(rest):
+            parts.append(("other", rest))
+    parts.sort(key=lambda part: (KINDS.index(part[0]), -trimesh.triangles.area(part[1]).sum()))
+    found = []
+    for name, (kind, corners) in zip(number_names([kind for kind, _ in parts]), parts, strict=True):
+        vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+        found.append(Surface(name, kind, vertices, faces.reshape(-1, 3)))
+    return found
+
+
+def _bodies(surface: Surface) -> Iterator[_Body]:
+    corners = surface.vertices_m[surface.faces]
+    grid = np.round(surface.vertices_m / SAME_VERTEX_M)
+    _, first, same = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    faces = same.reshape(-1)[surface.faces]
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, edge = np.unique(edges, axis=0, return_inverse=True)
+    edge = edge.reshape(-1)
+    count = np.bincount(edge)
+    face = np.repeat(np.arange(len(faces)), 3)
+    incidence = sparse.csr_array((np.ones(len(edge)), (face, edge)), shape=(len(faces), len(count)))
+    _, label = connected_components(incidence @ incidence.T, directed=False)
+    unpaired = np.bincount(label, weights=(count[edge] != 2).reshape(-1, 3).any(axis=1))
+    order = np.argsort(label, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        closed = bool(unpaired[label[members[0]]] == 0)
+        volume = 0.0
+        if closed:
+            mesh = trimesh.Trimesh(surface.vertices_m[first], faces[members], process=False)
+            volume = float(mesh.volume) if mesh.is_winding_consistent else 0.0
+        yield _Body(corners[members], closed, volume)
+
+
+def _slab(body: _Body, index: int) -> _Facet | None:
+    """A body that is a sheet or slab as one facet in its middle, or None."""
+    cross = trimesh.triangles.cross(body.corners_m)
+    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
+    normal = normal / np.linalg.norm(normal)
+    away = body.corners_m @ normal
+    if np.ptp(away) > THICKEST_M:
+        return None
+    return _facet(body.corners_m, normal, float(away.min() + away.max()) / 2, index)
+
+
+def _facets(body: _Body, index: int) -> Iterator[_Facet]:
+    """Flat parts of a body, whichever way their normals point."""
+    cross = trimesh.triangles.cross(body.corners_m)
+    size = np.linalg.norm(cross, axis=-1)
+    normals = cross / size[:, None]
+    free = np.ones(len(size), bool)
+    for _ in range(MOST_FACETS):
+        if not free.any():
+            return
+        seed = int(np.argmax(np.where(free, size, 0)))
+        normal = normals[seed]
+        offset = float(body.corners_m[seed].mean(axis=0) @ normal)
+        inside = free & (np.abs(normals @ normal) > PARALLEL)
+        inside[inside] = (np.abs(body.corners_m[inside] @ normal - offset) < FLAT_M).all(axis=-1)
+        inside[seed] = True
+        free &= ~inside
+        yield _facet(body.corners_m[inside], normal, offset, index)
+
+
+def _large(facet: _Facet) -> bool:
+    """Whether a facet may bound a room, by its area and, if it is upright, its height."""
+    low = abs(facet.plane.normal[2]) < UPRIGHT and np.ptp(facet.corners_m[..., 2]) < WALL_SHARE * STOREY_M
+    return facet.area.area >= SMALLEST_M2 and not low
+
+
+def _facet(corners_m: FloatArray, normal: FloatArray, offset_m: float, body: int) -> _Facet:
+    plane = with_axes(Plane(normal, offset_m, corners_m[:, [0, 1, 2, 2]], corners_m.mean(axis=(0, 1)), 0.0))
+    flat = shapely.polygons(plane.flat(corners_m))
+    flat = flat[shapely.area(flat) > 1e-8]
+    return _Facet(plane, shapely.union_all(flat), corners_m, body)
+
+
+def _bounds_rooms(index: int, bodies: Sequence[_Body], slabs: set[int], slab_bounds_m: FloatArray | None) -> bool:
+    """Whether the facets of a body may be floors, ceilings and walls."""
+    body = bodies[index]
+    if not body.closed:
+        return True
+    low, high = body.bounds_m[:, 2]
+    if high - low < STOREY_M:
+        return False
+    others = [other for i, other in enumerate(bodies) if i != index and i not in slabs]
+    around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
+    for other in around:
+        # A cavity is clear of floor and ceiling, furniture is not.
+        floor, ceiling = other.bounds_m[:, 2]
+        clear = low > floor + INSIDE_M and high < ceiling - INSIDE_M
+        if other.closed and body.volume_m3 < 0 < other.volume_m3 and clear:
+            return True
+    outer = [other.bounds_m for other in around]
+    if slab_bounds_m is not None and _within(body.bounds_m, slab_bounds_m):
+        outer.append(slab_bounds_m)
+    return all(high - low >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer)
+
+
+def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:
+    """Whether a box lies within a larger one."""
+    inside = (inner_m[0] > outer_m[0] - INSIDE_M).all() and (inner_m[1] < outer_m[1] + INSIDE_M).all()
+    return bool(inside and np.prod(np.ptp(inner_m, axis=0)) < 0.99 * np.prod(np.ptp(outer_m, axis=0)))
+
+
+def _both_faces(planes: Sequence[Plane], areas: Sequence[Any], roles: Sequence[Kind]) -> list[Kind]:
+    """Roles with both faces of a floor or roof given the same role; a scan sees only one face."""
+    found = list(roles)
+    shadow = [footprint(plane, area) for plane, area in zip(planes, areas, strict=True)]
+    height = [float(np.mean(span(plane, area))) for plane, area in zip(planes, areas, strict=True)]
+    level = [i for i, plane in enumerate(planes) if abs(plane.normal[2]) > PARALLEL]
+    least = least_level_area([planes[i] for i in level], [areas[i] for i in level])
+    for i in level:
+        if areas[i].area < least:
+            continue
+        for j in level:
+            apart, both = abs(height[i] - height[j]), shapely.intersection(shadow[i], shadow[j]).area
+            if i == j or apart > LAYERS_M or both < 0.5 * min(shadow[i].area, shadow[j].area):
+                continue
+            roof = roles[i] == "floor" and roles[j] == "ceiling" and height[i] > height[j]
+            above = any(roles[k] == "ceiling" and height[k] > height[i] + STOREY_M for k in level)
+            if (roles[i] == "other" and roles[j] != "other") or (roof and not above):
+                found[i] = roles[j]
+    return found

@@ -1,74 +1,96 @@
-"""How far a plane reaches: an area with holes from the points that lie in it."""
+"""Extents of planes: areas with holes that their points cover, with shadows filled and corners closed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import shapely
+import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 from shapely import affinity
 
 from ..core.angles import FloatArray
-from .planes import Plane
+from ..core.types import IntArray
+from .planes import Mask, Plane
+from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)
 POINTS_PER_CELL = 8
-"""Cells are as small as gives this many points in the sparse fifth of the area."""
+"""Number of points in the cells of the sparse fifth of the area, which sets the cells' size."""
 SHARE = 0.2
-"""An occupied cell has at least this share of the points of those around it: half of the last cell is on the plane."""
+"""Least number of points of an occupied cell, relative to those around it: half of the last cell is on the plane."""
 EDGE_SHARE = 0.3
 """Share of a cell by which an edge is found too far out: a last cell filled to a share x of `SHARE` to 1 counts, and
 the mean of 1 - x times its chance is 0.32."""
 AROUND_CELLS = 5
 CLOSED_CELLS = 1
 """Gaps of up to twice this many cells are noise."""
-STRAY_SIZE = 0.05
-STRAY_DENSITY = 0.25
-"""A part of an area is a stray where it is smaller than this share of the whole and sparser than this share."""
+STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
+"""A stray part of an area is smaller than this share of the whole and sparser than this share."""
 SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
 RECTANGLE_SHARE = 0.88
-"""An area that fills its tightest rectangle to this share is that rectangle."""
+"""Least share of its tightest rectangle that a rectangular area fills."""
 SCAN_LINES = 31
-
-Mask = NDArray[np.bool_]
+SHADOW_CELL_M = 0.1
+BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
+"""Largest distance from a surface of what hides it: cupboards; tables and lamps."""
+HIDDEN_SHARE = 0.5
+"""Least share of a gap before which something stands, for the gap to be filled."""
+SMALLEST_GAP_M2 = 0.02
+STEEPEST = np.cos(np.radians(20))
+"""Planes that meet at a smaller angle have no reliable line in common."""
+GRID_M = 1e-5
+PASSES = 2
+"""Number of passes over all pairs of planes; the second pass closes the corner of three planes."""
 
 
 def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
-    """The area (shapely, in the plane's coordinates) that its points cover, and the cell it was told with.
-
-    Args:
-        plane: with its axes set.
-        points_m: its points [n, 3], metres.
-    """
+    """The area (shapely, in the plane's coordinates) that points [n, 3] of a plane cover, and the edge of its cells."""
     flat = plane.flat(points_m).astype(float)
-    cell = cell_size(flat)
+    coarse = 0.1
+    _, number = np.unique(np.floor(flat / coarse).astype(int), axis=0, return_counts=True)
+    sparse = np.quantile(number[number > 1], 0.2) if (number > 1).any() else 1.0
+    cell = float(np.clip(coarse * np.sqrt(POINTS_PER_CELL / sparse), *CELL_RANGE_M))
     low = flat.min(axis=0) - (CLOSED_CELLS + 2) * cell
     bins = np.ceil((flat.max(axis=0) - low) / cell).astype(int) + CLOSED_CELLS + 2
     index = ((flat - low) / cell).astype(int)
     count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
-    mask = _without_strays(_clean(_occupied(count), cell), count)
-    area = from_mask(mask, low, cell)
-    return _tidy(area, cell), cell
-
-
-def cell_size(flat_m: FloatArray) -> float:
-    """Edge of the cells that suits the density of points [n, 2], metres."""
-    coarse = 0.1
-    _, count = np.unique(np.floor(flat_m / coarse).astype(int), axis=0, return_counts=True)
-    low = np.quantile(count[count > 1], 0.2) if (count > 1).any() else 1.0
-    return float(np.clip(coarse * np.sqrt(POINTS_PER_CELL / low), *CELL_RANGE_M))
-
-
-def from_mask(mask: Mask, low: FloatArray, cell: float) -> Any:
-    """The area of the marked cells: the union of one rectangle per run."""
+    mask = _covered(count, cell)
+    # One rectangle for each run of marked cells.
     steps = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(steps == 1)
     _, stop = np.nonzero(steps == -1)
     x, y0, y1 = low[0] + row * cell, low[1] + start * cell, low[1] + stop * cell
-    return shapely.union_all(shapely.box(x, y0, x + cell, y1), grid_size=cell * 1e-3)
+    area = shapely.union_all(shapely.box(x, y0, x + cell, y1), grid_size=cell * 1e-3)
+    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
+    # Edges are moved inwards because a cell that the edge crosses counts as a whole.
+    return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
+
+
+def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
+    """The area of a floor, ceiling or wall with its shadows filled: gaps before which things stand.
+
+    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. ``points_m`` [n,
+    3] are those of things alone: floors, ceilings and walls are seen through a gap and do not hide it.
+    """
+    if kind == "other":
+        return area
+    distance = np.abs(plane.distance(points_m))
+    before = (distance > max(0.05, 4 * noise_m)) & (distance < BEFORE_M[kind])
+    flat = plane.flat(points_m[before])
+    filled = [area]
+    for gap in polygons(shapely.difference(shapely.envelope(area), area)):
+        if gap.area < SMALLEST_GAP_M2:
+            continue
+        inside = flat[shapely.contains_xy(gap, flat)]
+        cells = len(np.unique(np.floor(inside / SHADOW_CELL_M), axis=0))
+        if cells * SHADOW_CELL_M**2 >= HIDDEN_SHARE * gap.area:
+            filled.append(gap)
+    return shapely.union_all(filled, grid_size=GRID_M)
 
 
 def polygons(area: Any) -> list[Any]:
@@ -77,28 +99,98 @@ def polygons(area: Any) -> list[Any]:
     return sorted(parts, key=lambda part: -part.area)
 
 
-def _occupied(count: NDArray[Any]) -> Mask:
-    """Cells as full as those that the points around them lie in; a stray beside an edge is not."""
+def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]) -> list[Any]:
+    """Extend or cut areas to the lines where their planes meet.
+
+    Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
+    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
+    coordinates of their planes.
+    """
+    areas = list(areas)
+    for _ in range(PASSES):
+        for i, a in enumerate(planes):
+            for j, b in enumerate(planes):
+                if i != j and abs(a.normal @ b.normal) < STEEPEST:
+                    areas[i] = _end_at(a, areas[i], b, areas[j], min(reach_m[i], reach_m[j]))
+    return areas
+
+
+def _end_at(a: Plane, area: Any, b: Plane, other: Any, reach: float) -> Any:
+    along = np.cross(a.normal, b.normal)
+    along /= np.linalg.norm(along)
+    point = np.linalg.solve(np.stack([a.normal, b.normal, along]), np.array([a.offset_m, b.offset_m, 0.0]))
+
+    def to_line(plane: Plane) -> tuple[FloatArray, FloatArray]:
+        """Transform to coordinates (t, s): t along the line, s away from it."""
+        rows = np.stack([along, np.cross(plane.normal, along)])
+        return rows @ np.stack([plane.u, plane.v], axis=1), rows @ (plane.normal * plane.offset_m - point)
+
+    matrix, shift = to_line(a)
+    turned, other_turned = _transformed(area, matrix, shift), _transformed(other, *to_line(b))
+    stretches = shapely.intersection(
+        shapely.buffer(_stretches(other_turned, reach), reach, cap_style="square"), _stretches(turned, reach)
+    )
+    changed = turned
+    for stretch in polygons(stretches):
+        t0, _, t1, _ = stretch.bounds
+        if t1 - t0 < reach:
+            continue
+        share = [
+            shapely.intersection(turned, shapely.box(t0, s, t1, s + reach)).area / (reach * (t1 - t0))
+            for s in (reach, -2 * reach)
+        ]
+        if (share[0] > 0.25) == (share[1] > 0.25):
+            continue
+        sign = 1 if share[0] > share[1] else -1
+        # The parts of the strip beside the line that the area comes near are filled up to the line.
+        near = [part.bounds for part in polygons(shapely.intersection(turned, _box(t0, t1, 0, sign * reach)))]
+        fill = [_box(max(s[0], t0), min(s[2], t1), 0, sign * max(abs(s[1]), abs(s[3]))) for s in near]
+        cut = _box(t0, t1, 0, -2 * sign * reach)
+        changed = shapely.difference(shapely.union_all([changed, *fill]), cut)
+    return area if changed is turned else _transformed(changed, matrix.T, -matrix.T @ shift)
+
+
+def _stretches(turned: Any, reach: float) -> Any:
+    """Stretches of the line that an area comes near: a union of boxes of unit height."""
+    low, _, high, _ = turned.bounds
+    strip = shapely.intersection(turned, shapely.box(low, -reach, high, reach))
+    return shapely.union_all([_box(part.bounds[0], part.bounds[2], 0, 1) for part in polygons(strip)])
+
+
+def _box(t0: float, t1: float, s0: float, s1: float) -> Any:
+    return shapely.box(t0, min(s0, s1), t1, max(s0, s1))
+
+
+def _transformed(area: Any, matrix: FloatArray, shift: FloatArray) -> Any:
+    """A transformed area on a fine grid: rounding would let edges that touch cross."""
+    return shapely.set_precision(shapely.make_valid(affinity.affine_transform(area, [*matrix.ravel(), *shift])), GRID_M)
+
+
+def triangulated(area: Any) -> tuple[FloatArray, IntArray]:
+    """Vertices [v, 2] and faces [f, 3] that fill an area (shapely)."""
+    parts = [trimesh.creation.triangulate_polygon(part, engine="earcut") for part in polygons(area)]
+    vertices, faces = trimesh.util.append_faces(*zip(*parts, strict=True))
+    return np.asarray(vertices, float), np.asarray(faces, np.int64)
+
+
+def large_parts(mask: Mask, cells: float, structure: NDArray[Any] | None = None) -> Mask:
+    """The connected parts of a mask that have at least a number of cells."""
+    parts, _ = ndimage.label(mask, structure)
+    return mask & (np.bincount(parts.ravel()) >= cells)[parts]
+
+
+def _covered(count: NDArray[Any], cell: float) -> Mask:
+    """Cells that a plane covers, from the number of points in each."""
+    # Cells about as full as those around them; a stray beside an edge is not.
     full = count.astype(float)
     total = ndimage.uniform_filter(full, AROUND_CELLS, mode="constant")
     squares = ndimage.uniform_filter(full * full, AROUND_CELLS, mode="constant")
-    occupied: Mask = count >= np.maximum(2, SHARE * squares / np.maximum(total, 1e-9))
-    return occupied
-
-
-def _clean(mask: Mask, cell: float) -> Mask:
+    mask: Mask = count >= np.maximum(2, SHARE * squares / np.maximum(total, 1e-9))
     disc = np.hypot(*np.mgrid[-CLOSED_CELLS : CLOSED_CELLS + 1, -CLOSED_CELLS : CLOSED_CELLS + 1]) <= CLOSED_CELLS + 0.5
-    mask = ndimage.binary_closing(mask, disc)
-    mask = ndimage.binary_opening(mask, np.ones((2, 2), bool))
-    for inverse, smallest in ((False, SMALLEST_M2), (True, SMALL_HOLE_M2)):
-        label, count = ndimage.label(mask != inverse)
-        size = np.bincount(label.ravel(), minlength=count + 1) * cell * cell
-        mask = mask ^ ((size < smallest)[label] & (label > 0))
-    return mask
-
-
-def _without_strays(mask: Mask, count: NDArray[Any]) -> Mask:
-    """The mask without small sparse parts: what a surface that crosses the plane leaves in it."""
+    mask = ndimage.binary_opening(ndimage.binary_closing(mask, disc), np.ones((2, 2), bool))
+    mask = large_parts(mask, SMALLEST_M2 / cell**2)
+    mask = ~large_parts(~mask, SMALL_HOLE_M2 / cell**2)
+    # Small sparse parts come from surfaces that cross the plane.
     label, parts = ndimage.label(mask)
     if parts < 2:
         return mask
@@ -108,14 +200,8 @@ def _without_strays(mask: Mask, count: NDArray[Any]) -> Mask:
     return mask & ~np.concatenate([[False], stray])[label]
 
 
-def _tidy(area: Any, cell: float) -> Any:
-    """Straight edges, moved inwards because a cell that the edge crosses counts as a whole."""
-    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
-    return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre")
-
-
 def _rectangle(part: Any) -> Any | None:
-    """The rectangle that a polygon is but for noise, or None; its sides are where the polygon's are in the median."""
+    """The rectangle of a polygon that is rectangular but for noise, or None; its sides are medians of the polygon's."""
     for tight in (shapely.envelope(part), part.minimum_rotated_rectangle):
         if part.area < RECTANGLE_SHARE * tight.area:
             continue

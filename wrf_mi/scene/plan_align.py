@@ -1,14 +1,12 @@
-"""Scans of one floor laid on one another, where the sensor stood, and what it saw empty.
+"""Alignment of scans of a floor, the places of their sensor, and the space that it saw empty.
 
-Poses from a robot's own positioning blur a map by decimetres and turn parts of it. Each scan by itself is sharp. So
-scans taken while standing still are put together, each such stop is matched to the map of those before it (correlative
-scan matching: Olson 2009, ICRA), and all are refined against all others. Where the sensor stood need not be known:
-every return was seen, so from there none lies behind another in the same direction.
+Poses of a robot's positioning blur a map by decimetres and turn parts of it. Scans taken while standing still are
+merged into stops, each stop is matched to the map of those before it (correlative scan matching: Olson 2009, ICRA),
+and all are refined against all others. The sensor's place is where no return lies behind another in the same direction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,20 +19,20 @@ from .plan_lines import rotation_2d
 from .plan_sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
 
 STANDING_S = 1.0
-"""Scans that follow one another faster may be of one stop."""
+"""Largest time between successive scans of a stop."""
 SAME_STOP = 0.6
-"""Least match of a scan with the stop before it; two scans of one place match to 0.8 or more."""
+"""Least match of a scan with the stop before it; two scans from the same place match to 0.8 or more."""
 SAME_PLACE = 0.5
-"""Least match of a stop with the map; with less it stays where it was."""
+"""Least match of a stop with the map; with less it keeps its pose."""
 STAYS = 0.2
-"""Least share of a stop's scans that see a cell: what moves and what is noise is seen once."""
+"""Least share of a stop's scans that see a cell: moving things and noise are seen once."""
 POSE_DEVIATION_M, POSE_DEVIATION_RAD = 0.4, np.radians(8)
-"""What a robot's positioning may be off by, one standard deviation; holds back matches with the wrong wall."""
+"""Standard deviations of a robot's positioning; they penalise matches with the wrong wall."""
 POSE_WEIGHT = 0.05
 HIDDEN_SHARE = 0.15
 """Largest share of a scan's returns that may lie behind others as seen from the sensor."""
 BEHIND_M = 0.15
-"""A return this much farther than another one in the same direction lies behind it: more than an edge's slope does."""
+"""Least distance by which a return lies behind another in the same direction, more than the slope of an edge."""
 BEARINGS = 240
 """Directions in which returns hide one another."""
 SECTORS = 36
@@ -45,23 +43,24 @@ ROUNDS = 3
 
 Step = tuple[float, float, float, float]
 """Half-width and step of a search over shifts (metres) and over turns (degrees)."""
-WITHIN_STOP: tuple[Step, ...] = ((0.2, 0.05, 3, 1), (0.04, 0.01, 0.6, 0.2))
+Steps = tuple[Step, ...]
+WITHIN_STOP: Steps = ((0.2, 0.05, 3, 1), (0.04, 0.01, 0.6, 0.2))
 COARSE: Step = (0.6, 0.15, 12, 3)
-FINE: tuple[Step, ...] = ((0.15, 0.05, 3, 1), (0.05, 0.0125, 0.75, 0.25))
-REFINING: tuple[Step, ...] = ((0.1, 0.05, 2, 1), (0.05, 0.0125, 0.5, 0.25))
+FINE: Steps = ((0.15, 0.05, 3, 1), (0.05, 0.0125, 0.75, 0.25))
+REFINING: Steps = ((0.1, 0.05, 2, 1), (0.05, 0.0125, 0.5, 0.25))
 COARSE_POINTS = 120
 
 
 @dataclass(eq=False)
 class _Stop:
-    """Returns seen from one place, in one frame; the pose (x, y, angle) moves them about their middle."""
+    """Returns seen from a place in a common frame; the pose (x, y, angle) moves them about their middle."""
 
     points: FloatArray
     sensor: FloatArray | None
     pose: FloatArray
 
-    def moved(self, points: FloatArray, pose: FloatArray | None = None) -> FloatArray:
-        return _moved(points, self.pose if pose is None else pose, self.points.mean(axis=0))
+    def moved(self, points: FloatArray) -> FloatArray:
+        return _moved(points, self.pose, self.points.mean(axis=0))
 
 
 def _moved(points: FloatArray, pose: FloatArray, middle: FloatArray) -> FloatArray:
@@ -71,14 +70,13 @@ def _moved(points: FloatArray, pose: FloatArray, middle: FloatArray) -> FloatArr
 class _Canvas:
     """Pictures of points in cells of one grid; axes x, y."""
 
-    def __init__(self, xy_m: FloatArray, cell_m: float = POINT_CELL_M) -> None:
-        self.cell = cell_m
+    def __init__(self, xy_m: FloatArray) -> None:
         self.low = xy_m.min(axis=0) - 2 * COARSE[0]
-        self.shape = tuple(np.ceil((xy_m.max(axis=0) + 2 * COARSE[0] - self.low) / cell_m).astype(int) + 1)
+        self.shape = tuple(np.ceil((xy_m.max(axis=0) + 2 * COARSE[0] - self.low) / POINT_CELL_M).astype(int) + 1)
 
     def cells(self, points: FloatArray) -> NDArray[np.intp]:
         """Indices [n, 2], clipped to the picture."""
-        return np.clip(np.floor((points - self.low) / self.cell).astype(int), 0, np.array(self.shape) - 1)
+        return np.clip(np.floor((points - self.low) / POINT_CELL_M).astype(int), 0, np.array(self.shape) - 1)
 
     def image(self, points: FloatArray) -> Mask:
         """Cells that hold a point."""
@@ -88,20 +86,28 @@ class _Canvas:
 
     def closeness(self, image: Mask, deviation_m: float) -> FloatArray:
         """1 in cells of the image, falling with the distance from them as a Gaussian."""
-        away = ndimage.distance_transform_edt(~image) * self.cell
+        away = ndimage.distance_transform_edt(~image) * POINT_CELL_M
         return np.exp(-0.5 * (away / deviation_m) ** 2)
 
     def match(
+        self, field: FloatArray, points: FloatArray, middle: FloatArray, pose: FloatArray, steps: Steps, weight: float
+    ) -> tuple[FloatArray, float]:
+        """The pose near a first one that lays points best on a field, and the mean of the field there."""
+        mean = 0.0
+        for step in steps:
+            pose, mean = self._searched(field, points, middle, pose, step, weight)
+        return pose, mean
+
+    def _searched(
         self, field: FloatArray, points: FloatArray, middle: FloatArray, start: FloatArray, step: Step, weight: float
     ) -> tuple[FloatArray, float]:
-        """The pose near a start that lays points best on a field, and the mean of the field there."""
         reach, pitch, turn, turn_pitch = step
         shifts = np.arange(-reach, reach + 1e-9, pitch)
         shift = np.stack(np.meshgrid(shifts, shifts, indexing="ij"), axis=-1).reshape(-1, 2)
         best, found, mean = -np.inf, start, 0.0
         for angle in start[2] + np.radians(np.arange(-turn, turn + 1e-9, turn_pitch)):
             turned = _moved(points, np.array([start[0], start[1], angle]), middle)
-            at = (turned[None] + shift[:, None] - self.low) / self.cell - 0.5
+            at = (turned[None] + shift[:, None] - self.low) / POINT_CELL_M - 0.5
             value = ndimage.map_coordinates(field, at.reshape(-1, 2).T, order=1).reshape(len(shift), -1).mean(axis=1)
             off = ((start[:2] + shift) ** 2).sum(axis=1) / POSE_DEVIATION_M**2 + (angle / POSE_DEVIATION_RAD) ** 2
             score = value - weight * off
@@ -113,21 +119,17 @@ class _Canvas:
 
 
 def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -> PlanGrid:
-    """A map from scans: cells that were hit, and cells that beams went through.
+    """A map in cells of `POINT_CELL_M`: cells that were hit, and cells that beams went through.
 
     Args:
-        xy_m: returns [n, 2] in one frame, each scan moved by its pose, which may be off by some decimetres.
-        time_s: of each return's scan, shape [n]; equal for the returns of a scan.
-        name: of the source, for errors.
-
-    Returns:
-        Cells of `wrf_mi.scene.plan_sources.POINT_CELL_M`; free ones only where the sensor's place could be told.
+        xy_m: returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres.
+        time_s: time of each return's scan, shape [n].
+        name: name of the source, for errors.
 
     Raises:
-        InputError: see `wrf_mi.scene.plan_sources.grid_from_points`.
+        InputError: as `wrf_mi.scene.plan_sources.grid_from_points`.
     """
-    # Refuses what no grid can be made of before the search.
-    grid_from_points(xy_m, None, name)
+    grid_from_points(xy_m, None, name)  # raises before the search
     canvas = _Canvas(xy_m)
     stops = _stops(xy_m, time_s, canvas)
     _place(stops, canvas)
@@ -137,17 +139,15 @@ def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -
 
 
 def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]:
-    """Scans of one stop laid on the first of them, then all of them where they were on average."""
-    times, scan = np.unique(time_s, return_inverse=True)
+    """Stops: successive scans aligned with the first of them, then moved to their mean pose."""
+    times, number = np.unique(time_s, return_inverse=True)
     groups: list[list[tuple[FloatArray, FloatArray]]] = []
     field, pose = np.zeros(canvas.shape), np.zeros(3)
     for i in range(len(times)):
-        raw = xy_m[scan == i]
+        raw = xy_m[number == i]
         if i and times[i] - times[i - 1] <= STANDING_S:
             middle = raw.mean(axis=0)
-            found = pose
-            for step in WITHIN_STOP:
-                found, mean = canvas.match(field, raw, middle, found, step, 0.0)
+            found, mean = canvas.match(field, raw, middle, pose, WITHIN_STOP, 0.0)
             if mean >= SAME_STOP:
                 pose = found
                 groups[-1].append((raw, _moved(raw, pose, middle)))
@@ -159,31 +159,21 @@ def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]
     for group in groups:
         back = np.median([(raw - moved).mean(axis=0) for raw, moved in group], axis=0)
         scans = [moved + back for _, moved in group]
-        stops.append(_Stop(_lasting(scans, canvas), sensor_of(max(scans, key=len)), np.zeros(3)))
+        # A return of each cell that enough of the scans hit.
+        count, points = np.sum([canvas.image(scan) for scan in scans], axis=0), np.concatenate(scans)
+        cells = canvas.cells(points)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        lasting = first[count[tuple(cells[first].T)] >= max(1, STAYS * len(scans))]
+        stops.append(_Stop(points[lasting], sensor_of(max(scans, key=len)), np.zeros(3)))
     return stops
 
 
-def _lasting(scans: Sequence[FloatArray], canvas: _Canvas) -> FloatArray:
-    """One return of each cell that enough of the scans hit."""
-    count = np.sum([canvas.image(points) for points in scans], axis=0)
-    points = np.concatenate(scans)
-    cells = canvas.cells(points)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    often = count[tuple(cells[first].T)] >= max(1, STAYS * len(scans))
-    return np.asarray(points[first[often]])
-
-
 def sensor_of(scan_m: FloatArray) -> FloatArray | None:
-    """Where the sensor of a scan stood: the place from which the fewest returns lie behind others.
+    """Place [2] of the sensor of a scan [n, 2]: the fewest returns lie behind others; None where too many do
+    everywhere.
 
-    From many places in a convex room all of them are seen; of these it is the one from which they are spread most
-    evenly over the directions, because a sensor turns at a constant rate.
-
-    Args:
-        scan_m: returns [n, 2] of one turn of the sensor.
-
-    Returns:
-        Shape [2], or None where no place sees enough of them.
+    Of places in a convex room that see all returns, it is the place from which they are spread most evenly over the
+    directions, because a sensor turns at a constant rate.
     """
     # Most returns surround the sensor, few come from far away.
     low, high = np.percentile(scan_m, (2, 98), axis=0)
@@ -197,7 +187,7 @@ def sensor_of(scan_m: FloatArray) -> FloatArray | None:
 
 
 def _seen_from(scan_m: FloatArray, place: FloatArray) -> tuple[int, int]:
-    """How many returns lie behind another one as seen from a place, or at it; and how unevenly they are spread."""
+    """Number of returns behind another return, or at the place, and unevenness of their directions."""
     away = scan_m - place
     distance = np.hypot(away[:, 0], away[:, 1])
     turn = np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5
@@ -210,7 +200,7 @@ def _seen_from(scan_m: FloatArray, place: FloatArray) -> tuple[int, int]:
 
 
 def _place(stops: list[_Stop], canvas: _Canvas) -> None:
-    """Poses of stops, from the largest on, each matched to the map of those placed; next is who overlaps it most."""
+    """Match each stop to the map of those placed, the largest stop first, then the stop with the most overlap."""
     rest = sorted(stops, key=lambda s: -len(s.points))
     image = canvas.image(rest.pop(0).points)
     while rest:
@@ -219,32 +209,28 @@ def _place(stops: list[_Stop], canvas: _Canvas) -> None:
         rest.remove(stop)
         middle = stop.points.mean(axis=0)
         some = stop.points[:: max(1, len(stop.points) // COARSE_POINTS)]
-        pose, _ = canvas.match(rough, some, middle, stop.pose, COARSE, POSE_WEIGHT)
-        field = canvas.closeness(image, 0.08)
-        for step in FINE:
-            pose, mean = canvas.match(field, stop.points, middle, pose, step, POSE_WEIGHT)
+        pose, _ = canvas.match(rough, some, middle, stop.pose, (COARSE,), POSE_WEIGHT)
+        pose, mean = canvas.match(canvas.closeness(image, 0.08), stop.points, middle, pose, FINE, POSE_WEIGHT)
         if mean >= SAME_PLACE:
             stop.pose = pose
         image |= canvas.image(stop.moved(stop.points))
 
 
 def _refine(stops: list[_Stop], canvas: _Canvas) -> None:
-    """Each pose once more against the map of all other stops."""
+    """Match each stop to the map of all other stops."""
     count = np.sum([canvas.image(stop.moved(stop.points)) for stop in stops], axis=0)
     for stop in stops:
         count = count - canvas.image(stop.moved(stop.points))
         if count.any():
             field, middle = canvas.closeness(count > 0, 0.07), stop.points.mean(axis=0)
-            pose = stop.pose
-            for step in REFINING:
-                pose, mean = canvas.match(field, stop.points, middle, pose, step, POSE_WEIGHT)
+            pose, mean = canvas.match(field, stop.points, middle, stop.pose, REFINING, POSE_WEIGHT)
             if mean >= SAME_PLACE:
                 stop.pose = pose
         count = count + canvas.image(stop.moved(stop.points))
 
 
 def _voted(stops: list[_Stop], name: str) -> PlanGrid:
-    """Occupied where at least half as many stops hit a cell as looked through it, free elsewhere if any did."""
+    """A cell is occupied if at least half as many stops hit it as look through it, else free if any looks through."""
     clouds = [stop.moved(stop.points) for stop in stops]
     grid = grid_from_points(np.concatenate(clouds), None, name)
     hits, passes = np.zeros(grid.occupied.shape, int), np.zeros(grid.occupied.shape, int)

@@ -1,8 +1,7 @@
-"""Straight runs of occupied cells: the pieces that walls of a plan are made of.
+"""Straight runs of occupied cells, the pieces of a plan's walls.
 
-The direction that most walls share is found first; the plan is turned until it is axis-parallel, and runs are taken
-greedily, the best supported first, along rows and columns. A run is as wide as the blur of the map, so a thick smear
-gives one wall and not many.
+The plan is turned so that the direction of most walls is axis-parallel, and runs are taken greedily, the best supported
+first, along rows and columns. A run is as wide as the blur of the map, so that a thick smear gives a single wall.
 """
 
 from __future__ import annotations
@@ -15,40 +14,34 @@ from scipy import ndimage
 from skimage.transform import hough_line
 
 from ..core.angles import FloatArray
+from .outline import large_parts
 from .plan_sources import Mask, PlanGrid
 
 HALF_WIDTH_M = 0.1
-"""Cells this near to a line support it: half the width of a blurred wall."""
+"""Largest distance of cells that support a line: half the width of a blurred wall."""
 CLEARED_M = 0.2
-"""Cells this near to a run are explained by it and support no other along the same stretch."""
+"""Largest distance of cells that are explained by a run; they support no other run along the same stretch."""
 LARGEST_HOLE_M = 0.25
-"""A hole in a run that is no opening: no door is so narrow."""
+"""Largest hole in a run, narrower than any door."""
 SHORTEST_RUN_M = 0.4
-"""Shorter pieces cannot be told from clutter."""
+"""Least length of a run; shorter pieces may be clutter."""
 FILLED = 0.6
 """Least share of a run's length that holds occupied cells."""
 LARGEST_RISE_M = 0.2
 """Cells that rise by more across a run climb through its window: a wall of another direction."""
 SMALLEST_BLOB_CELLS = 4
-"""Connected occupied cells, fewer of which are stray returns."""
+"""Least number of connected occupied cells; fewer are stray returns."""
 SMALLEST_ROOM_M2 = 1.0
-"""Smaller areas seen empty are gaps that beams went through."""
+"""Least area of a room; smaller free areas are gaps that beams went through."""
 PEAK = 0.1
-"""Part of the sharpness, from its highest down, that counts as its peak."""
+"""Share of the range of the sharpness, from the top, that counts as its peak."""
 DIRECTION_STEP_RAD = np.radians(0.25)
 ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
 class Run:
-    """An axis-parallel piece of wall in a turned plan.
-
-    Attributes:
-        axis: 0 along x (its offset is a y), 1 along y.
-        offset: its place across, metres.
-        start: where it begins along its axis, metres.
-        end: where it ends.
-    """
+    """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1)."""
 
     axis: int
     offset: float
@@ -57,7 +50,7 @@ class Run:
 
     @property
     def length(self) -> float:
-        """Metres."""
+        """Length, metres."""
         return self.end - self.start
 
     @property
@@ -68,36 +61,24 @@ class Run:
 
 
 def without_specks(grid: PlanGrid) -> PlanGrid:
-    """The grid without stray returns, and free only in rooms.
-
-    Beams that slip through a gap or a window say nothing about the walls beside them.
-    """
-    occupied = _large_parts(grid.occupied, SMALLEST_BLOB_CELLS, np.ones((3, 3)))
+    """The grid without stray returns, and free only in rooms, not where beams pass a gap or a window."""
+    occupied = large_parts(grid.occupied, SMALLEST_BLOB_CELLS, np.ones((3, 3)))
     free = ndimage.binary_opening(grid.free, np.ones((2, 2)))
-    return replace(grid, occupied=occupied, free=_large_parts(free, SMALLEST_ROOM_M2 / grid.resolution_m**2))
-
-
-def _large_parts(mask: Mask, cells: float, structure: FloatArray | None = None) -> Mask:
-    """The connected parts of a mask that have at least so many cells."""
-    parts, _ = ndimage.label(mask, structure)
-    return mask & (np.bincount(parts.ravel()) >= cells)[parts]
+    return replace(grid, occupied=occupied, free=large_parts(free, SMALLEST_ROOM_M2 / grid.resolution_m**2))
 
 
 def dominant_direction(occupied: Mask) -> float:
-    """The angle in [0, pi/2) from +x that most straight pieces share, up to quarter turns.
+    """The angle in [0, pi/2) from +x, up to quarter turns, of most straight pieces of a mask [rows, columns].
 
-    It is where the Hough transform is sharpest: the sum of its squares over all offsets of a direction and the one
-    across (Censi, Iocchi & Grisetti 2005, "Scan matching in the Hough domain").
-
-    Args:
-        occupied: shape [rows, columns], rows running with y.
+    There the Hough transform is sharpest: the sum of its squares over all offsets of a direction and its perpendicular
+    (Censi, Iocchi & Grisetti 2005, "Scan matching in the Hough domain"). Rows run with y.
     """
     # A line of direction a has its normal at a + pi/2, which is the angle of the transform.
     quarter = np.arange(0, np.pi / 2, DIRECTION_STEP_RAD)
     normals = np.concatenate([quarter, quarter - np.pi / 2])
     votes, _, _ = hough_line(occupied, theta=normals)
     sharp = np.square(votes.astype(float)).sum(axis=0).reshape(2, -1).sum(axis=0)
-    # The middle of the peak: smears make its very top jump by degrees.
+    # The middle of the peak: its top is uncertain by degrees in smeared plans.
     middle = len(quarter) // 2
     around = np.roll(sharp, middle - int(np.argmax(sharp)))
     weight = np.maximum(around - (sharp.max() - PEAK * np.ptp(sharp)), 0)
@@ -108,9 +89,7 @@ def dominant_direction(occupied: Mask) -> float:
 
 
 def turned(grid: PlanGrid, angle: float) -> PlanGrid:
-    """The grid in axes turned by an angle: what lies along the angle lies along x; coordinates are R(-angle) x."""
-    if angle == 0:
-        return grid
+    """The grid in axes turned by an angle, with coordinates R(-angle) x: the angle's direction becomes x."""
     rotation = rotation_2d(angle)
     step = grid.resolution_m
     rows, columns = grid.occupied.shape
@@ -132,12 +111,7 @@ def rotation_2d(angle: float) -> FloatArray:
 
 
 def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
-    """Axis-parallel runs of occupied cells, the best supported first.
-
-    Args:
-        grid: turned so that walls lie along its axes.
-        shortest_m: shorter runs are left out.
-    """
+    """Axis-parallel runs of occupied cells of a turned grid, the best supported first."""
     step = grid.resolution_m
     half, rim, hole = (max(0, round(m / step)) for m in (HALF_WIDTH_M, CLEARED_M, LARGEST_HOLE_M))
     left = np.pad(grid.occupied, half)
@@ -153,7 +127,7 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
         across, along = np.nonzero(image[first : row + half + 1, begin:end])
         rise = np.polyfit(along, across, 1)[0] * (end - begin) * step
         if abs(rise) > LARGEST_RISE_M:
-            # Left to the next direction.
+            # The next direction may explain it.
             image[first : row + half + 1, begin:end] = False
             continue
         middle = float(np.median(across)) + first

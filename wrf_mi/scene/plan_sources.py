@@ -1,14 +1,11 @@
 """Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices.
 
-Everything that walls are looked for in becomes a `PlanGrid`: cells that a wall may fill, cells that were seen empty,
-and the rest, of which nothing is known. Rows of a `PlanGrid` run with y. Row 0 of a picture, and so of a ROS map, is
-its top (largest y); an NPZ file states which side its row 0 is.
+Walls are found in a `PlanGrid` of occupied, free and unknown cells, whose rows run with y. Row 0 of a picture, and so
+of a ROS map, is its top (largest y); an NPZ file states on which side its row 0 lies.
 """
 
 from __future__ import annotations
 
-import csv
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -16,10 +13,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line, text_lines
+from ..core.files import one_line, stored_arrays, text_lines
+from ..datasets.folder_files import read_columns
 
 Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
@@ -30,9 +29,9 @@ OCCUPIED_PROBABILITY = 0.65
 FREE_PROBABILITY = 0.196
 """A cell less likely than this is free (``free_thresh`` there)."""
 POINT_CELL_M = 0.05
-"""Cells that points are counted in: what is usual for maps of indoor robots."""
+"""Side of the cells that points are counted in, as usual for maps of indoor robots."""
 LARGEST_GRID_CELLS = 4_000_000
-"""100 m x 100 m in cells of 5 cm; more is a slip of units or a stray point far away."""
+"""100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,8 @@ class PlanGrid:
     """A plan in square cells; cell (row, column) has its centre at origin + resolution (column + 1/2, row + 1/2).
 
     Attributes:
-        occupied: something stands there, shape [rows, columns].
-        free: seen empty, same shape; without any free cell nothing is known about openings and hidden places.
+        occupied: cells where something stands, shape [rows, columns].
+        free: cells seen empty, same shape; without any, nothing is known about openings and hidden places.
         resolution_m: side of a cell.
         origin_m: lower left corner, shape [2].
     """
@@ -59,12 +58,7 @@ class PlanGrid:
 
 @dataclass(frozen=True)
 class PlanPoints:
-    """LiDAR returns in a horizontal plane.
-
-    Attributes:
-        xy_m: shape [n, 2].
-        time_s: when the scan of each was taken, shape [n], or None. Returns with the same time are one scan.
-    """
+    """LiDAR returns [n, 2] in a horizontal plane and the times [n] of their scans, equal within a scan, or None."""
 
     xy_m: FloatArray
     time_s: FloatArray | None = None
@@ -73,14 +67,7 @@ class PlanPoints:
 def grid_from_probability(
     probability: ArrayLike, resolution_m: float, row_0: Row0, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
 ) -> PlanGrid:
-    """A grid from the probability that a cell is occupied.
-
-    Args:
-        probability: shape [rows, columns]; NaN where nothing is known.
-        resolution_m: side of a cell.
-        row_0: side of the plan where the first row lies.
-        origin_m: lower left corner of the lower left cell, shape [2].
-        name: of the source, for errors.
+    """A grid from the probability [rows, columns] that a cell is occupied, NaN where that is unknown.
 
     Raises:
         InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
@@ -101,12 +88,7 @@ def grid_from_probability(
 
 
 def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: str = "points") -> PlanGrid:
-    """A grid of the cells that hold points; none is free, since points do not tell what was seen empty.
-
-    Args:
-        xy_m: shape [n, 2].
-        resolution_m: side of a cell, by default `POINT_CELL_M`.
-        name: of the source, for errors.
+    """A grid of the cells that hold points [n, 2]; none is free, since points do not tell what was seen empty.
 
     Raises:
         InputError: no points, or more cells than `LARGEST_GRID_CELLS`.
@@ -116,7 +98,7 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: s
         raise InputError(f"{name}: points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
     if not np.isfinite(xy).all():
         bad = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
-        raise InputError(f"{name}: point {bad} is not finite; leave such points out")
+        raise InputError(f"{name}: point {bad} is not finite; remove such points")
     cell = POINT_CELL_M if resolution_m is None else float(resolution_m)
     # An empty rim keeps every window of the search inside.
     low = (np.floor(xy.min(axis=0) / cell) - 2) * cell
@@ -133,180 +115,31 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: s
     return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
 
 
-def read_plan_arrays(path: Path, resolution_m: float | None = None, row_0: Row0 | None = None) -> PlanGrid | PlanPoints:
-    """A plan in an NPZ file: an occupancy grid or points.
-
-    Grid: ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally ``origin_m`` [2]
-    of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities (log odds of free
-    cells are negative). Points: ``xy_m`` [n, 2], optionally ``time_s`` [n], the same for all returns of a scan.
-
-    Args:
-        path: of the file.
-        resolution_m: side of a cell; wins over the file's.
-        row_0: side of the plan where the first row lies; wins over the file's.
-
-    Raises:
-        InputError: unreadable, neither of both, a grid without a resolution or ``row_0``, or points with ``row_0``.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            content: dict[str, Any] = {key: arrays[key] for key in arrays.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
-    if "log_odds" in content:
-        values = _numbers(content["log_odds"], path, "log_odds")
-        if resolution_m is None:
-            if "resolution_m" not in content:
-                raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
-            resolution_m = float(_numbers(content["resolution_m"], path, "resolution_m").reshape(-1)[0])
-        origin = _numbers(content.get("origin_m", np.zeros(2)), path, "origin_m")
-        if origin.shape != (2,) or not np.isfinite(origin).all():
-            raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
-        row_0 = row_0 or _row_0(content, path)
-        return grid_from_probability(_probability(values), resolution_m, row_0, origin, str(path))
-    if "xy_m" in content:
-        if row_0 is not None:
-            raise _no_rows(path, "it holds points, which have no rows")
-        xy = _numbers(content["xy_m"], path, "xy_m")
-        if xy.ndim != 2 or xy.shape[1] != 2:
-            raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
-        time = _numbers(content["time_s"], path, "time_s") if "time_s" in content else None
-        if time is not None and time.shape != xy.shape[:1]:
-            raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
-        return PlanPoints(xy, time)
-    raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
-
-
-def _row_0(content: dict[str, NDArray[Any]], path: Path) -> Row0:
-    """What an NPZ file states about its first row."""
-    if "row_0" not in content:
-        way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, bottom if the smallest"
-        raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
-    stated = content["row_0"]
-    word = str(stated.astype(str).reshape(-1)[0]).strip().lower() if stated.size == 1 else str(stated.tolist())
-    for side in get_args(Row0):
-        if word == side:
-            return side
-    raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
-
-
-def _no_rows(path: Path, why: str) -> InputError:
-    return InputError(f"{path}: --row-0 is for an occupancy grid in an NPZ file, and {why}; leave it out")
-
-
-def _numbers(values: NDArray[Any], path: Path, key: str) -> FloatArray:
-    if values.dtype.kind not in "biuf":
-        raise InputError(f"{path}: {key} holds no numbers but {values.dtype}")
-    return values.astype(float)
-
-
-def _probability(values: FloatArray) -> FloatArray:
-    """Probabilities from log odds, or what are probabilities already."""
-    known = values[~np.isnan(values)]
-    if not known.size or (known.min() >= 0 and known.max() <= 1):
-        return values
-    return 1 / (1 + np.exp(-np.clip(values, -50, 50)))
-
-
-def read_plan_picture(path: Path, resolution_m: float | None = None) -> PlanGrid:
-    """A map as a grey picture, dark where occupied: PGM or PNG, with the YAML file of a ROS map beside it or without.
-
-    The YAML file has the picture's name or is given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw],
-    ``negate`` (https://wiki.ros.org/map_server); the yaw has to be zero. Its thresholds are not used. The first row is
-    the top of the plan, and the origin its lower left corner, as the format defines them.
-
-    Raises:
-        InputError: unreadable, no resolution, or a turned origin.
-    """
-    from PIL import Image
-
-    facts: dict[str, Any] = {}
-    sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
-    if sheet.is_file():
-        try:
-            facts = yaml.safe_load("\n".join(text_lines(sheet)))
-            path = sheet.parent / facts["image"] if path == sheet else path
-            origin = np.array(facts["origin"][:2], float)
-            yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
-            resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
-        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{sheet}: not the YAML of a ROS map ({one_line(error)}); it needs image, resolution, origin"
-            ) from None
-        if yaw:
-            raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
-    else:
-        origin = np.zeros(2)
-    if resolution_m is None:
-        raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
-    try:
-        with Image.open(path) as picture:
-            grey = np.asarray(picture.convert("L"), float) / 255
-    except OSError as error:
-        raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
-    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
-
-
-def read_plan_text(path: Path) -> PlanPoints:
-    """Points in a text file with two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
-
-    Raises:
-        InputError: a row has not two numbers.
-    """
-    rows = []
-    for number, line in enumerate(text_lines(path), 1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            rows.append(_pair(words, path, number))
-    if not rows:
-        raise InputError(f"{path}: no points; give rows x y in metres")
-    return PlanPoints(np.array(rows))
-
-
-def read_layout(path: str | Path) -> FloatArray:
-    """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
-
-    Raises:
-        InputError: missing file, header or number, or no wall in it.
-    """
-    path = Path(path)
-    rows = list(csv.reader(text_lines(path)))
-    if not rows or [word.strip().lower() for word in rows[0]] != ["x", "y"]:
-        raise InputError(f"{path}: line 1: the header is not x,y; a layout lists consecutive wall vertices in metres")
-    vertices = np.array([_pair(row, path, number) for number, row in enumerate(rows[1:], 2)]).reshape(-1, 2)
-    if not np.any(np.diff(vertices, axis=0)):
-        raise InputError(f"{path}: no wall; give at least two different vertices")
-    return vertices
-
-
-def _pair(words: list[str], path: Path, number: int) -> tuple[float, float]:
-    try:
-        x, y = (float(word) for word in words)
-        if not np.isfinite([x, y]).all():
-            raise ValueError("not finite")
-    except ValueError:
-        raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}") from None
-    return x, y
-
-
 def read_plan(
     path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None
 ) -> PlanGrid | PlanPoints | FloatArray:
-    """Any file that shows a plan, told by its ending and its content.
+    """Any file that shows a plan, recognised by its ending and its content.
 
-    ``.npz`` with ``log_odds`` or ``xy_m``; ``.png``, ``.pgm``, ``.yaml`` (ROS map); ``.csv`` with the header ``x,y``
-    (wall vertices); ``.xyz`` or ``.txt`` with two columns.
+    - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
+      ``origin_m`` [2] of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities
+      (log odds of free cells are negative).
+    - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
+    - ``.png``, ``.pgm``: a grey picture, dark where occupied, with or without the ``.yaml`` of a ROS map beside it,
+      which may be given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw], ``negate``
+      (https://wiki.ros.org/map_server). The yaw has to be zero; its thresholds are not used.
+    - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
+    - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
     Args:
-        path: of the file.
-        resolution_m: side of a cell of a grid; wins over what the file says.
-        row_0: side of the plan where the first row of an NPZ grid lies; wins over what the file says.
+        path: path of the file.
+        resolution_m: side of a cell of a grid; overrides that of the file.
+        row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
 
     Returns:
         A grid, points, or wall vertices [n, 2].
 
     Raises:
-        InputError: see the readers.
+        InputError: missing, unreadable or incomplete, or ``row_0`` for a file whose format fixes it.
     """
     path = Path(path)
     if not path.is_file():
@@ -317,11 +150,117 @@ def read_plan(
         raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
     match suffix:
         case ".npz":
-            return read_plan_arrays(path, resolution_m, row_0)
+            return _read_arrays(path, resolution_m, row_0)
         case ".png" | ".pgm" | ".yaml" | ".yml":
-            return read_plan_picture(path, resolution_m)
+            return _read_picture(path, resolution_m)
         case ".csv":
             return read_layout(path)
         case ".xyz" | ".txt":
-            return read_plan_text(path)
+            return _read_text(path)
     raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .yaml, .csv or .xyz")
+
+
+def read_layout(path: str | Path) -> FloatArray:
+    """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
+
+    Raises:
+        InputError: missing file, header or number, or no wall in it.
+    """
+    vertices = read_columns(Path(path), "x,y")
+    if not np.any(np.diff(vertices, axis=0)):
+        raise InputError(f"{path}: no wall; give at least two different vertices")
+    return vertices
+
+
+def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid | PlanPoints:
+    try:
+        content = stored_arrays(path)
+    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
+        raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
+    numbers = {}
+    for key in ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s"):
+        if key in content and content[key].dtype.kind not in "biuf":
+            raise InputError(f"{path}: {key} holds no numbers but {content[key].dtype}")
+        if key in content:
+            numbers[key] = content[key].astype(float)
+    if "log_odds" in numbers:
+        if resolution_m is None:
+            if "resolution_m" not in numbers:
+                raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
+            resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
+        origin = numbers.get("origin_m", np.zeros(2))
+        if origin.shape != (2,) or not np.isfinite(origin).all():
+            raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
+        values = numbers["log_odds"]
+        known = values[~np.isnan(values)]
+        if known.size and (known.min() < 0 or known.max() > 1):
+            values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+        if row_0 is None:
+            if "row_0" not in content:
+                way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
+                raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
+            stated = content["row_0"]
+            word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
+            row_0 = next((side for side in get_args(Row0) if side == word.strip().lower()), None)
+            if row_0 is None:
+                text = f"row_0 is {one_line(word)[:40]!r}"
+                raise InputError(f"{path}: {text}; give top (largest y) or bottom (smallest y)")
+        return grid_from_probability(values, resolution_m, row_0, origin, str(path))
+    if "xy_m" in numbers:
+        if row_0 is not None:
+            raise _no_rows(path, "it holds points, which have no rows")
+        xy, time = numbers["xy_m"], numbers.get("time_s")
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
+        if time is not None and time.shape != xy.shape[:1]:
+            raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
+        return PlanPoints(xy, time)
+    raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
+
+
+def _no_rows(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: --row-0 is for an occupancy grid in an NPZ file, and {why}; leave it out")
+
+
+def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
+    facts: dict[str, Any] = {}
+    origin = np.zeros(2)
+    sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
+    if sheet.is_file():
+        try:
+            facts = yaml.safe_load("\n".join(text_lines(sheet)))
+            path = sheet.parent / facts["image"] if path == sheet else path
+            origin = np.array(facts["origin"][:2], float)
+            yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
+            resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
+        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+            text = f"not the YAML of a ROS map ({one_line(error)})"
+            raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
+        if yaw:
+            raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
+    if resolution_m is None:
+        raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
+    try:
+        with Image.open(path) as picture:
+            grey = np.asarray(picture.convert("L"), float) / 255
+    except OSError as error:
+        raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
+    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
+
+
+def _read_text(path: Path) -> PlanPoints:
+    rows = []
+    for number, line in enumerate(text_lines(path), 1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            try:
+                x, y = (float(word) for word in words)
+                if not np.isfinite([x, y]).all():
+                    raise ValueError("not finite")
+            except ValueError:
+                text = f"line {number}: expected two numbers x, y, found {' '.join(words)!r}"
+                raise InputError(f"{path}: {text}") from None
+            rows.append((x, y))
+    if not rows:
+        raise InputError(f"{path}: no points; give rows x y in metres")
+    return PlanPoints(np.array(rows))

@@ -1,48 +1,69 @@
-"""Wall segments of a plan: runs of every direction the plan shows, corners joined, clutter left out."""
+"""Walls of a plan: runs of every direction that the plan shows, merged and extended, corners joined, clutter left out.
+
+Rules for the runs, each checked in the grid: a run is seen from a room; collinear runs with nothing seen empty between
+them are a single wall; a run close before a longer run, with nothing seen empty between the two, is the front of
+furniture along the wall; a wall that ends where something stands before it continues behind it up to the next wall
+across. Where no cell is known to be free (points without scans) only narrow gaps are closed and nothing is called
+furniture.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import shapely
+from scipy import ndimage
 from scipy.sparse.csgraph import connected_components
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .plan_lines import CLEARED_M, dominant_direction, find_runs, rotation_2d, turned, without_specks
-from .plan_sources import PlanGrid
-from .plan_tidy import tidy
+from .plan_lines import CLEARED_M, HALF_WIDTH_M, Run, dominant_direction, find_runs, rotation_2d, turned, without_specks
+from .plan_sources import Mask, PlanGrid
 
 REACH_M = 0.35
-"""Ends are moved by no more to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open."""
+"""Largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open."""
 SHORTEST_LOOSE_M = 0.8
 """A shorter piece has to meet other walls at both ends: legs of tables and chairs do not."""
 SHORTEST_GROUP_M = 2.0
-"""Walls that touch one another and together are shorter than this, apart from all others, are things in the room."""
+"""Total length of walls that touch; shorter groups apart from all others are things in the room."""
 MOST_DIRECTIONS = 4
 SHORTEST_OBLIQUE_M = 1.0
-"""Walls in other than the plan's main directions are looked for in what those leave; smears leave short pieces."""
+"""Least length of runs in the secondary directions: smears leave short pieces."""
 TOUCHING_M = 0.05
 LEAST_ANGLE_RAD = np.radians(20)
-"""Walls at a smaller angle are no corner."""
+"""Least angle of a corner."""
+SAME_WALL_M = 0.25
+"""Largest distance of parallel runs of the same wall: the blur of a map, or a partition's two faces."""
+SAME_LINE_M = 0.15
+"""Largest difference in offset of collinear runs."""
+NARROW_GAP_M = 0.5
+"""Largest gap that is closed where free space is unknown: narrower than any door (0.6 m)."""
+HIDDEN_GAP_M = 3.0
+"""Longest hidden stretch of a wall."""
+FURNITURE_DEPTH_M = 0.7
+"""Depth of wardrobes, kitchens and sofas along a wall, 0.6 m and a margin."""
+BESIDE_M = 0.4
+"""Largest distance of free space from a wall that was seen; between them lies the blur of the map."""
+SEEN_SHARE = 0.3
+"""Least share of a run beside free space; other runs were seen through windows and mirrors."""
+MOST_ROUNDS = 4
+"""Extending a wall uncovers furniture before it, and removing that lets another wall be extended."""
+HIDING_SHARE = 0.7
+"""Least covered share of a hidden stretch or a furniture front."""
+FREE_SHARE = 0.1
+"""Largest share of a stretch with free cells that is attributed to noise."""
 
 
 def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
-    """Straight walls of a plan.
+    """Straight walls of a plan: end points [n, 2, 2] in metres, the longest wall first.
 
-    The main direction comes from the data, and walls along and across it are taken first. What they leave may show
-    further directions; a plan without right angles is made of those.
-
-    Args:
-        grid: where things stand, and where free space was seen if that is known.
-        name: of the source, for errors.
-
-    Returns:
-        End points [n, 2, 2] in metres, the longest wall first.
+    Walls along and across the main direction are taken first; the remaining cells may show further directions.
 
     Raises:
-        InputError: no wall was found.
+        InputError: no wall was found; the message begins with ``name``.
     """
     grid = without_specks(grid)
     left, found = grid, []
@@ -54,34 +75,25 @@ def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
         runs = find_runs(view) if pass_ == 0 else find_runs(view, SHORTEST_OBLIQUE_M)
         if not runs:
             break
-        # What hides a wall may already have been explained by another direction.
-        walls = [run.ends_m @ rotation_2d(angle).T for run in tidy(runs, turned(grid, angle))]
+        # Things that hide a wall may already have been explained by another direction: the rules use the whole grid.
+        walls = [run.ends_m @ rotation_2d(angle).T for run in _tidy(runs, turned(grid, angle))]
         pieces = [run.ends_m @ rotation_2d(angle).T for run in runs]
         found += walls
-        left = _unexplained(left, np.array(pieces + walls))
+        # The occupied cells that lie at these walls are explained.
+        lines = shapely.STRtree(shapely.linestrings(np.array(pieces + walls)))
+        cells = shapely.points(left.centres_m(left.occupied))
+        near, occupied = lines.query(cells, predicate="dwithin", distance=CLEARED_M)[0], left.occupied.copy()
+        row, column = np.nonzero(occupied)
+        occupied[row[near], column[near]] = False
+        left = without_specks(replace(left, occupied=occupied))
     if not found:
         raise InputError(f"{name}: no straight wall was found; is the resolution right, and is it a plan of walls?")
     walls_m = _without_clutter(joined(np.array(found)))
     return walls_m[np.argsort(-np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=-1), kind="stable")]
 
 
-def _unexplained(grid: PlanGrid, walls_m: FloatArray) -> PlanGrid:
-    """The grid without the occupied cells that lie at walls."""
-    row, column = np.nonzero(grid.occupied)
-    lines = shapely.STRtree(shapely.linestrings(walls_m))
-    near = lines.query(shapely.points(grid.centres_m(grid.occupied)), predicate="dwithin", distance=CLEARED_M)[0]
-    occupied = grid.occupied.copy()
-    occupied[row[near], column[near]] = False
-    return without_specks(replace(grid, occupied=occupied))
-
-
 def joined(walls_m: FloatArray, reach_m: float = REACH_M) -> FloatArray:
-    """Walls whose ends are moved, along the wall, to where it meets another one nearby.
-
-    Args:
-        walls_m: end points [n, 2, 2].
-        reach_m: the longest way an end is moved, and the farthest the other wall may be from there.
-    """
+    """Walls [n, 2, 2] whose ends are moved, along the wall, to where it meets another wall within ``reach_m``."""
     result = walls_m.copy()
     along = walls_m[:, 1] - walls_m[:, 0]
     length = np.linalg.norm(along, axis=-1)
@@ -92,14 +104,14 @@ def joined(walls_m: FloatArray, reach_m: float = REACH_M) -> FloatArray:
         safe = np.where(corner, sine, 1.0)
         # Where line i meets line j: distance from the start of i along i, and from the start of j along j.
         between = walls_m[:, 0] - walls_m[i, 0]
-        own = _cross(between, unit) / safe
+        here = _cross(between, unit) / safe
         other = _cross(between, unit[i]) / safe
         beyond = np.maximum(np.maximum(-other, other - length), 0)
-        for end, here in enumerate((0.0, length[i])):
-            way = np.where(corner & (beyond <= reach_m), np.abs(own - here), np.inf)
+        for end, at in enumerate((0.0, length[i])):
+            way = np.where(corner & (beyond <= reach_m), np.abs(here - at), np.inf)
             nearest = int(np.argmin(way))
             if way[nearest] <= reach_m:
-                result[i, end] = walls_m[i, 0] + own[nearest] * unit[i]
+                result[i, end] = walls_m[i, 0] + here[nearest] * unit[i]
     return result[np.linalg.norm(result[:, 1] - result[:, 0], axis=-1) > TOUCHING_M]
 
 
@@ -122,3 +134,149 @@ def _without_clutter(walls_m: FloatArray) -> FloatArray:
     _, group = connected_components(touching.any(axis=1), directed=False)
     total = np.bincount(group, length)
     return np.asarray(walls_m[total[group] >= min(SHORTEST_GROUP_M, total.max())])
+
+
+@dataclass(frozen=True)
+class _Strips:
+    """Bands of a turned grid that run along an axis."""
+
+    grid: PlanGrid
+
+    @cached_property
+    def hiding(self) -> Mask:
+        """Cells near enough to an occupied cell for furniture to hide them; in a corner it is a diagonal away."""
+        away = ndimage.distance_transform_edt(~self.grid.occupied) * self.grid.resolution_m
+        return np.asarray(away <= np.sqrt(2) * FURNITURE_DEPTH_M)
+
+    def share(self, mask: Mask, axis: int, across: tuple[float, float], along: tuple[float, float]) -> float:
+        """Share of a band's length where the mask is set somewhere across it; 0 for a band outside the grid."""
+        step, origin = self.grid.resolution_m, self.grid.origin_m
+        image = mask if axis == 0 else mask.T
+        low, high = ((v - origin[1 - axis]) / step for v in sorted(across))
+        begin, end = ((v - origin[axis]) / step for v in along)
+        rows = slice(max(0, int(np.floor(low))), max(0, int(np.ceil(high))))
+        band = image[rows, max(0, round(begin)) : max(0, round(end))]
+        return float(band.any(axis=0).mean()) if band.size else 0.0
+
+    def free_between(self, a: Run, b: Run, along: tuple[float, float]) -> float:
+        """Share of a stretch where free cells lie between two parallel runs, without their smears."""
+        low, high = sorted((a.offset, b.offset))
+        margin = min(HALF_WIDTH_M, (high - low) / 2)
+        return self.share(self.grid.free, a.axis, (low + margin, high - margin), along)
+
+    def on_line(self, mask: Mask, axis: int, offset: float, along: tuple[float, float]) -> float:
+        """Share of a stretch of a line where the mask is set."""
+        half = self.grid.resolution_m / 2
+        return self.share(mask, axis, (offset - half, offset + half), along)
+
+
+def _tidy(runs: Sequence[Run], grid: PlanGrid) -> list[Run]:
+    """Walls from runs of the same turned grid."""
+    strips = _Strips(grid)
+    knows_free = bool(grid.free.any())
+    if knows_free:
+        beside = [(run.offset - BESIDE_M, run.offset + BESIDE_M) for run in runs]
+        shares = [strips.share(grid.free, r.axis, b, (r.start, r.end)) for r, b in zip(runs, beside, strict=True)]
+        runs = [run for run, share in zip(runs, shares, strict=True) if share >= SEEN_SHARE]
+    walls = _bridged(_merged(runs, strips), strips, knows_free)
+    if knows_free:
+        walls = _without_fronts(walls, strips)
+        for _ in range(MOST_ROUNDS):
+            before, walls = walls, _without_fronts(_extended(walls, strips), strips)
+            if walls == before:
+                break
+    return walls
+
+
+def _merged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+    """Parallel runs of the same smear merged, at the offset of the longest."""
+    walls: list[Run] = []
+    for run in sorted(runs, key=lambda r: -r.length):
+        for i, wall in enumerate(walls):
+            apart = abs(wall.offset - run.offset)
+            begin, end = max(wall.start, run.start), min(wall.end, run.end)
+            if wall.axis != run.axis or apart > SAME_WALL_M or end - begin < run.length / 2:
+                continue
+            if strips.free_between(wall, run, (begin, end)) > FREE_SHARE:
+                continue
+            walls[i] = replace(wall, start=min(wall.start, run.start), end=max(wall.end, run.end))
+            break
+        else:
+            walls.append(run)
+    return walls
+
+
+def _bridged(runs: Sequence[Run], strips: _Strips, knows_free: bool) -> list[Run]:
+    """Collinear runs merged where the gap between them is no opening."""
+    walls = sorted(runs, key=lambda r: -r.length)
+    i = 0
+    while i < len(walls):
+        partner = next((b for b in walls[i + 1 :] if _same_wall(walls[i], b, strips, knows_free)), None)
+        if partner is None:
+            i += 1
+            continue
+        a = walls[i]
+        offset = (a.offset * a.length + partner.offset * partner.length) / (a.length + partner.length)
+        walls[i] = Run(a.axis, offset, min(a.start, partner.start), max(a.end, partner.end))
+        walls.remove(partner)
+        i = 0
+    return walls
+
+
+def _same_wall(a: Run, b: Run, strips: _Strips, knows_free: bool) -> bool:
+    if a.axis != b.axis or abs(a.offset - b.offset) > SAME_LINE_M:
+        return False
+    begin, end = min(a.end, b.end), max(a.start, b.start)
+    gap = end - begin
+    if gap <= 0:
+        return True
+    if not knows_free:
+        return gap <= NARROW_GAP_M
+    free = strips.on_line(strips.grid.free, a.axis, (a.offset + b.offset) / 2, (begin, end))
+    return gap <= min(HIDDEN_GAP_M, a.length + b.length) and free <= FREE_SHARE
+
+
+def _without_fronts(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+    """Runs without those that stand before a longer parallel run with nothing free between them."""
+    kept = sorted(runs, key=lambda r: r.length)
+    for run in tuple(kept):
+        covered = np.zeros(max(1, round(run.length / strips.grid.resolution_m)), bool)
+        for wall in kept:
+            near = 0 < abs(wall.offset - run.offset) <= FURNITURE_DEPTH_M
+            along = max(wall.start, run.start), min(wall.end, run.end)
+            if wall.axis != run.axis or wall.length <= run.length or not near or along[0] >= along[1]:
+                continue
+            if strips.free_between(run, wall, along) <= FREE_SHARE:
+                first, last = ((v - run.start) / run.length * len(covered) for v in along)
+                covered[round(first) : round(last)] = True
+        if covered.mean() >= HIDING_SHARE:
+            kept.remove(run)
+    return kept
+
+
+def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+    """Runs extended behind the things that hide their ends, to the nearest wall across."""
+    walls = []
+    for run in runs:
+        ends = [run.start, run.end]
+        for side, sign in enumerate((-1, 1)):
+            here = ends[side]
+            across = [b for b in runs if b.axis != run.axis]
+            near = [b for b in across if abs(b.offset - here) <= SAME_WALL_M]
+            if any(b.start - SAME_WALL_M <= run.offset <= b.end + SAME_WALL_M for b in near):
+                continue
+            reachable = [
+                b.offset
+                for b in across
+                if 0 < sign * (b.offset - here) <= HIDDEN_GAP_M
+                and b.start - FURNITURE_DEPTH_M <= run.offset <= b.end + FURNITURE_DEPTH_M
+            ]
+            if not reachable:
+                continue
+            there = min(reachable, key=lambda v: abs(v - here))
+            along = (min(here, there), max(here, there))
+            free, hidden = (strips.on_line(m, run.axis, run.offset, along) for m in (strips.grid.free, strips.hiding))
+            if free <= FREE_SHARE and hidden >= HIDING_SHARE:
+                ends[side] = there
+        walls.append(replace(run, start=ends[0], end=ends[1]))
+    return walls

@@ -1,8 +1,6 @@
-"""Planes of a building in a noisy point cloud.
+"""Planes of a building in a noisy point cloud: flat patches, split into layers, merged, and fitted to all their points.
 
-A reconstruction that follows every point (Poisson, alpha shape) ripples by the scanner's noise, and a wall tilted by
-1 degree sends a specular path elsewhere. So patches are found in a thinned cloud (Open3D; Araujo and Oliveira 2020,
-Pattern Recognit. 107), told apart into layers, merged, and fitted to all their points.
+Patches are those of Open3D (Araujo and Oliveira 2020, Pattern Recognit. 107).
 """
 
 from __future__ import annotations
@@ -18,29 +16,27 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from ..core.angles import FloatArray
-from .packages import lidar_package
-from .thin import Thinned
+from .points import Thinned, lidar_package
 
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
-"""Searches for planes, each in what the last one left (a board before a wall shows once the wall is taken), and by how
-much the normals in a patch may differ. Open3D's default of 60 joins the walls of a sparse room around its corners, but
-finds narrow faces, where normals turn at the edges."""
+"""Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
+joins the walls of a sparse room around its corners, but finds narrow faces."""
 SEARCH_M = 0.10
-"""Half thickness of a patch in which parallel layers (both sides of a partition) are told apart."""
+"""Half thickness of a patch in which parallel layers, such as both sides of a partition, are separated."""
 MARGIN_M = 0.15
 """A plane may reach this far beyond the patch it was found as."""
 BAND = 3.0
 """Points within this many standard deviations belong to a plane."""
 REPEAT = 5.0
-"""A later plane nearer than this to a parallel one, in standard deviations, is made of its strays."""
+"""A later plane nearer than this to a parallel plane, in standard deviations, consists of its strays."""
 PLANAR_SHARE = 0.6
 """A patch with fewer of its points in its layers is bent: a chair, a curtain."""
 NOISE_RANGE_M = (0.002, 0.04)
-"""Noise that planes are looked for with: scanner on a tripod to phone."""
+"""Range of the noise: scanner on a tripod to phone."""
 LAYER_SHARE = 0.2
-"""A layer has at least this share of the density of the strongest one in its patch."""
+"""Least density of a layer relative to the densest layer of its patch."""
 LAYER_CORE = (0.02, 0.98)
-"""Share of a layer's points between which it reaches along each axis; the rest may be strays."""
+"""Quantiles of a layer's points that bound it along each axis; the rest may be strays."""
 MERGE_GAP_M = 1.0
 """Coplanar pieces nearer than this are one plane: wall on both sides of a door."""
 MERGE_ANGLE_RAD = float(np.radians(1.0))
@@ -59,10 +55,10 @@ class Plane:
     Attributes:
         normal: unit vector n, shape [3]; its sign has no meaning.
         offset_m: d, metres.
-        patches_m: corners of the rectangles that it was found as, shape [k, 4, 3], metres.
+        patches_m: corners of the rectangles where it was found, shape [k, 4, 3], metres.
         centre_m: weighted mean of its points, shape [3].
         angle_error_rad: standard error of the normal's direction.
-        u: unit vector in the plane, shape [3]; the second one is v = n x u.
+        u: unit vector in the plane, shape [3].
     """
 
     normal: FloatArray
@@ -74,11 +70,11 @@ class Plane:
 
     @property
     def v(self) -> FloatArray:
-        """The second unit vector in the plane."""
+        """The second unit vector in the plane, n x u."""
         return np.cross(self.normal, self.u)
 
     def flat(self, points_m: FloatArray) -> FloatArray:
-        """Coordinates [..., 2] along u and v of the points' feet, metres."""
+        """Coordinates [..., 2] along u and v of points [..., 3], metres."""
         return points_m @ np.stack([self.u, self.v], axis=1).astype(points_m.dtype)
 
     def lift(self, flat_m: FloatArray) -> FloatArray:
@@ -90,13 +86,13 @@ class Plane:
         return points_m @ self.normal.astype(points_m.dtype) - points_m.dtype.type(self.offset_m)
 
     def region(self, margin_m: float = MARGIN_M) -> Any:
-        """The area (shapely) in its own coordinates where its points may lie: its patches and a margin."""
+        """Area (shapely, in the plane's coordinates) of its patches and a margin around them."""
         hulls = shapely.convex_hull(shapely.multipoints(self.flat(self.patches_m)))
         return shapely.buffer(shapely.union_all(hulls), margin_m, join_style="mitre")
 
 
 def with_axes(plane: Plane, along: ArrayLike = (1.0, 0.0, 0.0)) -> Plane:
-    """The plane with its axes set: u horizontal where it is upright, else the direction ``along`` put into it."""
+    """The plane with its axes set: u horizontal where it is upright, else the projection of ``along``."""
     n = plane.normal
     level = np.array([-n[1], n[0], 0.0])
     u = level if np.linalg.norm(level) > 0.5 else np.asarray(along) - n * (n @ np.asarray(along))
@@ -120,7 +116,7 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         if not found:
             break
         once: list[Plane] = []
-        for plane in merge(cloud, [*planes, *found], noise):
+        for plane in _merge(cloud, [*planes, *found], noise):
             if not any(_repeats(plane, other, 2 * noise) for other in once):
                 once.append(plane)
         planes = once
@@ -145,14 +141,9 @@ def over(plane: Plane, area: Any, points_m: FloatArray, band_m: float) -> Mask:
 def fit(
     points_m: FloatArray, weight: FloatArray, start: Plane, noise_m: float, *, normal: FloatArray | None = None
 ) -> Plane:
-    """Least squares on the points within 2 standard deviations of the plane, three times over.
+    """Least squares on the points [n, 3] within 2 standard deviations of a plane, in three iterations.
 
-    Args:
-        points_m: shape [n, 3].
-        weight: of each point, shape [n].
-        start: a plane near the one to be found.
-        noise_m: standard deviation of the points from the plane.
-        normal: unit vector to be kept; only the offset is fitted then.
+    A given ``normal`` is kept; only the offset is fitted then. ``weight`` [n] are those of the points.
     """
     plane = start if normal is None else replace(start, normal=normal, offset_m=float(normal @ start.centre_m))
     for _ in range(3):
@@ -172,8 +163,13 @@ def fit(
     return with_axes(plane)
 
 
-def merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane]:
-    """Coplanar neighbours as one plane, fitted anew; the one with the most points comes first."""
+def _fit_near(cloud: Thinned, chosen: Mask, start: Plane, noise_m: float) -> Plane:
+    """A plane fitted to some of the points of a cloud."""
+    return fit(cloud.points_m[chosen], cloud.count[chosen], start, noise_m)
+
+
+def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+    """Coplanar neighbours merged and fitted anew, the plane with the most points first."""
     weight = [cloud.count[near(p, cloud.points_m, 2 * noise_m)].sum() for p in planes]
     left = [planes[i] for i in np.argsort(weight)[::-1]]
     merged: list[Plane] = []
@@ -183,11 +179,10 @@ def merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane
         if not same:
             merged.append(plane)
             continue
-        left = [other for other in left if not any(other is one for one in same)]
-        plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *(one.patches_m for one in same)]))
-        own = near(plane, cloud.points_m, BAND * noise_m)
-        # Once more from the start: what it has grown to may meet further pieces.
-        left.insert(0, fit(cloud.points_m[own], cloud.count[own], plane, noise_m))
+        left = [other for other in left if not any(other is piece for piece in same)]
+        plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *(piece.patches_m for piece in same)]))
+        # The grown plane goes back to the front: it may meet further pieces.
+        left.insert(0, _fit_near(cloud, near(plane, cloud.points_m, BAND * noise_m), plane, noise_m))
     return merged
 
 
@@ -204,7 +199,7 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
 
 
 def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
-    """Whether a plane is what the noise left over of another one, nearly parallel and nearer than ``least_m``."""
+    """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
     if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
         return False
     if abs(other.distance(plane.centre_m)) > least_m:
@@ -213,7 +208,7 @@ def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
 
 
 def _patches(cloud: Thinned, rest: Mask, spread_deg: float) -> list[Any]:
-    """Boxes around the flat patches of what is left of a cloud."""
+    """Boxes around the flat patches of a part of a cloud."""
     if np.count_nonzero(rest) < FEWEST_VOXELS:
         return []
     o3d = lidar_package("open3d")
@@ -242,66 +237,49 @@ def _box_plane(box: Any) -> tuple[Plane, float]:
 
 
 def _inner(plane: Plane, cloud: Thinned, rest: Mask) -> tuple[FloatArray, FloatArray]:
-    """Offsets and counts of the points about a patch, its rim left out because neighbours begin there."""
+    """Offsets and counts of the points about a patch, without its rim, where neighbours begin."""
     size = np.linalg.norm(np.diff(plane.patches_m[0, [0, 1, 2]], axis=0), axis=1).min()
-    index = np.flatnonzero(rest)
-    own = index[near(plane, cloud.points_m[index], SEARCH_M, -min(0.1 * size, 0.1))]
-    return plane.distance(cloud.points_m[own]), cloud.count[own]
+    inside = rest & near(plane, cloud.points_m, SEARCH_M, -min(0.1 * size, 0.1))
+    return plane.distance(cloud.points_m[inside]), cloud.count[inside]
 
 
 def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
     """Standard deviation of points from the planes, metres: over the ten largest patches, weighted by area."""
     sized = sorted((_box_plane(box) for box in boxes), key=lambda pair: -pair[1])[:10]
     widths, areas = [], []
-    rest = np.ones(len(cloud.points_m), bool)
+    everywhere = np.ones(len(cloud.points_m), bool)
     for plane, area in sized:
-        own = near(plane, cloud.points_m, SEARCH_M, 0.0)
-        if np.count_nonzero(own) < FEWEST_VOXELS:
+        around = near(plane, cloud.points_m, SEARCH_M, 0.0)
+        if np.count_nonzero(around) < FEWEST_VOXELS:
             continue
-        plane = fit(cloud.points_m[own], cloud.count[own], plane, NOISE_RANGE_M[1] / 2)
-        offsets, count = _inner(plane, cloud, rest)
-        order = np.argsort(np.abs(offsets))
-        share = np.cumsum(count[order]) / count.sum()
-        # Of a normal distribution 95 % lies within 1.96 standard deviations. The tails count: noise along the ray
-        # is smaller across a surface that is seen at a grazing angle, so the sum over all angles has wide ones.
-        widths.append(np.abs(offsets[order])[np.searchsorted(share, 0.95)] / 1.96)
+        offsets, count = _inner(_fit_near(cloud, around, plane, NOISE_RANGE_M[1] / 2), cloud, everywhere)
+        # 95 % of a normal distribution lies within 1.96 standard deviations. The tails count: noise along the ray is
+        # smaller across a surface seen at a grazing angle, so the sum over all angles has wide tails.
+        widths.append(np.quantile(np.abs(offsets), 0.95, weights=count, method="inverted_cdf") / 1.96)
         areas.append(area)
     if not widths:
         return NOISE_RANGE_M[0]
-    order = np.argsort(widths)
-    middle = np.searchsorted(np.cumsum(np.asarray(areas)[order]) / sum(areas), 0.5)
-    return float(np.clip(np.asarray(widths)[order][middle], *NOISE_RANGE_M))
-
-
-def _bounds(plane: Plane, points_m: FloatArray) -> FloatArray:
-    """Corners [1, 4, 3] of the rectangle along the plane's axes that holds all but a few of the points."""
-    (left, low), (right, high) = np.quantile(plane.flat(points_m), LAYER_CORE, axis=0)
-    return plane.lift(np.array([[(left, low), (right, low), (right, high), (left, high)]]))
-
-
-def _ways(cloud: Thinned, rest: Mask, box: Any) -> list[Plane]:
-    """The middle plane of a box, and the one fitted to all points about it.
-
-    A box may be turned by a degree, which smears a large wall into two layers; a fit may run across two real ones.
-    """
-    middle, _ = _box_plane(box)
-    index = np.flatnonzero(rest)
-    own = index[near(middle, cloud.points_m[index], SEARCH_M, 0.0)]
-    return [middle, fit(cloud.points_m[own], cloud.count[own], middle, SEARCH_M / 2)]
+    return float(np.clip(np.quantile(widths, 0.5, weights=areas, method="inverted_cdf"), *NOISE_RANGE_M))
 
 
 def _layers(cloud: Thinned, rest: Mask, box: Any, noise_m: float) -> list[Plane]:
-    """The parallel planes within a patch, none where it is bent."""
+    """The parallel planes within a patch, none where it is bent.
+
+    The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
+    all points about it may run across two real layers. The sharper of both is used.
+    """
+    middle, _ = _box_plane(box)
+    fitted = _fit_near(cloud, rest & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
     step = max(noise_m / 4, 0.002)
     bins = np.arange(-SEARCH_M, SEARCH_M + step, step)
     sharpest, best = 0.0, None
-    for middle in _ways(cloud, rest, box):
-        offsets, count = _inner(middle, cloud, rest)
+    for plane in (middle, fitted):
+        offsets, count = _inner(plane, cloud, rest)
         if len(offsets) >= FEWEST_VOXELS / 2:
             density = gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
             sharpness = float((density**2).sum() / density.sum() ** 2)
             if sharpness > sharpest:
-                sharpest, best = sharpness, (middle, offsets, count, density)
+                sharpest, best = sharpness, (plane, offsets, count, density)
     if best is None:
         return []
     middle, offsets, count, density = best
@@ -314,17 +292,14 @@ def _layers(cloud: Thinned, rest: Mask, box: Any, noise_m: float) -> list[Plane]
         return []
     planes = []
     for offset in at:
-        moved = middle.normal * offset
-        start = replace(
-            middle,
-            offset_m=middle.offset_m + offset,
-            patches_m=middle.patches_m + moved,
-            centre_m=middle.centre_m + moved,
-        )
-        index = np.flatnonzero(rest)
-        own = index[near(start, cloud.points_m[index], BAND * noise_m, 0.0)]
-        if len(own) >= FEWEST_VOXELS / 2:
+        shift = middle.normal * offset
+        patches, centre = middle.patches_m + shift, middle.centre_m + shift
+        start = replace(middle, offset_m=middle.offset_m + offset, patches_m=patches, centre_m=centre)
+        inside = rest & near(start, cloud.points_m, BAND * noise_m, 0.0)
+        if np.count_nonzero(inside) >= FEWEST_VOXELS / 2:
             if len(at) > 1:
-                start = replace(start, patches_m=_bounds(start, cloud.points_m[own]))
-            planes.append(fit(cloud.points_m[own], cloud.count[own], start, noise_m))
+                (left, low), (right, high) = np.quantile(start.flat(cloud.points_m[inside]), LAYER_CORE, axis=0)
+                corners = np.array([[(left, low), (right, low), (right, high), (left, high)]])
+                start = replace(start, patches_m=start.lift(corners))
+            planes.append(_fit_near(cloud, inside, start, noise_m))
     return planes

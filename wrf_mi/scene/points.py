@@ -1,9 +1,11 @@
-"""Point clouds and meshes from files, in metres."""
+"""Point clouds from files, in metres, and thinned to the means of small cells."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,17 +13,52 @@ import trimesh
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line
-from .packages import lidar_package
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
 FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"
-LARGEST_M = 1000.0
-HIGHEST_M = 100.0
-SMALLEST_M = 0.5
-"""Scans of rooms and buildings are smaller and larger than that, or their units are others."""
+SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
+"""Libraries that Open3D is linked against and a small system lacks."""
+LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
+"""Bounds of the extent of a building; outside them the units are wrong."""
 CORE = (0.005, 0.995)
-"""Share of the coordinates between which the extent is taken: strays do not make a room larger."""
+"""Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
+VOXEL_M = 0.03
+"""Edge of the cells: a desk's side still has several."""
+MOST_VOXELS = 600_000
+"""The cells of a large building grow until there are no more: bounds time and memory."""
+NORMAL_RADIUS_M, NORMAL_NEIGHBOURS = 0.15, 50
+STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
+"""A mean farther from its neighbours than usual by this many standard deviations is a stray."""
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """A thinned point cloud: mean of the points in each cell [m, 3], their number [m], and unit normals [m, 3]."""
+
+    points_m: FloatArray
+    count: FloatArray
+    normals: FloatArray
+
+
+def lidar_package(name: str) -> Any:
+    """A package of the extra ``lidar``; an `InputError` if it or a system library that it needs is not installed."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        raise InputError(f"scenes from scans need {name}: pip install 'wrf-mi[lidar]'") from None
+    except ImportError as error:
+        text = one_line(error)
+        raise InputError(f"{name} cannot be loaded ({text}); install that library, on Debian: {SYSTEM}") from None
+
+
+def source_file(path: str | Path, units: str, wanted: str) -> Path:
+    """The path of a file; an `InputError` for unknown units or a missing file, whose message ends with ``wanted``."""
+    if units not in UNITS_M:
+        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; give {wanted}")
+    return Path(path)
 
 
 def read_points(path: str | Path, units: str = "m") -> FloatArray:
@@ -30,23 +67,16 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
     Args:
         path: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las`` or ``.laz``; ``.xyz`` or ``.txt`` with
             three or more columns, separated by spaces or commas; or any format that trimesh reads (PLY, OBJ, STL).
-        units: of the file's coordinates, a key of `UNITS_M`.
+        units: unit of the file's coordinates, a key of `UNITS_M`.
 
     Raises:
-        InputError: a file that is missing, has no points, or one that is not finite; units that are not known.
+        InputError: missing file, unknown units, no points, or a point that is not finite.
     """
-    file = Path(path)
-    if units not in UNITS_M:
-        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
-    if not file.is_file():
-        raise InputError(f"{file}: no such file; give a point cloud ({FORMATS})")
-    suffix = file.suffix.lower()
-    if suffix in (".las", ".laz"):
-        # Outside the net below: a missing package is no fault of the file.
-        lidar_package("laspy")
-    read: Callable[[Path], FloatArray] = _READERS.get(suffix, _read_trimesh)
+    file = source_file(path, units, f"a point cloud ({FORMATS})")
+    if file.suffix.lower() in (".las", ".laz"):
+        lidar_package("laspy")  # a missing package is no fault of the file
     try:
-        points = np.asarray(read(file), float)
+        points = np.asarray(_read(file), float)
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
     if points.ndim != 2 or points.shape[1] != 3:
@@ -60,50 +90,54 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse coordinates that are not metres of a room or a building.
-
-    Args:
-        points_m: shape [n, 3].
-        name: of the source, for the error.
-
-    Raises:
-        InputError: they look like millimetres or centimetres, or are too small for a room.
-    """
+    """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building."""
     low, high = np.quantile(points_m, CORE, axis=0)
     size = high - low
-    text = " x ".join(f"{side:.4g}" for side in size)
+    text = f"{name}: extent {' x '.join(f'{side:.4g}' for side in size)} m"
     if size.max() > LARGEST_M:
-        raise InputError(f"{name}: extent {text} m looks like millimetres; give --units mm (or cut out one building)")
+        raise InputError(f"{text} looks like millimetres; give --units mm (or cut out one building)")
     if size[2] > HIGHEST_M:
-        raise InputError(f"{name}: extent {text} m looks like centimetres; give --units cm (or cut out one building)")
+        raise InputError(f"{text} looks like centimetres; give --units cm (or cut out one building)")
     if size.max() < SMALLEST_M:
-        raise InputError(f"{name}: extent {text} m is too small for a room; give its --units ({', '.join(UNITS_M)})")
+        raise InputError(f"{text} is too small for a room; give its --units ({', '.join(UNITS_M)})")
 
 
-def _read_arrays(file: Path) -> FloatArray:
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-        return np.asarray(arrays["xyz_m" if "xyz_m" in arrays else "points"], float)
+def thin(points_m: FloatArray) -> Thinned:
+    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
+    o3d = lidar_package("open3d")
+    voxel = VOXEL_M
+    mean, count = _cells(points_m, voxel)
+    while len(mean) > MOST_VOXELS:
+        voxel *= 1.25
+        mean, count = _cells(points_m, voxel)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
+    cloud, kept = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
+    if len(kept) < STRAY_NEIGHBOURS:
+        raise InputError(f"only {len(kept)} points have neighbours; give a denser point cloud")
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS_M * voxel / VOXEL_M, NORMAL_NEIGHBOURS))
+    return Thinned(np.asarray(cloud.points), count[kept], np.asarray(cloud.normals))
 
 
-def _read_las(file: Path) -> FloatArray:
-    with lidar_package("laspy").open(file) as source:
-        return np.asarray(source.read().xyz, float)
+def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:
+    """Mean [m, 3] and number [m] of the points in each cell."""
+    cell = ((points_m - points_m.min(axis=0)) / voxel_m).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    _, inverse = np.unique(key, return_inverse=True)
+    count = np.bincount(inverse).astype(float)
+    return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
 
 
-def _read_text(file: Path) -> FloatArray:
-    with file.open(encoding="utf-8-sig") as stream:
-        commas = "," in next((line for line in stream if line.strip() and not line.startswith("#")), "")
-    return np.loadtxt(file, usecols=(0, 1, 2), delimiter="," if commas else None, ndmin=2, encoding="utf-8-sig")
-
-
-def _read_trimesh(file: Path) -> FloatArray:
-    return np.asarray(getattr(trimesh.load(file), "vertices", np.empty((0, 3))), float)
-
-
-_READERS = {
-    ".npz": _read_arrays,
-    ".las": _read_las,
-    ".laz": _read_las,
-    ".xyz": _read_text,
-    ".txt": _read_text,
-}
+def _read(file: Path) -> Any:
+    match file.suffix.lower():
+        case ".npz":
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+                return arrays["xyz_m" if "xyz_m" in arrays else "points"]
+        case ".las" | ".laz":
+            with lidar_package("laspy").open(file) as source:
+                return source.read().xyz
+        case ".xyz" | ".txt":
+            with file.open(encoding="utf-8-sig") as text:
+                commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
+            columns, delimiter = (0, 1, 2), "," if commas else None
+            return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
+    return getattr(trimesh.load(file), "vertices", np.empty((0, 3)))

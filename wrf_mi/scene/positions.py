@@ -1,15 +1,15 @@
-"""Measured positions against the walls of a scene: a mirrored plan has walls where somebody walked.
+"""Measured positions against the walls of a scene, which shows whether a plan is mirrored.
 
-Nobody walks through a wall. The shortest lines that join the measured positions (a minimum spanning tree, which needs
-no order of them) stay within rooms and pass through open doors, so few of them cross a wall. In the reflection of the
-building many do, or positions lie outside the floor.
+The shortest lines that join the measured positions (their minimum spanning tree, which needs no order) stay within
+rooms and pass through open doors, so few of them cross a wall. In the reflection of the building many do, or
+positions lie outside the floor.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..datasets.csv_table import read_csv
+from ..datasets.folder_files import read_csv
 from .plan_sources import PlanGrid
 from .register import best_motion, wall_points
 from .surfaces import Surface, moved
@@ -29,40 +29,22 @@ from .surfaces import Surface, moved
 logger = logging.getLogger(__name__)
 
 CELL_M = 0.1
-"""Of positions in one square of this side one is used: a robot that stands still adds nothing."""
+"""Side of the squares of which a single position is used: a robot that stands still adds nothing."""
 REACH_M = 1.0
-"""Longest line between two positions that tells where somebody walked."""
+"""Longest line between two positions."""
 NEIGHBOURS = 8
-"""Nearest positions among which the lines are looked for."""
+"""Number of nearest positions that lines may lead to."""
 OUTSIDE_M = 0.2
-"""A position this far beyond the floor's edge lies outside: the blur of a robot's map."""
+"""Least distance beyond the floor's edge of a position outside: the blur of a robot's map."""
 WALKING_HEIGHT_M = 1.0
-"""Above the lowest floor: where walls are cut if the positions have no height; doors are open there."""
+"""Height above the lowest floor at which walls are cut if the positions have no height; doors are open there."""
 EDGE_SHARE = 0.1
 """Share of the walls' height, from below and above, within which they are not cut."""
 TOLERATED, TOLERATED_SHARE = 1, 0.005
-"""Conflicts, and share of the positions in conflict, that tell nothing: a cupboard taken for a wall, a position that is
-off. Walls found from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
+"""Tolerated conflicts, and share of positions in conflict: a cupboard taken for a wall, a wrong position. Walls found
+from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
 LARGEST_SHARE = 0.1
-"""A larger share of positions in conflict is refused though no reflection fits better."""
-
-
-@dataclass(frozen=True)
-class Conflicts:
-    """How badly positions fit a scene.
-
-    Attributes:
-        crossings: lines between neighbouring positions that cross a wall.
-        outside: positions that do not lie over a floor or below a ceiling.
-    """
-
-    crossings: int
-    outside: int
-
-    @property
-    def total(self) -> int:
-        """Crossings and positions outside."""
-        return self.crossings + self.outside
+"""Largest share of positions in conflict where no reflection fits better."""
 
 
 def read_positions(path: str | Path) -> FloatArray:
@@ -83,12 +65,12 @@ def read_positions(path: str | Path) -> FloatArray:
     return np.stack([table.numbers("x"), table.numbers("y"), z], axis=-1)
 
 
-def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> Conflicts:
-    """How often positions are in conflict with a scene's walls and floors.
+def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int, int]:
+    """Number of lines between neighbouring positions that cross a wall, and of positions outside all floors.
 
     Args:
         positions_m: shape [n, 3]; z NaN where it is not known.
-        surfaces: in the same frame; those of kind wall are crossed, floors and ceilings are where positions may lie.
+        surfaces: surfaces of the scene, in the same frame.
 
     Raises:
         InputError: there is no wall.
@@ -97,15 +79,23 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> Conflicts
     if not walls:
         raise InputError("the scene has no wall that positions could cross; leave out --positions")
     places = _distinct(positions_m)
-    lines = shapely.linestrings(_joined(places))
-    cut = shapely.STRtree(shapely.linestrings(_cut(walls, surfaces, positions_m[:, 2])))
+    lines = shapely.linestrings(_tree(places))
+    heights, z_m = np.concatenate([wall.vertices_m[:, 2] for wall in walls]), positions_m[:, 2]
+    cut_m = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
+    if np.isfinite(z_m).all():
+        cut_m = float(np.median(z_m))
+    margin = EDGE_SHARE * np.ptp(heights)
+    level_m = (0, 0, float(np.clip(cut_m, heights.min() + margin, heights.max() - margin)))
+    meshes = [trimesh.Trimesh(wall.vertices_m, wall.faces, process=False) for wall in walls]
+    pieces = np.concatenate([trimesh.intersections.mesh_plane(mesh, (0, 0, 1), level_m) for mesh in meshes])
+    cut = shapely.STRtree(shapely.linestrings(pieces[..., :2]))
     crossings = len(np.unique(cut.query(lines, predicate="intersects")[0]))
     level = [surface for surface in surfaces if surface.kind in ("floor", "ceiling")]
     if not level:
-        return Conflicts(crossings, 0)
+        return crossings, 0
     corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in level])
     area = shapely.buffer(shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6)), OUTSIDE_M)
-    return Conflicts(crossings, int(np.count_nonzero(~shapely.contains_xy(area, places))))
+    return crossings, int(np.count_nonzero(~shapely.contains_xy(area, places)))
 
 
 def check_positions(
@@ -114,31 +104,26 @@ def check_positions(
     mirrored: Sequence[tuple[str, Sequence[Surface]]],
     name: str,
 ) -> None:
-    """Refuse a scene that measured positions do not fit, above all a mirrored one.
-
-    Args:
-        positions_m: shape [n, 3] in the scene's frame; z NaN where it is not known.
-        surfaces: of the scene.
-        mirrored: the remedy that undoes each reflection of the source, and the surfaces of it (`reflections`).
-        name: of the source and the positions, for errors.
+    """Refuse a scene that measured positions [n, 3] do not fit, above all a mirrored scene.
 
     Raises:
-        InputError: a reflection fits the positions clearly better, or the positions fit neither.
+        InputError: a reflection (`reflections`) fits the positions clearly better, or the positions fit neither.
     """
     count = len(_distinct(positions_m))
-    here = conflicts(positions_m, surfaces)
+    crossings, outside = conflicts(positions_m, surfaces)
     others = [(remedy, conflicts(positions_m, those)) for remedy, those in mirrored]
-    remedy, best = min(others, key=lambda pair: pair[1].total)
-    lines = f"{here.crossings} lines between neighbouring positions cross walls"
-    text = f"{name}: {lines} and {here.outside} of {count} positions lie outside"
-    text += f"; mirrored it is {best.crossings} and {best.outside}"
+    remedy, best = min(others, key=lambda pair: sum(pair[1]))
+    text = (
+        f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions lie"
+    )
+    text += f" outside; mirrored it is {best[0]} and {best[1]}"
     tolerated = TOLERATED + TOLERATED_SHARE * count
-    if here.total > 2 * best.total + tolerated:
+    if crossings + outside > 2 * sum(best) + tolerated:
         raise InputError(f"{text}: {remedy}")
-    if here.total > tolerated + LARGEST_SHARE * count:
+    if crossings + outside > tolerated + LARGEST_SHARE * count:
         raise InputError(f"{text}: check the registration and the frame of the positions")
-    if best.total <= here.total:
-        # Nobody walked where the building and its reflection differ, or too little to tell.
+    if sum(best) <= crossings + outside:
+        # No position lies where the building and its reflection differ.
         logger.warning("%s: positions do not tell the plan from its mirror image; see that it is right", text)
     else:
         logger.info("%s", text)
@@ -151,18 +136,11 @@ def reflections(
     matrix: FloatArray | None,
     known_walls_m: FloatArray | None,
 ) -> list[tuple[str, list[Surface]]]:
-    """The scenes that a source would make if its y, or its x, ran the other way.
+    """The scenes of a source with its y or its x reversed.
 
-    Args:
-        surfaces: of the source, in its frame.
-        file: the source, for the remedy.
-        grid: the source's cells if it is an occupancy grid: rows that run the other way keep the middle of its rows.
-        matrix: registration of the source [4, 4], or None.
-        known_walls_m: end points [m, 2, 2] of walls that the source was registered to; each reflection is registered
-            to them anew.
-
-    Returns:
-        The remedy and the surfaces of each reflection.
+    ``grid`` are the cells of an occupancy grid, ``matrix`` is the registration of the source [4, 4], and each
+    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any. Returns the remedy and the surfaces of each
+    reflection.
     """
     if grid is not None:
         # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.
@@ -190,35 +168,19 @@ def reflections(
 
 
 def _distinct(positions_m: FloatArray) -> FloatArray:
-    """Positions [k, 2] seen from above, one of each cell."""
+    """Positions [k, 2] seen from above, the first of each cell."""
     xy = positions_m[:, :2]
     _, first = np.unique(np.floor(xy / CELL_M).astype(np.int64), axis=0, return_index=True)
     return np.asarray(xy[np.sort(first)])
 
 
-def _joined(places_m: FloatArray) -> FloatArray:
+def _tree(places_m: FloatArray) -> FloatArray:
     """End points [m, 2, 2] of the shortest lines that join neighbouring places [n, 2]."""
     n = len(places_m)
     if n < 2:
         return np.empty((0, 2, 2))
     length, other = cKDTree(places_m).query(places_m, k=min(NEIGHBOURS + 1, n), distance_upper_bound=REACH_M)
     near = np.isfinite(length) & (length > 0)
-    one = np.broadcast_to(np.arange(n)[:, None], other.shape)
-    tree = minimum_spanning_tree(sparse.csr_array((length[near], (one[near], other[near])), shape=(n, n))).tocoo()
+    row = np.broadcast_to(np.arange(n)[:, None], other.shape)
+    tree = minimum_spanning_tree(sparse.csr_array((length[near], (row[near], other[near])), shape=(n, n))).tocoo()
     return np.stack([places_m[tree.row], places_m[tree.col]], axis=1)
-
-
-def _cut(walls: Sequence[Surface], surfaces: Sequence[Surface], z_m: FloatArray) -> FloatArray:
-    """End points [m, 2, 2] of where walls are at the height of the positions, or at `WALKING_HEIGHT_M`."""
-    heights = np.concatenate([wall.vertices_m[:, 2] for wall in walls])
-    low, high = heights.min(), heights.max()
-    at = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
-    if np.isfinite(z_m).all():
-        at = float(np.median(z_m))
-    margin = EDGE_SHARE * (high - low)
-    at = float(np.clip(at, low + margin, high - margin))
-    parts = []
-    for wall in walls:
-        mesh = trimesh.Trimesh(wall.vertices_m, wall.faces, process=False)
-        parts.append(trimesh.intersections.mesh_plane(mesh, (0, 0, 1), (0, 0, at)))
-    return np.concatenate(parts)[..., :2]

@@ -1,68 +1,63 @@
-"""A picture of a scene: seen from above at a slant with the ceiling taken off, and its plan.
+"""A picture of a scene in two views: from above at a slant without the ceiling, and in plan.
 
-Surfaces, the scan they were made from, traced paths and the Gaussians of a field go into the same two views. Made
-without pyplot, as all figures here: no global state, no window system.
+Surfaces, the scan they were made from, traced paths and the Gaussians of a field are drawn in both. Figures are made
+without pyplot: no global state, no window system.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, rotation_matrix
 from ..core.files import write_atomically
 from ..core.paths import Paths
-from .preview_surfaces import TOP, draw_plan, draw_slant, extent, toward_viewer
 from .surfaces import Surface
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
-MATERIAL_COLOURS = {
-    "itu_concrete": "#a3a3a3",
-    "itu_brick": "#b5654a",
-    "itu_plasterboard": "#d8cfb8",
-    "itu_ceiling_board": "#e8e8e4",
-    "itu_wood": "#b07b46",
-    "itu_chipboard": "#c79a63",
-    "itu_plywood": "#d0a873",
-    "itu_floorboard": "#9c6b3f",
-    "itu_glass": "#8ec7d9",
-    "itu_metal": "#5b6770",
-    "itu_marble": "#dcd6d0",
-}
-OTHER_MATERIAL = "#b9a9c9"
-MOST_POINTS = 20_000
-MOST_GAUSSIANS = 3_000
-MOST_PATHS = 300
-"""The strongest are drawn; more only fill the picture."""
+MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
+"""Points are thinned to their number; of the others the strongest or largest are drawn."""
 OUTLINE_POINTS = 20
 SPAN_DB = 40.0
-"""Colours span so much below the strongest."""
+"""Range of the colours below the strongest."""
+ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
+"""Name, marker and colour of each end of paths."""
+ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0
+"""Direction of the viewer of the slanted view."""
+LIGHT = np.array([0.35, -0.5, 0.79])
+CUT = 0.45
+"""Share of the height at which the plan is cut."""
+TOP = 0.8
+"""Level faces above this share of the height are taken off like a ceiling."""
+WHOLE_FACES = 50
 
 
 @dataclass(frozen=True)
 class GaussianCloud:
-    """Gaussians as a picture needs them.
+    """Gaussians for a picture.
 
     Attributes:
         position_m: centres [n, 3].
-        scale_m: standard deviations along own axes [n, 3].
-        rotation_xyzw: quaternions, own axes to world [n, 4].
-        strength_db: what colours them, [n]; for example 20 log10 of the signal's magnitude.
-        label: of the strength.
+        scale_m: standard deviations along the Gaussians' axes [n, 3].
+        rotation_xyzw: quaternions, Gaussians' axes to world [n, 4].
+        strength_db: value that colours them, [n]; for example 20 log10 of the signal's magnitude.
+        label: name of the strength.
     """
 
     position_m: FloatArray
@@ -71,40 +66,23 @@ class GaussianCloud:
     strength_db: FloatArray
     label: str = "signal of a Gaussian (dB)"
 
-    def covariance(self) -> FloatArray:
-        """Shape [n, 3, 3], square metres."""
-        axes = rotation_matrix(self.rotation_xyzw) * np.asarray(self.scale_m, float)[:, None, :]
-        return np.asarray(axes @ np.swapaxes(axes, -1, -2))
-
     def strongest(self, count: int) -> GaussianCloud:
         """The ``count`` strongest, weakest first, so that the strong are drawn last."""
         order = np.argsort(self.strength_db, kind="stable")[-count:]
-        return GaussianCloud(
-            np.asarray(self.position_m, float)[order],
-            np.asarray(self.scale_m, float)[order],
-            np.asarray(self.rotation_xyzw, float)[order],
-            np.asarray(self.strength_db, float)[order],
-            self.label,
-        )
+        values = {key: np.asarray(value)[order] for key, value in vars(self).items() if key != "label"}
+        return GaussianCloud(**values, label=self.label)
+
+    def silhouettes(self, across: FloatArray) -> FloatArray:
+        """Outlines [n, points, 2] at one standard deviation in the plane of two unit vectors [2, 3]."""
+        axes = across @ (rotation_matrix(self.rotation_xyzw) * self.scale_m[:, None, :])
+        half = np.linalg.cholesky(axes @ np.swapaxes(axes, -1, -2) + 1e-12 * np.eye(2))
+        turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
+        return np.swapaxes(half @ np.stack([np.cos(turn), np.sin(turn)]), -1, -2)
 
 
-def draw_preview(
-    surfaces: Sequence[Surface],
-    path: str | Path,
-    points: ArrayLike | None = None,
-    materials: Mapping[str, str] | None = None,
-    title: str = "",
-) -> Path:
-    """Write a picture of a scene as PNG, whole or not at all.
-
-    Args:
-        surfaces: of the scene, at least one.
-        path: of the file.
-        points: the scan [n, 3] or [n, 2], metres.
-        materials: radio material of surfaces by name; None colours them by kind.
-        title: above the picture.
-    """
-    figure = draw_scene(surfaces, points_m=points, materials=materials, title=title)
+def draw_preview(surfaces: Sequence[Surface], path: str | Path, points: ArrayLike | None = None) -> Path:
+    """Write a picture of a scene and a scan [n, 3] or [n, 2] of it as PNG, atomically."""
+    figure = draw_scene(surfaces, points_m=points)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     return write_atomically(Path(path), buffer.getvalue())
@@ -118,20 +96,18 @@ def draw_scene(
     transmitters_m: ArrayLike | None = None,
     receivers_m: ArrayLike | None = None,
     gaussians: GaussianCloud | None = None,
-    materials: Mapping[str, str] | None = None,
     title: str = "",
 ) -> Figure:
-    """A scene with what is known in it, at a slant and in plan.
+    """A scene at a slant and in plan, with a scan, paths, both ends of these, or Gaussians.
 
     Args:
-        surfaces: of the scene, at least one.
+        surfaces: surfaces of the scene, at least one.
         points_m: a scan [n, 3] or [n, 2].
         paths: traced paths; the strongest `MOST_PATHS` are drawn, with ``transmitters_m`` and ``receivers_m``.
         transmitters_m: shape [n_tx, 3].
         receivers_m: shape [n_rx, 3].
-        gaussians: of a field.
-        materials: radio material of surfaces by name; None colours them by kind.
-        title: above the picture.
+        gaussians: Gaussians of a field.
+        title: text above the picture.
 
     Raises:
         ValueError: no surface, or paths without both ends.
@@ -141,111 +117,169 @@ def draw_scene(
     if paths is not None and (transmitters_m is None or receivers_m is None):
         raise ValueError("draw_scene: paths need transmitters_m and receivers_m")
     ends = [None if p is None else np.asarray(p, float).reshape(-1, 3) for p in (transmitters_m, receivers_m)]
-    scan = None if points_m is None else _thinned(np.asarray(points_m, float))
-    cloud = None if gaussians is None else gaussians.strongest(MOST_GAUSSIANS)
-    lines = None if paths is None or not len(paths) else _lines(paths, ends[0], ends[1])
-
+    colours = [KIND_COLOURS[surface.kind] for surface in surfaces]
     figure = Figure(figsize=(12.5, 5.8), layout="constrained")
     grid = figure.add_gridspec(1, 2, width_ratios=[1.2, 1])
     slant: Any = figure.add_subplot(grid[0], projection="3d", computed_zorder=False)
     plan = figure.add_subplot(grid[1])
-    colours = _colours(surfaces, materials)
-    low, high = extent(surfaces)
-    draw_slant(slant, surfaces, colours, low, high)
-    draw_plan(plan, surfaces, colours, low, high)
-    if scan is not None:
+    vertices = np.concatenate([surface.vertices_m for surface in surfaces])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    _draw_slant(slant, surfaces, colours, low, high)
+    _draw_plan(plan, surfaces, colours, low, high)
+    if points_m is not None and len(scan := np.asarray(points_m, float)):
+        scan = scan[:: -(-len(scan) // MOST_POINTS)]
         plan.plot(*scan.T[:2], ",", color="0.35", alpha=0.25, zorder=2)
         if scan.shape[1] == 3:
             below = scan[scan[:, 2] < low[2] + TOP * (high[2] - low[2])]
             slant.plot(*below.T, ",", color="0.3", alpha=0.15, zorder=4)
-    if cloud is not None:
-        _draw_gaussians(figure, slant, plan, cloud)
-    if lines is not None:
-        _draw_paths(figure, slant, plan, *lines)
-    for points, marker, colour in zip(ends, "^o", ("#c1121f", "#0353a4"), strict=True):
+    if gaussians is not None:
+        _draw_gaussians(figure, slant, plan, gaussians.strongest(MOST_GAUSSIANS))
+    if paths is not None and len(paths):
+        _draw_paths(figure, slant, plan, paths, *ends)
+    kinds = dict.fromkeys(surface.kind for surface in surfaces if surface.kind != "ceiling")
+    legend: list[Any] = [Patch(facecolor=KIND_COLOURS[k], edgecolor="0.3", linewidth=0.5, label=k) for k in kinds]
+    for points, (name, marker, colour) in zip(ends, ENDS, strict=True):
         if points is not None:
             slant.plot(*points.T, marker, color=colour, markersize=5, markeredgecolor="white", zorder=8)
             plan.plot(*points.T[:2], marker, color=colour, markersize=6, markeredgecolor="white", zorder=8)
-    _legend(figure, surfaces, colours, materials, ends)
+            legend.append(Line2D([], [], marker=marker, color=colour, linestyle="none", label=name))
+    figure.legend(handles=legend, fontsize=8, loc="outside lower center", ncols=8, frameon=False)
     figure.suptitle(title, fontsize=10)
     return figure
 
 
-def _colours(surfaces: Sequence[Surface], materials: Mapping[str, str] | None) -> list[str]:
-    if materials is None:
-        return [KIND_COLOURS[surface.kind] for surface in surfaces]
-    return [MATERIAL_COLOURS.get(materials[surface.name], OTHER_MATERIAL) for surface in surfaces]
-
-
-def _thinned(points: FloatArray) -> FloatArray:
-    return points[:: -(-len(points) // MOST_POINTS)] if len(points) else points
-
-
-def _silhouettes(cloud: GaussianCloud, across: FloatArray) -> FloatArray:
-    """Outlines at one standard deviation as seen across two unit vectors [2, 3], [n, points, 2] in their plane."""
-    covariance = across @ cloud.covariance() @ across.T
-    half = np.linalg.cholesky(covariance + 1e-12 * np.eye(2))
-    turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
-    return np.swapaxes(half @ np.stack([np.cos(turn), np.sin(turn)]), -1, -2)
+def _toward_viewer() -> FloatArray:
+    """Unit vector from the scene to the eye of the slanted view."""
+    elevation, azimuth = np.radians([ELEVATION_DEG, AZIMUTH_DEG])
+    flat = np.cos(elevation)
+    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
-    """Each Gaussian as the outline that it has from there (an orthographic view keeps Gaussians Gaussian)."""
-    shades = _shades(cloud.strength_db, "viridis")
-    rgba = shades.to_rgba(cloud.strength_db, alpha=0.4)
-    eye = toward_viewer()
+    """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
+    rgba = _coloured(figure, cloud.strength_db, "viridis", cloud.label, 0.4)
+    eye = _toward_viewer()
     right = np.cross([0, 0, 1], eye) / np.linalg.norm(np.cross([0, 0, 1], eye))
     screen = np.stack([right, np.cross(eye, right)])
-    outlines = cloud.position_m[:, None] + _silhouettes(cloud, screen) @ screen
+    outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen
     slant.add_collection3d(Poly3DCollection(outlines, facecolors=rgba, edgecolors="none", zorder=5))
-    flat = cloud.position_m[:, None, :2] + _silhouettes(cloud, np.eye(3)[:2])
+    flat = cloud.position_m[:, None, :2] + cloud.silhouettes(np.eye(3)[:2])
     plan.add_collection(PolyCollection(list(flat), facecolors=rgba, edgecolors="none", zorder=4))
-    _colour_bar(figure, shades, cloud.label)
 
 
-def _lines(paths: Paths, transmitters: Any, receivers: Any) -> tuple[list[FloatArray], FloatArray]:
-    """Corners of the strongest paths, the weakest first, and 20 log10 of their gains."""
+def _draw_paths(figure: Figure, slant: Any, plan: Axes, paths: Paths, transmitters: Any, receivers: Any) -> None:
+    """The strongest paths, the weakest of them first, coloured by 20 log10 of their gains."""
     strength = 20 * np.log10(np.maximum(np.abs(paths.gain), 1e-20))
     order = np.argsort(strength, kind="stable")[-MOST_PATHS:]
-    corners = []
-    for i in order:
-        met = paths.vertices_m[i][: int(paths.bounces[i])]
-        corners.append(np.vstack([transmitters[paths.tx[i]], met, receivers[paths.rx[i]]]))
-    return corners, strength[order]
-
-
-def _draw_paths(figure: Figure, slant: Any, plan: Axes, corners: list[FloatArray], strength: FloatArray) -> None:
-    shades = _shades(strength, "plasma")
-    rgba = shades.to_rgba(strength, alpha=0.85)
+    corners = [
+        np.vstack([transmitters[paths.tx[i]], paths.vertices_m[i][: int(paths.bounces[i])], receivers[paths.rx[i]]])
+        for i in order
+    ]
+    rgba = _coloured(figure, strength[order], "plasma", "gain of a path (dB)", 0.85)
     slant.add_collection3d(Line3DCollection(corners, colors=rgba, linewidths=0.9, zorder=6))
     plan.add_collection(LineCollection([c[:, :2] for c in corners], colors=rgba, linewidths=0.9, zorder=6))
-    _colour_bar(figure, shades, "gain of a path (dB)")
 
 
-def _shades(strength: FloatArray, colours: str) -> ScalarMappable:
+def _coloured(figure: Figure, strength: FloatArray, colours: str, label: str, alpha: float) -> FloatArray:
+    """Colours [n, 4] of strengths, and their bar in the figure."""
     top = float(np.max(strength))
-    return ScalarMappable(Normalize(max(float(np.min(strength)), top - SPAN_DB), top + 1e-9), colours)
-
-
-def _colour_bar(figure: Figure, shades: ScalarMappable, label: str) -> None:
+    shades = ScalarMappable(Normalize(max(float(np.min(strength)), top - SPAN_DB), top + 1e-9), colours)
     bar = figure.colorbar(shades, ax=figure.axes[:2], shrink=0.6, pad=0.01, aspect=30)
     bar.set_label(label, fontsize=8)
     bar.ax.tick_params(labelsize=7)
+    return shades.to_rgba(strength, alpha=alpha)
 
 
-def _legend(
-    figure: Figure,
-    surfaces: Sequence[Surface],
-    colours: Sequence[str],
-    materials: Mapping[str, str] | None,
-    ends: Sequence[FloatArray | None],
+def _draw_slant(
+    axes: Any, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
 ) -> None:
-    shown = [(s, c) for s, c in zip(surfaces, colours, strict=True) if s.kind != "ceiling"]
-    names = {materials[s.name] if materials else s.kind: c for s, c in shown}
-    handles: list[Any] = [Patch(facecolor=c, edgecolor="0.3", linewidth=0.5, label=name) for name, c in names.items()]
-    for points, marker, colour, name in zip(
-        ends, "^o", ("#c1121f", "#0353a4"), ("transmitter", "receiver"), strict=True
-    ):
-        if points is not None:
-            handles.append(Line2D([], [], marker=marker, color=colour, linestyle="none", label=name))
-    figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=8, frameon=False)
+    """Faces without the ceiling, lit from the side; walls in front are transparent."""
+    middle, eye = (low + high) / 2, _toward_viewer()
+    # The empty parts serve scenes that have ceilings only.
+    faces, rgba, floor = [np.empty((0, 3, 3))], [np.empty((0, 4))], [np.empty(0, bool)]
+    for surface, colour in zip(surfaces, colours, strict=True):
+        if surface.kind == "ceiling":
+            continue
+        corners = surface.vertices_m[surface.faces]
+        normal = trimesh.triangles.cross(corners)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        level = np.abs(normal[:, 2]) > 0.9
+        centre = corners.mean(axis=1)
+        kept = ~(level & (centre[:, 2] > low[2] + TOP * (high[2] - low[2])) & (surface.kind != "floor"))
+        light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
+        if surface.kind == "floor":
+            front = np.zeros(len(corners), bool)
+        else:
+            # A wall fades as a whole; a large body that holds a whole room fades face by face.
+            place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
+            front = (place - middle)[:, :2] @ eye[:2] > 0.05 * np.linalg.norm(high - low)
+        shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
+        faces.append(corners[kept])
+        rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[kept])
+        floor.append(np.full(np.count_nonzero(kept), surface.kind == "floor"))
+    corners, shades, is_floor = np.concatenate(faces), np.concatenate(rgba), np.concatenate(floor)
+    largest = np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]
+    for part, order in ((is_floor[largest], 1), (~is_floor[largest], 2)):
+        chosen = largest[part]
+        if len(chosen):
+            axes.add_collection3d(
+                Poly3DCollection(
+                    corners[chosen], facecolors=shades[chosen], edgecolors="none", antialiaseds=False, zorder=order
+                )
+            )
+    # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
+    rims = [np.empty((0, 2, 3))]
+    for surface in surfaces:
+        if surface.kind != "ceiling" and len(surface.faces) <= 500:
+            edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+            edge, count = np.unique(edges, axis=0, return_counts=True)
+            rims.append(surface.vertices_m[edge[count == 1]])
+    if len(lines := np.concatenate(rims)):
+        axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
+    axes.set_proj_type("ortho")
+    axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+    size = np.maximum(high - low, 0.1)
+    for axis, name, a, s in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", low, size, strict=True):
+        axes.set(**{f"{name}lim": (a, a + s)})
+        axis.set_label_text(f"{name} (m)", fontsize=8)
+        axis.set_pane_color((1, 1, 1, 0))
+    axes.zaxis.labelpad = -4
+    axes.set_box_aspect(size, zoom=0.98)
+    axes.tick_params(labelsize=7, pad=0)
+    axes.zaxis.set_major_locator(MaxNLocator(3))
+    axes.grid(False)
+
+
+def _draw_plan(
+    axes: Axes, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
+) -> None:
+    """The floor, and a cut through everything that stands on it."""
+    level = float(low[2] + CUT * (high[2] - low[2]))
+    for surface, colour in zip(surfaces, colours, strict=True):
+        if surface.kind == "floor":
+            triangles = surface.vertices_m[surface.faces][..., :2]
+            light = 0.45 * np.array(to_rgb(colour)) + 0.55
+            axes.add_collection(
+                PolyCollection(list(triangles), facecolors=[light], edgecolors="none", antialiased=False, zorder=1)
+            )
+            continue
+        mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+        cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, level])
+        if len(cut):
+            edge = tuple(0.6 * c for c in to_rgb(colour))
+            axes.add_collection(
+                LineCollection(list(cut[..., :2]), colors=[edge], linewidths=2.2, capstyle="round", zorder=3)
+            )
+    size = np.maximum(high - low, 0.1)[:2]
+    margin = 0.06 * size.max()
+    axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)
+    axes.set_ylim(low[1] - 2 * margin, low[1] + size[1] + margin)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)", fontsize=8)
+    axes.set_ylabel("y (m)", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.set_title(f"plan, cut at z = {level:.2g} m", fontsize=9)
+    bar = max((b for b in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if b <= size[0] / 3), default=0.1)
+    corner = low[0], low[1] - 1.35 * margin
+    axes.add_patch(Rectangle(corner, bar, 0.25 * margin, color="black", zorder=9))
+    axes.annotate(f"{bar:g} m", (low[0] + bar, corner[1]), (4, 0), textcoords="offset points", fontsize=8)

@@ -1,37 +1,48 @@
-"""Rigid registration of a scene to another frame: by pairs of points, or by fitting what it shows to known walls."""
+"""Rigid registration of a scene to another frame: by pairs of points, or by fitting its walls to known walls."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
+from scipy import ndimage, optimize, signal
+from scipy.spatial import cKDTree
+from skimage.transform import estimate_transform
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import text_lines
+from ..core.types import IntArray
+from ..datasets.folder_files import read_columns
 from .plan_lines import rotation_2d
-from .register_search import NEAR_M, SAMPLE_M, best_scale, distance_to_walls, find_poses, moved, sample_walls
 from .surfaces import Surface
 
 LEAST_AGREEMENT = 0.5
-"""A fit is refused below it. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""
+"""Least agreement of a fit. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""
 CLEAR_LEAD = 0.03
-"""The best fit has to agree by this share more than any other, or the walls do not tell which is right."""
+"""Least difference in agreement between the best pose and any other; with less, the pose is ambiguous."""
 LARGEST_RMS_M = 0.3
-"""Pairs that disagree by more are no pairs."""
+"""Largest rms residual of pairs."""
 SPREAD = 0.05
-"""Pairs whose second extent is below this share of the first lie on a line."""
+"""Least ratio of the second to the first extent of pairs; with less they lie on a line."""
 SMALLEST_EXTENT_M = 0.1
-"""Pairs that lie closer together tell no rotation."""
+"""Least extent of pairs; with less they tell no rotation."""
 SAME_M = 0.3
-"""Poses that bring the scene's points to places this near, rms, are one."""
+"""Largest rms distance between the points in two poses that count as equal."""
 MOST_POINTS = 1500
-"""More points on walls are thinned: they would only cost time."""
+"""Points on walls are thinned to their number."""
+NEAR_M = 0.2
+"""Largest distance of a point that agrees with a wall: the blur of a robot's map."""
+SAMPLE_M = 0.1
+"""Distance of the points at which walls are compared."""
+CELL_M = 0.1
+"""Cells of the correlated pictures; in large scenes a hundredth of the radius."""
+TURNS, PEAKS, STARTS = 72, 4, 12
+"""Turns all around that are searched (every 5 degrees), shifts for each turn, and starts that are refined."""
+APART_CELLS, APART_RAD = 5, np.radians(12)
+"""Least difference between two starts; nearer starts lead to the same pose."""
 
 
 @dataclass(frozen=True)
@@ -40,29 +51,79 @@ class Registration:
 
     Attributes:
         matrix: shape [4, 4], applied to columns (x, y, z, 1) in metres.
-        rms_m: of the residuals; of a fit to walls, of the points that agree.
-        median_m: of all residuals.
-        share: of the points within `NEAR_M` of a wall; 1 for pairs.
-        agreement: how much of the scene lies at walls and how many of the walls it shows, mean of both, each point
-            weighted by exp(-(d / 0.1 m)^2 / 2); 1 for pairs.
-        count: pairs, or points.
-        scale: what the source's lengths would have to be multiplied by to fit best; far from 1, the units or the
-            resolution are wrong. It is not in the matrix.
+        rms_m: rms residual; of a fit to walls, over the points that agree.
+        share: share of the points within `NEAR_M` of a wall; 1 for pairs.
+        agreement: mean of the share of the scene that lies at walls and the share of the walls that it shows, each
+            point weighted by exp(-(d / 0.1 m)^2 / 2); 1 for pairs.
+        count: number of pairs, or points.
+        scale: factor on the source's lengths that would fit best; far from 1, the units or the resolution are wrong.
+            It is not in the matrix.
     """
 
     matrix: FloatArray
     rms_m: float
-    median_m: float
     share: float
     agreement: float
     count: int
     scale: float
 
     def apply(self, points_m: ArrayLike) -> FloatArray:
-        """Points [..., 2] or [..., 3] in the target's frame; two coordinates are taken at z = 0 and stay two."""
+        """Points [..., 2] or [..., 3] in the target's frame; two coordinates are taken at z = 0."""
         points = np.asarray(points_m, float)
         n = points.shape[-1]
         return np.asarray(points @ self.matrix[:n, :n].T + self.matrix[:n, 3])
+
+
+def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
+    """Pairs of points from a CSV file: ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y`` in metres.
+
+    Returns:
+        Points in the scene's frame and in the target's, shapes [n, 2] or [n, 3].
+
+    Raises:
+        InputError: wrong header or a row without as many numbers.
+    """
+    table = read_columns(Path(path), "x,y,z,to_x,to_y,to_z", "x,y,to_x,to_y")
+    n = table.shape[1] // 2
+    return table[:, :n], table[:, n:]
+
+
+def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs") -> Registration:
+    """The rotation and shift that bring points to their partners with the least squared error (Umeyama 1991).
+
+    Args:
+        source_m: shape [n, 2] (turned about z alone) or [n, 3].
+        target_m: same shape.
+        name: name of the pairs, for errors.
+
+    Raises:
+        InputError: too few pairs, pairs that lie on a point or (in 3D) a line, or a bad fit.
+    """
+    source, target = np.asarray(source_m, float), np.asarray(target_m, float)
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] not in (2, 3):
+        text = f"points of shapes {source.shape} and {target.shape} are no pairs"
+        raise InputError(f"{name}: {text}; give [n, 2] or [n, 3] each")
+    n, dimension = source.shape
+    if n < dimension:
+        raise InputError(f"{name}: {n} pairs; give at least {dimension}, well apart")
+    spread = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (source, target)]
+    extent = min(spread, key=lambda s: s[0])
+    if extent[0] < SMALLEST_EXTENT_M or (dimension == 3 and extent[1] < SPREAD * extent[0]):
+        where = "at one place" if extent[0] < SMALLEST_EXTENT_M else "on one line"
+        raise InputError(f"{name}: all pairs lie {where}, so the rotation is open; add a pair away from it")
+    rigid, similar = (estimate_transform(kind, source, target) for kind in ("euclidean", "similarity"))
+    error = rigid.residuals(source, target)
+    rms = float(np.sqrt(np.mean(error**2)))
+    if rms > LARGEST_RMS_M:
+        text = f"{name}: the pairs disagree by {rms:.2f} m rms (at most {LARGEST_RMS_M} m), "
+        text += f"pair {int(np.argmax(error)) + 1} by {error.max():.2f} m"
+        scaled = float(np.sqrt(np.mean(similar.residuals(source, target) ** 2)))
+        if scaled < rms / 2:
+            better = f"lengths times {similar.scale:.3f} would fit better ({scaled:.2f} m rms)"
+            raise InputError(f"{text}; {better}: check units and resolution")
+        raise InputError(f"{text}: check this pair and the axes")
+    matrix = _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
+    return Registration(matrix, rms, 1.0, 1.0, n, float(similar.scale))
 
 
 def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
@@ -73,81 +134,12 @@ def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
     return matrix
 
 
-def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
-    """Pairs of points from a CSV file: ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y`` in metres.
-
-    Returns:
-        Points in the scene's frame and the same in the target's, shapes [n, 2] or [n, 3].
-
-    Raises:
-        InputError: wrong header or a row without as many numbers.
-    """
-    path = Path(path)
-    rows = list(csv.reader(text_lines(path)))
-    header = [word.strip().lower() for word in rows[0]] if rows else []
-    n = len(header) // 2
-    if header not in (["x", "y", "to_x", "to_y"], ["x", "y", "z", "to_x", "to_y", "to_z"]):
-        raise InputError(f"{path}: line 1: the header is neither x,y,z,to_x,to_y,to_z nor x,y,to_x,to_y")
-    values = []
-    for number, row in enumerate(rows[1:], 2):
-        try:
-            values.append([float(word) for word in row])
-            if len(row) != 2 * n or not np.isfinite(values[-1]).all():
-                raise ValueError
-        except ValueError:
-            raise InputError(f"{path}: line {number}: expected {2 * n} numbers, found {','.join(row)!r}") from None
-    table = np.array(values, float).reshape(-1, 2 * n)
-    return table[:, :n], table[:, n:]
-
-
-def register_pairs(
-    source_m: ArrayLike, target_m: ArrayLike, largest_rms_m: float = LARGEST_RMS_M, name: str = "pairs"
-) -> Registration:
-    """The rotation and shift that bring points to their partners with the least squared error (Kabsch 1976).
-
-    Args:
-        source_m: shape [n, 2] (turned about z alone) or [n, 3].
-        target_m: same shape.
-        largest_rms_m: pairs that fit worse are refused.
-        name: of the pairs, for errors.
-
-    Raises:
-        InputError: too few pairs, pairs that lie on a point or (in 3D) a line, or a bad fit.
-    """
-    source, target = np.asarray(source_m, float), np.asarray(target_m, float)
-    if source.shape != target.shape or source.ndim != 2 or source.shape[1] not in (2, 3):
-        raise InputError(
-            f"{name}: points of shapes {source.shape} and {target.shape} are no pairs; give [n, 2] or [n, 3] each"
-        )
-    n, dimension = source.shape
-    if n < dimension:
-        raise InputError(f"{name}: {n} pairs; give at least {dimension}, well apart")
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    extent = min((np.linalg.svd(v, compute_uv=False) for v in (a, b)), key=lambda s: s[0])
-    if extent[0] < SMALLEST_EXTENT_M or (dimension == 3 and extent[1] < SPREAD * extent[0]):
-        where = "at one place" if extent[0] < SMALLEST_EXTENT_M else "on one line"
-        raise InputError(f"{name}: all pairs lie {where}, so the rotation is open; add a pair away from it")
-    if dimension == 3:
-        rotation = Rotation.align_vectors(b, a)[0].as_matrix()
-    else:
-        rotation = rotation_2d(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-    shift = target.mean(axis=0) - rotation @ source.mean(axis=0)
-    error = np.linalg.norm(source @ rotation.T + shift - target, axis=1)
-    scale = float((b * (a @ rotation.T)).sum() / (a * a).sum())
-    rms = float(np.sqrt(np.mean(error**2)))
-    if rms > largest_rms_m:
-        text = f"{name}: the pairs disagree by {rms:.2f} m rms (at most {largest_rms_m} m), "
-        text += f"pair {int(np.argmax(error)) + 1} by {error.max():.2f} m"
-        scaled = float(np.sqrt(np.mean(((scale * a @ rotation.T - b) ** 2).sum(axis=1))))
-        if scaled < rms / 2:
-            better = f"lengths times {scale:.3f} would fit better ({scaled:.2f} m rms)"
-            raise InputError(f"{text}; {better}: check units and resolution")
-        raise InputError(f"{text}: check this pair and the axes")
-    return Registration(_motion(rotation, shift), rms, float(np.median(error)), 1.0, 1.0, n, scale)
-
-
 def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatArray:
-    """Points [n, 2] along the walls of surfaces as seen from above, the same number for each metre of wall."""
+    """Points [n, 2] along the walls of surfaces seen from above, in equal steps.
+
+    Raises:
+        InputError: there is no wall.
+    """
     pieces: list[FloatArray] = []
     for surface in surfaces:
         if surface.kind != "wall":
@@ -164,25 +156,21 @@ def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatA
 
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """The turn about z and shift [4, 4] in which points [n, 2] fit walls [m, 2, 2] best, however badly."""
-    pose = find_poses(_thinned(points_m), walls_m)[0].pose
+    pose, _ = _find_poses(points_m, walls_m)[0]
     return _motion(rotation_2d(pose[2]), pose[:2])
-
-
-def _thinned(points_m: FloatArray) -> FloatArray:
-    return points_m[:: -(-len(points_m) // MOST_POINTS)]
 
 
 def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> Registration:
     """The turn about z and shift that lay a scene's walls on known walls.
 
-    Turns all around start it, each with the shifts where both plans correlate best; every start is refined by robust
-    least squares over the points' distances from the walls (point-to-line ICP with a Cauchy loss: Fitzgibbon 2003), and
-    the one where most points and walls agree is taken.
+    Turns all around, each with the shifts where both plans correlate best, are refined by robust least squares over the
+    points' distances from the walls (point-to-line ICP with a Cauchy loss: Fitzgibbon 2003); the pose where most points
+    and walls agree is taken.
 
     Args:
         points_m: points on the scene's walls [n, 2] or [n, 3] (z is ignored), evenly spread: `wall_points`.
-        walls_m: end points of known walls [m, 2, 2] in the target's frame; `wall_points` may miss some and show others.
-        name: of the scene, for errors.
+        walls_m: end points of known walls [m, 2, 2] in the target's frame; the scene may miss some and show others.
+        name: name of the scene, for errors.
 
     Raises:
         InputError: too few points agree, another pose fits as well, or the mirror image fits better.
@@ -190,40 +178,151 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     points, walls = np.asarray(points_m, float)[:, :2], np.asarray(walls_m, float)
     if len(points) < 3 or not len(walls):
         raise InputError(f"{name}: registration to walls needs points and walls, got {len(points)} and {len(walls)}")
-    points = _thinned(points)
-    fits = find_poses(points, walls)
-    best = fits[0]
-    residual = distance_to_walls(moved(points, best.pose), walls)
+    points = points[:: -(-len(points) // MOST_POINTS)]
+    fits = _find_poses(points, walls)
+    pose, score = fits[0]
+    residual = distance_to_walls(_moved(points, pose), walls)
     near = residual[residual <= NEAR_M]
     share = len(near) / len(residual)
-    mirrored = find_poses(points * [-1, 1], walls)[0]
-    if mirrored.score > max(best.score + CLEAR_LEAD, LEAST_AGREEMENT):
+    _, mirrored = _find_poses(points * [-1, 1], walls)[0]
+    if mirrored > max(score + CLEAR_LEAD, LEAST_AGREEMENT):
         raise InputError(
-            f"{name}: its mirror image fits the walls better (agreement {mirrored.score:.2f}, not {best.score:.2f}); "
+            f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
             "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
-    if best.score < LEAST_AGREEMENT:
-        scale, agreement = best_scale(points, best, walls)
-        text = f"{name}: it does not fit the walls: agreement {best.score:.2f} (at least {LEAST_AGREEMENT}), "
+    scale, agreement = _best_scale(points, pose, walls)
+    if score < LEAST_AGREEMENT:
+        text = f"{name}: it does not fit the walls: agreement {score:.2f} (at least {LEAST_AGREEMENT}), "
         text += f"{share:.0%} within {NEAR_M} m"
-        if agreement > best.score + CLEAR_LEAD:
+        if agreement > score + CLEAR_LEAD:
             better = f"lengths times {scale:.2f} would fit better (agreement {agreement:.2f})"
             raise InputError(f"{text}; {better}: check resolution and units, or give pairs")
         remedy = "check that the walls are of this place, and its units, or give pairs"
         raise InputError(f"{text}, and slightly other lengths fit no better: {remedy}")
-    for other in fits[1:]:
-        apart = np.linalg.norm(moved(points, best.pose) - moved(points, other.pose), axis=1)
-        if np.sqrt(np.mean(apart**2)) > SAME_M and other.score > best.score - CLEAR_LEAD:
-            turn = np.degrees(other.pose[2] - best.pose[2]) % 360
+    for other, other_score in fits[1:]:
+        apart = np.linalg.norm(_moved(points, pose) - _moved(points, other), axis=1)
+        if np.sqrt(np.mean(apart**2)) > SAME_M and other_score > score - CLEAR_LEAD:
+            turn = np.degrees(other[2] - pose[2]) % 360
             raise InputError(
                 f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
             )
-    return Registration(
-        _motion(rotation_2d(best.pose[2]), best.pose[:2]),
-        float(np.sqrt(np.mean(near**2))),
-        float(np.median(residual)),
-        share,
-        best.score,
-        len(points),
-        best_scale(points, best, walls)[0],
+    matrix, rms = _motion(rotation_2d(pose[2]), pose[:2]), float(np.sqrt(np.mean(near**2)))
+    return Registration(matrix, rms, share, score, len(points), scale)
+
+
+def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
+    """Points [n, 2] along walls [m, 2, 2]: the middles of equal parts no longer than a step."""
+    parts = []
+    for begin, end in np.asarray(walls_m, float):
+        count = max(1, int(np.ceil(np.linalg.norm(end - begin) / step_m)))
+        parts.append(begin + (np.arange(count)[:, None] + 0.5) / count * (end - begin))
+    return np.concatenate(parts)
+
+
+def _from_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
+    """Vector [n, 2] to each point [n, 2] from the nearest point on walls [m, 2, 2]."""
+    begin, along = walls_m[:, 0], walls_m[:, 1] - walls_m[:, 0]
+    offset = points_m[:, None] - begin
+    part = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
+    away = offset - part[..., None] * along
+    nearest = np.argmin((away**2).sum(axis=-1), axis=1)
+    return np.asarray(away[np.arange(len(away)), nearest])
+
+
+def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
+    """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
+    return np.asarray(np.linalg.norm(_from_walls(points_m, walls_m), axis=-1))
+
+
+def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
+    """Points [n, 2] turned about the origin and shifted by a pose (x, y, angle)."""
+    return points @ rotation_2d(pose[2]).T + pose[:2]
+
+
+def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray, float]]:
+    """Poses (x, y, angle) of points [n, 2] that fit walls [m, 2, 2], and their agreement 0 to 1, the best first."""
+    points = points[:: -(-len(points) // MOST_POINTS)]
+    middle = points.mean(axis=0)
+    centred = points - middle
+    targets = sample_walls(walls)
+    radius = float(np.linalg.norm(centred, axis=1).max())
+    cell = max(CELL_M, radius / 100)
+
+    def misfit(pose: FloatArray) -> FloatArray:
+        return distance_to_walls(_moved(centred, pose), walls)
+
+    def gradient(pose: FloatArray) -> FloatArray:
+        # A distance grows along its direction; a turn moves a point across its radius.
+        turned = _moved(centred, np.array([0.0, 0.0, pose[2]]))
+        away = _from_walls(turned + pose[:2], walls)
+        unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)
+        return np.column_stack([unit, unit[:, 1] * turned[:, 0] - unit[:, 0] * turned[:, 1]])
+
+    fits = []
+    for pose in _starts(centred, targets, cell):
+        # A start is off by half a cell and half a turn's step.
+        for width in (cell + radius * np.pi / TURNS, NEAR_M / 2):
+            pose = optimize.least_squares(misfit, pose, gradient, loss="cauchy", f_scale=width, max_nfev=30).x
+        # The pose for the points themselves: R (x - middle) + t = R x + (t - R middle).
+        whole = np.append(pose[:2] - rotation_2d(pose[2]) @ middle, pose[2])
+        fits.append((whole, _agreement(_moved(centred, pose), targets, walls)))
+    return sorted(fits, key=lambda fit: -fit[1])
+
+
+def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> float:
+    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows."""
+    there = np.exp(-0.5 * (distance_to_walls(placed, walls) / (NEAR_M / 2)) ** 2)
+    back = np.exp(-0.5 * (cKDTree(placed).query(targets)[0] / (NEAR_M / 2)) ** 2)
+    return float((there.mean() + back.mean()) / 2)
+
+
+def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[FloatArray]:
+    """Distinct poses where blurred pictures of both plans correlate best, over turns all around."""
+    radius = float(np.linalg.norm(centred, axis=1).max()) + 2 * cell
+    low = targets.min(axis=0) - 2 * radius
+    shape = np.ceil((targets.max(axis=0) + 2 * radius - low) / cell).astype(int) + 1
+    half = int(np.ceil(radius / cell))
+    wall_image = ndimage.gaussian_filter(_image((targets - low) / cell, shape), 2.0)
+    found: list[tuple[float, FloatArray]] = []
+    for angle in np.arange(TURNS) * (2 * np.pi / TURNS):
+        kernel = _image(centred @ rotation_2d(angle).T / cell + half, np.array([2 * half + 1] * 2))
+        match = signal.fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
+        for _ in range(PEAKS):
+            peak = np.array(np.unravel_index(np.argmax(match), match.shape))
+            found.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))
+            match[tuple(slice(max(0, p - APART_CELLS), p + APART_CELLS + 1) for p in peak)] = 0
+    found.sort(key=lambda f: -f[0])
+    starts: list[FloatArray] = []
+    for _, pose in found:
+        turn = [abs((pose[2] - s[2] + np.pi) % (2 * np.pi) - np.pi) for s in starts]
+        shift = [np.linalg.norm(pose[:2] - s[:2]) for s in starts]
+        if not any(t < APART_RAD and d < APART_CELLS * cell for t, d in zip(turn, shift, strict=True)):
+            starts.append(pose)
+        if len(starts) == STARTS:
+            break
+    return starts
+
+
+def _image(cells: FloatArray, shape: IntArray) -> FloatArray:
+    """Image with 1 in cells (x, y) that hold a point; points are in units of cells."""
+    image = np.zeros(tuple(shape))
+    image[tuple(np.clip(cells.astype(int), 0, shape - 1).T)] = 1.0
+    return image
+
+
+def _best_scale(points: FloatArray, pose: FloatArray, walls: FloatArray) -> tuple[float, float]:
+    """The factor on lengths, 1/2 to 2, that fits best near a pose, and the agreement with it."""
+    middle = points.mean(axis=0)
+
+    def placed(pose_and_scale: FloatArray) -> FloatArray:
+        return _moved(pose_and_scale[3] * (points - middle), pose_and_scale[:3])
+
+    fit = optimize.least_squares(
+        lambda pose_and_scale: distance_to_walls(placed(pose_and_scale), walls),
+        np.append(_moved(middle[None], pose)[0], [pose[2], 1.0]),
+        bounds=([-np.inf] * 3 + [0.5], [np.inf] * 3 + [2.0]),
+        loss="cauchy",
+        f_scale=NEAR_M / 2,
+        max_nfev=100,
     )
+    return float(fit.x[3]), _agreement(placed(fit.x), sample_walls(walls), walls)

@@ -1,4 +1,4 @@
-"""A simulated LiDAR scan of a scene: points for benchmarks, tests and people without a scanner."""
+"""A simulated LiDAR scan of a scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RAYS_PER_POSE = 300_000
 RANGE_NOISE_M = 0.02
 """Standard deviation of a range, metres: a phone or a mobile scanner; one on a tripod has a tenth of it."""
 OUTLIERS = 0.01
-"""Share of the returns that come from nowhere: edges, glass, people walking by."""
+"""Share of stray returns: edges, glass, people walking by."""
 
 
 def simulate_scan(
@@ -28,18 +28,18 @@ def simulate_scan(
     outliers: float = OUTLIERS,
     seed: int = 1,
 ) -> FloatArray:
-    """Points that a LiDAR at some positions would see.
+    """Points of a simulated LiDAR at some positions.
 
-    From each position rays go out evenly over the sphere (a Fibonacci lattice, turned at random); each return
-    is moved along its ray by Gaussian noise, and a share of them to a uniform random part of its range.
+    The rays of a position are spread evenly over the sphere (a Fibonacci lattice, turned at random); each return is
+    moved along its ray by Gaussian noise, and a share of them to a uniform random part of its range.
 
     Args:
-        scene: a Mitsuba scene file, or a ``mi.Scene`` (of a ``sionna.rt.Scene``: its ``mi_scene``).
+        scene: a Mitsuba scene file, or a ``mi.Scene`` (for a ``sionna.rt.Scene``: its ``mi_scene``).
         poses_m: scanner positions [k, 3], metres.
-        rays_per_pose: rays from each position.
+        rays_per_pose: number of rays from each position.
         range_noise_m: standard deviation of the range, metres.
-        outliers: share of the returns, 0 to 1.
-        seed: of the noise; the same seed gives the same points.
+        outliers: share of stray returns, 0 to 1.
+        seed: seed of the noise.
 
     Returns:
         Points [n, 3] in metres; rays that meet nothing leave none.
@@ -57,7 +57,10 @@ def simulate_scan(
     rng = np.random.default_rng(seed)
     parts = []
     for pose in np.asarray(poses_m, float).reshape(-1, 3):
-        directions = _sphere(rays_per_pose, rng)
+        index = np.arange(rays_per_pose) + rng.random()  # Gonzalez 2010, Math. Geosci. 42
+        z, azimuth = 1 - 2 * index / (rays_per_pose + 1), index * (np.pi * (3 - np.sqrt(5))) + rng.random() * 2 * np.pi
+        across = np.sqrt(1 - z * z)
+        directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
         ray = mi.Ray3f(mi.Point3f(*pose.tolist()), to_vectors(directions, mi.Vector3f))
         distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
         seen = np.isfinite(distance)
@@ -69,12 +72,3 @@ def simulate_scan(
     if not len(points):
         raise InputError("simulated scan: no ray met the scene; put the scanner inside it")
     return points
-
-
-def _sphere(count: int, rng: np.random.Generator) -> FloatArray:
-    """Directions [count, 3] spread evenly over the sphere (Gonzalez 2010, Math. Geosci. 42)."""
-    index = np.arange(count) + rng.random()
-    z = 1 - 2 * index / (count + 1)
-    azimuth = index * (np.pi * (3 - np.sqrt(5))) + rng.random() * 2 * np.pi
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)

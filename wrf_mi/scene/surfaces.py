@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-import numpy as np
+import trimesh
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -36,12 +36,11 @@ class Surface:
     @property
     def area_m2(self) -> float:
         """Sum of the areas of its faces."""
-        a, b, c = np.moveaxis(self.vertices_m[self.faces], 1, 0)
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
+        return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
 
 
 def number_names(kinds: Sequence[Kind]) -> list[str]:
-    """A unique name for each: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
+    """A unique name for each surface: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
     names, seen = [], dict.fromkeys(KINDS, 0)
     for kind in kinds:
         seen[kind] += 1
@@ -49,11 +48,6 @@ def number_names(kinds: Sequence[Kind]) -> list[str]:
     return names
 
 
-def moved_points(points_m: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Points [n, 3] moved by a matrix [4, 4]."""
-    return points_m @ matrix[:3, :3].T + matrix[:3, 3]
-
-
 def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     """Surfaces moved by a matrix [4, 4]."""
-    return [replace(surface, vertices_m=moved_points(surface.vertices_m, matrix)) for surface in surfaces]
+    return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]

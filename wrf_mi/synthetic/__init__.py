@@ -1,7 +1,9 @@
-"""Data sets that are traced on this machine: the laboratory, a furnished room, channels of two floors."""
+"""Synthetic data sets, traced on this machine: the laboratory, a furnished room, channels of two floors."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from ..core import Record
@@ -16,24 +18,20 @@ __all__ = ["laboratory_record", "load_record", "traced_room", "walked_channels"]
 
 
 def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
-    """Read any data set as `wrf_mi.datasets.load` does, and trace what is made on this machine where it is asked for.
+    """Read any data set as `wrf_mi.datasets.load` does, or trace a synthetic data set.
 
-    These are the embedded ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
+    Synthetic are ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
     ``traced-csi-office`` (a minute or two each).
 
     Args:
-        name_or_folder: a folder, or a known data set's name.
-        progress: show a progress bar on standard error where tracing takes time.
+        name_or_folder: a folder, or the name of a known data set.
+        progress: show a progress bar on standard error while tracing.
 
     Raises:
         InputError: as `wrf_mi.datasets.load`.
     """
-    if not Path(name_or_folder).is_dir():
-        if name_or_folder == LABORATORY:
-            return laboratory_record(progress=progress)
-        if name_or_folder == ROOM:
-            return traced_room(progress=progress)[0]
-        place = str(name_or_folder).removeprefix(PREFIX)
-        if place in PLACES and place != str(name_or_folder):
-            return walked_channels(place, progress=progress)
+    makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: lambda **kw: traced_room(**kw)[0]}
+    makers |= {f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES}
+    if not Path(name_or_folder).is_dir() and str(name_or_folder) in makers:
+        return makers[str(name_or_folder)](progress=progress)
     return load(name_or_folder)

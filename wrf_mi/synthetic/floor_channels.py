@@ -1,15 +1,12 @@
-"""Channels traced between a base station and users who walk through a floor: uplink and downlink of two made-up floors.
+"""Channels traced between a base station and users who walk through two made-up floors: uplink and downlink.
 
-The base station has 104 antennas, 8 rows of 13 half a wavelength apart, and one vertical antenna stands for a user.
-Carrier and subcarriers are those of the ArgosV2 traces on which NeRF2, FIRE and WRF-GS+ were tried: 2.437 GHz, IEEE
-802.11's 52 subcarriers 312.5 kHz apart at -26..-1 (the uplink) and 1..26 (the downlink). By reciprocity the base
-station is the record's receiver in both. Beside the channels lies the floor's mesh that a model may be given: without
-furniture, each wall off by some centimetres, all of one generic material.
-
-Paths: transmission through walls, up to three reflections, and diffuse reflection by every surface
-(`wrf_mi_scenes.floor_plans`). Uplink and downlink are measured with noise; the downlink without it is `Record.truth`,
-which predictions are held against. Users walk closed routes through rooms and doors, two on each; rows run in the order
-of time, user after user.
+The base station has 104 antennas, 8 rows of 13 half a wavelength apart, and each user a vertical antenna. Carrier and
+subcarriers are those of the ArgosV2 traces: 2.437 GHz, IEEE 802.11's 52 subcarriers 312.5 kHz apart at -26..-1 (the
+uplink) and 1..26 (the downlink). By reciprocity the base station is the record's receiver in both. Paths: transmission
+through walls, up to three reflections, and diffuse reflection by every surface (`wrf_mi_scenes.floor_plans`). Uplink
+and downlink are noisy; the downlink without noise is `Record.truth`, with which predictions are compared. Users walk
+closed routes through rooms and doors, two on each; rows run in the order of time, user after user. The mesh for
+models has no furniture, each wall off by some centimetres, all of a single generic material.
 """
 
 from __future__ import annotations
@@ -24,12 +21,10 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from scipy.constants import speed_of_light
 from wrf_mi_scenes import floor_plans
 from wrf_mi_scenes.floor_plans import FloorPlan
-from wrf_mi_scenes.furnished import write_scene
+from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.registry import content_sha256
 
 from ..core import InputError, Receiver, Record
@@ -37,53 +32,41 @@ from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import load, make_splits, read_nerf2_csi, user_cache, write_nerf2_csi
 from ..datasets.registry import locate
-from ..receivers.channel import array_channels
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
-from ..tracing.solve import trace_paths
-from .furnished_room import SCATTERING
-from .laboratory import RECIPE
+from .furnished_room import trace_channels
+from .laboratory import RECIPE, is_made
 
 logger = logging.getLogger(__name__)
 
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
-PREFIX = "traced-csi-"
-"""Of the data sets' names."""
-MEASURED = "floor"
-"""Folder beside the channels with the measured floor's scene: what a model is given."""
-FORMAT = 2
-"""To be raised when the same recipe would give other files."""
+PREFIX = "traced-csi-"  # of the names of the data sets
+MEASURED = "floor"  # folder beside the channels with the measured scene, the input of models
+FORMAT = 2  # version of the files, to be raised when they change for equal parameters
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.437e9, 312.5e3, 26
 UPLINK_HZ: FloatArray = CARRIER_HZ + SPACING_HZ * np.arange(-HALF, 0, dtype=float)
 DOWNLINK_HZ: FloatArray = CARRIER_HZ + SPACING_HZ * np.arange(1, HALF + 1, dtype=float)
 # Array's x = y of the world, y = up, boresight z = x of the world.
 ORIENTATION = (0.5, 0.5, 0.5, 0.5)
-UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-
-CHUNK_SIZE = 100
-"""Users' places traced at once."""
 
 
 @dataclass(frozen=True)
 class Walk:
-    """How a floor's channels are made.
+    """Parameters of a floor's channels.
 
     Attributes:
-        rows, columns: of the base station's antennas.
-        users: on each route.
-        places: of each user along it.
-        wander_m: users stray from the route by this at most, along x and along y.
-        height_m, sway_m: of a user's antenna and how far it goes up and down.
-        depth: interactions of a path at most.
-        reflections: of these at most.
-        rays: for specular paths.
-        scattered_rays: for diffuse reflection: each hit is a patch of rough surface.
-        scattered_depth: interactions of a scattered path at most.
+        rows, columns: numbers of the base station's antennas.
+        users, places: numbers of users on each route, and of positions of each user.
+        wander_m: largest deviation of users from the route, along x and along y.
+        height_m, sway_m: height of a user's antenna and its largest deviation.
+        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
+            scattered path.
+        rays, scattered_rays: numbers of rays for specular paths and for diffuse reflection.
         scattering: share of the reflected amplitude that every surface scatters.
-        snr_db: of each row's uplink and of its downlink, mean over antennas and subcarriers.
-        mesh_error_m: standard deviation of the measured walls' places along each axis, metres.
-        seed: of ways, noise, rays, split and the measured floor's errors.
+        snr_db: signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers.
+        mesh_error_m: standard deviation of the measured walls' positions along each axis, metres.
+        seed: seed of ways, noise, rays, split and errors of the measured floor.
     """
 
     rows: int = 8
@@ -110,15 +93,15 @@ DEFAULT = Walk()
 def walked_channels(
     place: str, folder: str | Path | None = None, walk: Walk = DEFAULT, progress: bool = False
 ) -> Record:
-    """A floor's uplink and downlink channels: read if they were traced before, else traced now and kept.
+    """A floor's uplink and downlink channels: read from an earlier call, or traced now and stored.
 
-    The official split is a seeded random one of 80 and 20 %.
+    The official split is a seeded random split of 80 and 20 %.
 
     Args:
         place: ``flat`` or ``office``.
-        folder: where they are kept in the layout of NeRF2's channels; by default ``traced-csi-<place>/`` below
-            ``WRF_MI_DATA`` if it is there, else in the user's cache.
-        walk: how they are made.
+        folder: folder of the channels in the layout of NeRF2's channels; by default ``traced-csi-<place>/`` below
+            ``WRF_MI_DATA`` if it exists, else in the user's cache.
+        walk: parameters.
         progress: show a progress bar on standard error.
 
     Returns:
@@ -138,9 +121,19 @@ def walked_channels(
     folder, plan = Path(folder), PLACES[place]()
     with tempfile.TemporaryDirectory() as work:
         write_scene(Path(work), plan.parts, f"{place.capitalize()} of several rooms", "wrf_mi_scenes.floor_plans")
-        recipe = _recipe(place, plan, content_sha256(Path(work), "scene.xml"), walk)
-        made = (folder / RECIPE).is_file() and (folder / MEASURED / "scene.yml").is_file()
-        if not made or (folder / RECIPE).read_text(encoding="utf-8") != recipe:
+        facts = {
+            "format": FORMAT,
+            "place": place,
+            "scene_sha256": content_sha256(Path(work), "scene.xml"),
+            "station_m": list(plan.station_m),
+            "routes_m": [[list(corner) for corner in route] for route in plan.routes],
+            **asdict(walk),
+            "frequency_hz": CARRIER_HZ,
+            "subcarrier_spacing_hz": SPACING_HZ,
+            "sionna_rt": version("sionna-rt"),
+        }
+        recipe = yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)
+        if not is_made(folder, recipe) or not (folder / MEASURED / "scene.yml").is_file():
             logger.info("tracing channels in the %s into %s", place, folder)
             record = _trace(Path(work), name, plan, walk, progress)
             write_nerf2_csi(folder, record, replace=True, extra={RECIPE: recipe})
@@ -151,19 +144,13 @@ def walked_channels(
 
 
 def users_way(route: tuple[tuple[float, float], ...], walk: Walk, rng: np.random.Generator) -> FloatArray:
-    """Places [walk.places, 3] in metres, evenly along a closed route, to 0.1 mm.
-
-    Args:
-        route: corners (x, y), metres.
-        walk: how many, how high and how far astray.
-        rng: of straying and of where the user begins.
-    """
+    """Positions [walk.places, 3] in metres, evenly along a closed route of corners (x, y), to 0.1 mm."""
     corners = np.array([*route, route[0]])
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     share = (np.arange(walk.places) + rng.uniform()) / walk.places
     places = np.stack([np.interp(share * length[-1], length, corners[:, axis]) for axis in range(2)], axis=-1)
     height = np.full(walk.places, walk.height_m)
-    # Whole numbers of turns close the way; the amplitudes of two waves add up to the most that is allowed.
+    # Whole numbers of turns close the way; the amplitudes of two waves add up to the largest deviation.
     for cycles in (3, 7):
         turn = 2 * np.pi * (cycles * share[:, None] + rng.uniform(size=3))
         places += walk.wander_m / 2 * np.sin(turn[:, :2])
@@ -172,12 +159,9 @@ def users_way(route: tuple[tuple[float, float], ...], walk: Walk, rng: np.random
 
 
 def with_noise(channel: NDArray[np.complex128], snr_db: float, rng: np.random.Generator) -> NDArray[np.complex128]:
-    """Channels [n, antennas, subcarriers] with circular complex normal noise of a given SNR in each row.
+    """Channels [n, antennas, subcarriers] with circular complex normal noise.
 
-    Args:
-        channel: without noise.
-        snr_db: ratio of a row's mean power over antennas and subcarriers to the noise's.
-        rng: of the noise.
+    ``snr_db`` is the ratio of a row's mean power over antennas and subcarriers to the power of the noise.
     """
     power = (np.abs(channel) ** 2).mean(axis=(1, 2), keepdims=True) * 10 ** (-snr_db / 10)
     noise = rng.standard_normal(channel.shape) + 1j * rng.standard_normal(channel.shape)
@@ -191,24 +175,12 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     positions = np.concatenate(ways)
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
     receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION), array_m=array_m)
-    # Diffuse reflection: the base station searches, so that all users see the same patches of rough wall.
-    shared: dict[str, Any] = {"transmission": True, "seed": walk.seed}
-    shared |= {"scattering_coefficient": walk.scattering}
+    shared: dict[str, Any] = {"transmission": True, "seed": walk.seed, "scattering_coefficient": walk.scattering}
     specular = TraceOptions(max_depth=walk.depth, max_reflections=walk.reflections, rays=walk.rays, **shared)
     rough = TraceOptions(scattering=True, max_depth=walk.scattered_depth, rays=walk.scattered_rays, **shared)
     frequencies = np.concatenate([UPLINK_HZ, DOWNLINK_HZ])
-    channel = np.zeros((len(positions), len(array_m), len(frequencies)), complex)
-    for material in scene.radio_materials.values():
-        material.scattering_coefficient = walk.scattering
-    with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
-        for start in bar.track(range(0, len(positions), CHUNK_SIZE), description=f"tracing {name}"):
-            part = positions[start : start + CHUNK_SIZE]
-            ends = [Receiver(str(row), one, np.array(UPRIGHT)) for row, one in enumerate(part, start=start + 1)]
-            for options in (specular, rough):
-                paths = trace_paths(scene, receiver.position_m, ends, options).paths
-                if options.scattering:
-                    paths = paths.select((paths.interactions == SCATTERING).any(axis=1))
-                channel[start : start + CHUNK_SIZE] += array_channels(paths, receiver, array_m, frequencies)
+    text = f"tracing {name}" if progress else None
+    channel = trace_channels(scene, receiver, positions, frequencies, (specular, rough), progress=text)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(
@@ -224,18 +196,3 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     )
     split = make_splits(record, "random", seed=walk.seed)[0]
     return replace(record, official=(split.all_train, split.test))
-
-
-def _recipe(place: str, plan: FloorPlan, scene_sha256: str, walk: Walk) -> str:
-    facts = {
-        "format": FORMAT,
-        "place": place,
-        "scene_sha256": scene_sha256,
-        "station_m": list(plan.station_m),
-        "routes_m": [[list(corner) for corner in route] for route in plan.routes],
-        **asdict(walk),
-        "frequency_hz": CARRIER_HZ,
-        "subcarrier_spacing_hz": SPACING_HZ,
-        "sionna_rt": version("sionna-rt"),
-    }
-    return yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)

@@ -1,8 +1,8 @@
-"""The embedded default: spectra of our own laboratory scene, traced on this machine in place of measured ones.
+"""The default data set: spectra of the `laboratory` scene, traced on this machine without noise.
 
-Same form as rfid-lab: a 4 x 4 array with 0.16 m spacing at 920 MHz, 200 transmitter positions along a path within
-0.5 x 1 x 0.2 m, about 5 m away. It is synthetic: no noise, no calibration error, nothing that moves. A simulated LiDAR
-scan of the same scene lies beside the spectra (2 cm range noise, 1 % strays), for the way from points to a mesh.
+Layout and array are those of rfid-lab: a 4 x 4 array with 0.16 m spacing at 920 MHz, 200 transmitter positions along a
+path within 0.5 x 1 x 0.2 m, about 5 m away. A simulated LiDAR scan of the scene is included (2 cm range noise, 1 %
+strays).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from wrf_mi_scenes import SceneInfo, scenes
+from wrf_mi_scenes import scenes
 
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
@@ -35,14 +35,13 @@ SPACING_M = 0.16
 POSITIONS = 200
 OPTIONS = TraceOptions(max_depth=3, seed=1)
 RECIPE = "traced.yml"
-"""File in the cached folder that states how its spectra were made; another recipe makes them anew."""
+"""File in the cached folder with the parameters of its data; other parameters make them anew."""
 SCAN = "lidar/points.npz"
-"""File in that folder with what a simulated LiDAR sees of the scene."""
+"""File in that folder with the simulated LiDAR scan of the scene."""
 SCANNER_M = ((2.0, 2.5, 1.5), (3.0, 5.0, 1.5), (5.5, 3.5, 1.5), (7.0, 1.8, 1.5), (7.6, 6.0, 1.6), (5.8, 1.0, 1.2))
-"""Where the LiDAR stands, metres: five places of the room and one of the inner room."""
+"""Positions of the LiDAR, metres: five in the room and one in the inner room."""
 SCANNED_RAYS = 60_000
-FORMAT = 4
-"""To be raised when the same recipe would give other files."""
+FORMAT = 4  # version of the files, to be raised when they change for equal parameters
 
 RECEIVER = Receiver(
     name="gateway1",
@@ -50,6 +49,11 @@ RECEIVER = Receiver(
     # Array's x = (0.0698, -0.9976, 0), y = up, boresight z = (-0.9976, -0.0698, 0).
     orientation_xyzw=np.array([0.51712, -0.48227, -0.48227, 0.51712]),
 )
+ARRAY_FACTS = {
+    "array": f"4 x 4, {SPACING_M} m",
+    "receiver": [*RECEIVER.position_m.tolist(), *RECEIVER.orientation_xyzw.tolist()],
+}
+"""Entries of a recipe that describe the array."""
 
 
 def transmitter_path(count: int = POSITIONS) -> FloatArray:
@@ -60,13 +64,13 @@ def transmitter_path(count: int = POSITIONS) -> FloatArray:
 
 
 def laboratory_record(folder: str | Path | None = None, progress: bool = False) -> Record:
-    """The laboratory's 200 spectra: read if they were traced before, else traced now (some 5 s) and kept.
+    """The laboratory's 200 spectra in 8 bits: read from an earlier call, or traced now (some 5 s) and stored.
 
-    The official split is a seeded random one of 160 and 40 rows. Spectra are kept as 8-bit grey, as measured ones are.
+    The official split is a seeded random split of 160 and 40 rows.
 
     Args:
-        folder: where they are kept in the NeRF2 layout; by default ``laboratory/`` below ``WRF_MI_DATA`` if it is
-            there, else in the user's cache.
+        folder: folder of the spectra in the NeRF2 layout; by default ``laboratory/`` below ``WRF_MI_DATA`` if it
+            exists, else in the user's cache.
         progress: show a progress bar on standard error.
     """
     if folder is None:
@@ -76,53 +80,12 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
         folder = user_cache() / NAME
     folder = Path(folder)
     info = scenes()[NAME]
-    recipe = _recipe(info)
-    if not (folder / RECIPE).is_file() or (folder / RECIPE).read_text(encoding="utf-8") != recipe:
-        logger.info("tracing %d spectra in the scene %s into %s", POSITIONS, NAME, folder)
-        extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: _scan(info)}
-        write_spectrum_folder(folder, _trace(info, progress), replace=True, extra=extra)
-    return read_spectrum_folder(folder, NAME)
-
-
-def _trace(info: SceneInfo, progress: bool) -> Record:
-    scene = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
-    positions, array_m = transmitter_path(), planar_array(4, 4, SPACING_M)
-    spectra = trace_spectra(
-        scene,
-        positions,
-        RECEIVER,
-        array_m,
-        FREQUENCY_HZ,
-        options=OPTIONS,
-        progress=progress,
-    )
-    record = Record(
-        name=NAME,
-        task="spectrum",
-        tx_pos_m=positions,
-        receivers=(replace(RECEIVER, array_m=array_m),),
-        observation=spectra[None],
-        frequencies_hz=np.array([FREQUENCY_HZ]),
-    )
-    split = make_splits(record, "random", seed=OPTIONS.seed)[0]
-    return replace(record, official=(split.all_train, split.test))
-
-
-def _scan(info: SceneInfo) -> bytes:
-    points = simulate_scan(info.xml, SCANNER_M, rays_per_pose=SCANNED_RAYS, seed=OPTIONS.seed)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, points=points.astype(np.float32))
-    return stream.getvalue()
-
-
-def _recipe(info: SceneInfo) -> str:
     facts = {
         "format": FORMAT,
         "scene": info.name,
         "scene_sha256": info.sha256,
         "frequency_hz": FREQUENCY_HZ,
-        "array": f"4 x 4, {SPACING_M} m",
-        "receiver": [*RECEIVER.position_m.tolist(), *RECEIVER.orientation_xyzw.tolist()],
+        **ARRAY_FACTS,
         "positions": POSITIONS,
         "scanner": [list(place) for place in SCANNER_M],
         "scanned_rays": SCANNED_RAYS,
@@ -131,4 +94,29 @@ def _recipe(info: SceneInfo) -> str:
         "seed": OPTIONS.seed,
         "sionna_rt": version("sionna-rt"),
     }
-    return yaml.safe_dump(facts, sort_keys=False)
+    recipe = yaml.safe_dump(facts, sort_keys=False)
+    if not is_made(folder, recipe):
+        logger.info("tracing %d spectra in the scene %s into %s", POSITIONS, NAME, folder)
+        positions, array_m = transmitter_path(), planar_array(4, 4, SPACING_M)
+        receiver, frequency_hz = replace(RECEIVER, array_m=array_m), np.array([FREQUENCY_HZ])
+        scene = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
+        spectra = trace_spectra(scene, positions, RECEIVER, array_m, FREQUENCY_HZ, options=OPTIONS, progress=progress)
+        record = Record(NAME, "spectrum", positions, (receiver,), spectra[None], frequencies_hz=frequency_hz)
+        split = make_splits(record, "random", seed=OPTIONS.seed)[0]
+        record = replace(record, official=(split.all_train, split.test))
+        extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: scan_file(info.xml, OPTIONS.seed)}
+        write_spectrum_folder(folder, record, replace=True, extra=extra)
+    return read_spectrum_folder(folder, NAME)
+
+
+def is_made(folder: Path, recipe: str) -> bool:
+    """Whether a folder holds data of the parameters of a recipe."""
+    return (folder / RECIPE).is_file() and (folder / RECIPE).read_text(encoding="utf-8") == recipe
+
+
+def scan_file(xml: Path, seed: int) -> bytes:
+    """Content of the file `SCAN` of a scene."""
+    points = simulate_scan(xml, SCANNER_M, rays_per_pose=SCANNED_RAYS, seed=seed)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, points=points.astype(np.float32))
+    return stream.getvalue()

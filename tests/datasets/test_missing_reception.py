@@ -1,6 +1,6 @@
-"""Data in which a gateway received nothing to learn from, and traces that were stopped: what the command says of them.
+"""Gateways without reception in training rows, and traces that are stopped.
 
-Whatever is refused is refused in one line that names the data, before anything is written or told of progress.
+Errors are a single line that names the data, before anything is written or progress is reported.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ GATEWAYS_M = {"near": (0.4, 0.5, 2.1), "far": (4.5, 3.4, 2.3)}
 
 
 @pytest.fixture
-def unheard(tmp_path: Path) -> Path:
+def silent(tmp_path: Path) -> Path:
     """Strengths in the flat's room, in NeRF2's layout; the second gateway received none of the training rows."""
-    folder = tmp_path / "unheard"
+    folder = tmp_path / "silent"
     folder.mkdir()
     places = np.random.default_rng(4).uniform([0.6, 0.6, 1], [4.2, 3.2, 1.5], (ROWS, 3))
     lines = [f"{name}: [{x}, {y}, {z}]" for name, (x, y, z) in GATEWAYS_M.items()]
@@ -50,33 +50,33 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("model", ["ray-tracing", "physics", "physics without a mesh", "mri"])
 def test_a_gateway_without_training_rows_is_refused_before_anything_is_done(
-    model: str, unheard: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    model: str, silent: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    asked: list[Any] = ["train", unheard, "--model", model.split()[0], "--out", out]
+    asked: list[Any] = ["train", silent, "--model", model.split()[0], "--out", out]
     asked += ["--scene", room] if model in ("ray-tracing", "physics") else []
-    message = f"{unheard}, receiver far: received none of {TRAINED} training rows; leave it out or use another split"
+    message = f"{silent}, receiver far: received none of {TRAINED} training rows; leave it out or use another split"
     refused(asked, message, capsys)
     assert not out.exists()
 
 
-def test_every_split_is_looked_at(unheard: Path, room: Path, tmp_path: Path) -> None:
+def test_every_split_is_checked(silent: Path, room: Path, tmp_path: Path) -> None:
     """Rows that the second gateway received are in one block: where that is held out, none is left."""
-    record = load(unheard)
+    record = load(silent)
     observation = record.observation.copy()
     observation[1] = np.where(np.arange(ROWS) == 3, -60, np.nan)
     object.__setattr__(record, "observation", observation)
-    told: list[str] = []
+    stages: list[str] = []
     for start in (
         lambda: train(record, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked"),
         lambda: train(
-            record, tmp_path / "run", "physics", split="blocked", on_progress=lambda *said: told.append(said[0])
+            record, tmp_path / "run", "physics", split="blocked", on_progress=lambda *said: stages.append(said[0])
         ),
     ):
         with pytest.raises(InputError, match="receiver far: received none of"):
             start()
         assert not (tmp_path / "run").exists()
-    assert told == []
+    assert stages == []
 
 
 def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path, room: Path, tmp_path: Path) -> None:
