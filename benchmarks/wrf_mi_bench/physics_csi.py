@@ -21,7 +21,8 @@ from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import read_newrf
 from wrf_mi.models.interpolation.idw import InverseDistance
 from wrf_mi.models.interpolation.kriging import Kriging
-from wrf_mi.models.physics.csi import CsiSettings, fit_csi
+from wrf_mi.models.physics.csi import fit_csi
+from wrf_mi.models.physics.csi_fit import CsiSettings
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks.scores import cea_db, summary
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths

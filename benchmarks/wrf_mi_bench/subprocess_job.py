@@ -122,7 +122,8 @@ def _physics(job: Job, work: Path) -> Arrays:
 
 def _channels(job: Job, work: Path) -> Arrays:
     """A physics model for channels in a CAD room, on a mesh made of a simulated scan."""
-    from wrf_mi.models.physics.csi import CsiSettings, fit_csi
+    from wrf_mi.models.physics.csi import fit_csi
+    from wrf_mi.models.physics.csi_fit import CsiSettings
     from wrf_mi.synthetic import load_record
 
     from .comparison import room_file

@@ -105,7 +105,8 @@ class Antenna:
         if self.pattern == "iso":
             return np.ones_like(z)
         if self.pattern == "dipole":
-            return np.sqrt(1.5) * level
+            result: FloatArray = np.sqrt(1.5) * level
+            return result
         if self.pattern == "hw_dipole":
             return np.where(pole, 0.0, np.sqrt(1.643) * np.cos(np.pi / 2 * z) / np.where(pole, 1.0, level))
         width = np.radians(65)

@@ -80,7 +80,8 @@ class Paths:
     @property
     def bounces(self) -> IntArray:
         """Number of interactions of each path, shape [p]."""
-        return np.count_nonzero(self.interactions, axis=1)
+        result: IntArray = np.count_nonzero(self.interactions, axis=1)
+        return result
 
     def select(self, which: NDArray[Any]) -> Paths:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""

@@ -67,4 +67,5 @@ def minmax_scale(spectrum: ArrayLike) -> FloatArray:
     image = np.asarray(spectrum, float)
     low = image.min(axis=(-2, -1), keepdims=True)
     span = image.max(axis=(-2, -1), keepdims=True) - low
-    return np.divide(image - low, span, out=np.zeros_like(image), where=span > 0)
+    result: FloatArray = np.divide(image - low, span, out=np.zeros_like(image), where=span > 0)
+    return result

@@ -67,7 +67,8 @@ class Lags:
     @property
     def count(self) -> int:
         """Number of real numbers in a vector of lags."""
-        return self.basis.shape[1]
+        result: int = self.basis.shape[1]
+        return result
 
     @cached_property
     def pairs(self) -> FloatArray:

@@ -127,7 +127,8 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
     Where another process has a core, the spectrum of an array would take twenty times as long.
     """
-    return threadpool_limits(1, "blas")
+    result: AbstractContextManager[Any] = threadpool_limits(1, "blas")
+    return result
 
 
 def settle(result: Any) -> None:
@@ -257,7 +258,8 @@ def memory_mb(call: Call) -> float:
         peak = 1024 * int(line.split()[1])
     else:
         peak = _watched(call)
-    return max(peak - before, 0) / 1e6
+    result: float = max(peak - before, 0) / 1e6
+    return result
 
 
 def _watched(call: Call) -> int:
@@ -276,7 +278,8 @@ def _watched(call: Call) -> int:
     finally:
         done.set()
         thread.join()
-    return max(peak[0], process.memory_info().rss)
+    result: int = max(peak[0], process.memory_info().rss)
+    return result
 
 
 def measure(call: Call, repeats: int = REPEATS, most_s: float = np.inf) -> Measured:

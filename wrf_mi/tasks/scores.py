@@ -53,7 +53,8 @@ def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     """
     predicted, expected = np.asarray(prediction, float), np.asarray(truth, float)
     _check(predicted, expected)
-    return np.abs(predicted - expected)
+    result: FloatArray = np.abs(predicted - expected)
+    return result
 
 
 def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
@@ -77,7 +78,8 @@ def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     power = np.square(np.abs(expected)).sum(axis=-1)
     # A prediction without any error would be infinitely accurate; float64 cannot tell more than this.
     ratio = np.maximum(np.divide(error, power, out=np.full(power.shape, np.nan), where=power > 0), EXACT)
-    return -10 * np.log10(ratio)
+    result: FloatArray = -10 * np.log10(ratio)
+    return result
 
 
 def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:

@@ -59,7 +59,10 @@ class Trees:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
-        return self.model.predict(_features(tx_pos, tx_heading_rad, self._like)).astype(self._like.dtype)
+        result: NDArray[np.floating] = self.model.predict(_features(tx_pos, tx_heading_rad, self._like)).astype(
+            self._like.dtype
+        )
+        return result
 
     def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
@@ -133,7 +136,8 @@ class GrownTrees:
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
-        return self.value[node].mean(axis=0).astype(self.like.dtype)
+        result: NDArray[np.floating] = self.value[node].mean(axis=0).astype(self.like.dtype)
+        return result
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""

@@ -101,7 +101,8 @@ class Hyperparameters:
         if here.heading_rad is not None and there.heading_rad is not None:
             turn = np.cos(here.heading_rad[:, None] - there.heading_rad[None]) - 1
             covariance += self.body_db**2 * np.exp(self.concentration * turn - distance / self.body_m)
-        return covariance
+        result: FloatArray = covariance
+        return result
 
     def variance(self, headings: bool) -> float:
         """Variance of the field, with or without the part that depends on headings, dB^2."""

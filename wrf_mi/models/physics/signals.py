@@ -152,7 +152,8 @@ class Posterior:
     @property
     def ignorance(self) -> FloatArray:
         """Posterior variance as a share of the prior variance, [q]: 0 known, 1 unknown."""
-        return self.variance.sum(axis=1) / self.prior.sum()
+        result: FloatArray = self.variance.sum(axis=1) / self.prior.sum()
+        return result
 
 
 @dataclass(eq=False)

@@ -90,7 +90,8 @@ class Waves:
 
     def image(self, offset_m: FloatArray) -> FloatArray:
         """The transmitters' images less the array's origin with planes displaced by ``offset_m`` [q], [p, 3]."""
-        return self.paths.image_m + np.einsum("q,qpi->pi", offset_m, self.moved)
+        result: FloatArray = self.paths.image_m + np.einsum("q,qpi->pi", offset_m, self.moved)
+        return result
 
     def gain(self, slabs: FloatArray, path: IntArray | None = None) -> ComplexArray:
         """Gains of all or some paths with materials ``slabs`` [3, b]."""

@@ -50,7 +50,8 @@ class Grid:
         """Observed spectra [n, height, width] as unit vectors on the grid [n, r * c]; zero spectra as 0."""
         values = spectra[:, self.row][:, :, self.column].reshape(len(spectra), -1).astype(float)
         norm = np.linalg.norm(values, axis=1, keepdims=True)
-        return np.divide(values, norm, out=np.zeros_like(values), where=norm > 0)
+        result: FloatArray = np.divide(values, norm, out=np.zeros_like(values), where=norm > 0)
+        return result
 
     def loss(self, signals: ComplexArray, shapes: FloatArray) -> tuple[FloatArray, ComplexArray]:
         """Losses [n], at least 0, of element signals [n, m] of any unit, and derivative G [n, m].
@@ -82,12 +83,14 @@ class Spectrometer:
     @property
     def wavenumber(self) -> float:
         """2 pi over the wavelength, rad/m."""
-        return 2 * np.pi * self.frequency_hz / speed_of_light
+        result: float = 2 * np.pi * self.frequency_hz / speed_of_light
+        return result
 
     @property
     def wavelength_m(self) -> float:
         """Wavelength, metres."""
-        return speed_of_light / self.frequency_hz
+        result: float = speed_of_light / self.frequency_hz
+        return result
 
     @property
     def array_m(self) -> FloatArray:
