@@ -5,17 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import with_settings
+from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
 from ..gaussians.encoding import telling_scale
 from ..gaussians.skip import Skip
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
-from .loop_config import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, RANGES, SHARE, AdamConfig, LoopConfig, Range, checked
+from .loop_config import AdamConfig, LoopConfig
+
+AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,14 @@ class InitialConfig:
         signal: deviation of the starting signals.
     """
 
-    gaussians: int = 270
+    gaussians: Count = 270
     points: str = ""
     mesh: str = ""
     paths: str = ""
-    size_deg: float = 7.0
-    nearest_m: float = 1.0
-    farthest_m: float = 8.0
-    opacity: float = 0.4
+    size_deg: AcuteAngle = 7.0
+    nearest_m: Positive = 1.0
+    farthest_m: Positive = 8.0
+    opacity: Inside = 0.4
     signal: float = 0.3
 
 
@@ -58,8 +61,8 @@ class EncodingConfig:
             `LEAST_TX_SCALE_M`.
     """
 
-    position_octaves: int = 4
-    position_scale_m: float = 4.0
+    position_octaves: Count = 4
+    position_scale_m: Positive = 4.0
     tx_octaves: int = 4
     tx_scale_m: float = 0.0
 
@@ -96,9 +99,9 @@ class ViewConfig:
         components: complex signals of a Gaussian at most, coefficients of the principal components of channels.
     """
 
-    height: int = 9
-    columns: int = 36
-    components: int = 6
+    height: Count = 9
+    columns: Count = 36
+    components: Count = 6
 
 
 @dataclass(frozen=True)
@@ -140,14 +143,14 @@ class DensityConfig:
     """
 
     every: int = 1000
-    start: float = 0.05
-    stop: float = 0.4
-    growth_fraction: float = 0.05
-    max_gaussians: int = 320
-    split_deg: float = 5.0
-    least_opacity: float = 0.005
+    start: Share = 0.05
+    stop: Share = 0.4
+    growth_fraction: Share = 0.05
+    max_gaussians: Count = 320
+    split_deg: Positive = 5.0
+    least_opacity: Inside = 0.005
     reset_every: int = 0
-    reset_opacity: float = 0.05
+    reset_opacity: Inside = 0.05
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,7 @@ class LossConfig:
         ssim_weight: eta.
     """
 
-    ssim_weight: float = 0.2
+    ssim_weight: Share = 0.2
 
 
 PATHS_ALONE = "ray-tracing"
@@ -193,7 +196,7 @@ class TrainConfig(LoopConfig):
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
 
-    steps: int = 0
+    steps: Annotated[int, NOT_NEGATIVE] = 0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     model: str = "wrf-gs+"
     seed: int = 0
@@ -220,48 +223,22 @@ class TrainConfig(LoopConfig):
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
-        """Refuse values that no fit can use."""
-        values = checked(self, _RANGES)
-        sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
+        """Refuse values that no fit can use.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        super().__post_init__()
+        sources = [name for name in ("points", "mesh", "paths") if getattr(self.initial, name)]
         if len(sources) > 1:
             raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")
-        nearest, farthest = values["initial.nearest_m"], values["initial.farthest_m"]
+        nearest, farthest = self.initial.nearest_m, self.initial.farthest_m
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
         if self.evaluation == TRACED and self.skip.error:
             raise InputError(
                 "settings skip.contribution and skip.early_stop_tolerance belong to evaluation=splatted; set them to 0"
             )
-
-
-_RANGES: Mapping[str, Range] = {
-    **RANGES,
-    "steps": NOT_NEGATIVE,
-    "loss.ssim_weight": SHARE,
-    "initial.gaussians": COUNT,
-    "initial.size_deg": (lambda x: 0 < x < 90, "more than 0 and less than 90"),
-    "initial.nearest_m": POSITIVE,
-    "initial.farthest_m": POSITIVE,
-    "initial.opacity": INSIDE,
-    "encoding.position_octaves": COUNT,
-    "encoding.position_scale_m": POSITIVE,
-    "view.height": COUNT,
-    "view.columns": COUNT,
-    "view.components": COUNT,
-    "density.start": SHARE,
-    "density.stop": SHARE,
-    "density.growth_fraction": SHARE,
-    "density.max_gaussians": COUNT,
-    "density.split_deg": POSITIVE,
-    "density.least_opacity": INSIDE,
-    "density.reset_opacity": INSIDE,
-    "traced.alone": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-    "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
-    "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
-    "traced.faint": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-    "traced.pattern_degree": (lambda x: 0 <= x <= MAX_DEGREE, f"0 to {MAX_DEGREE}"),
-}
-"""What numbers may be, and words for it; `NOT_NEGATIVE` where nothing is said here."""
 
 
 PAPER = (

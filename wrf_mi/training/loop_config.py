@@ -2,41 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
 
-from ..core import InputError
-from ..core.settings import flat
-
-Range = tuple[Callable[[float], bool], str]
-
-
-def at_least(smallest: float) -> Range:
-    """Numbers from a smallest one."""
-    return lambda x: x >= smallest, f"{smallest} or more"
-
-
-COUNT: Range = at_least(1)
-POSITIVE: Range = (lambda x: x > 0, "more than 0")
-INSIDE: Range = (lambda x: 0 < x < 1, "more than 0 and less than 1")
-SHARE: Range = (lambda x: 0 <= x <= 1, "0 to 1")
-NOT_NEGATIVE: Range = at_least(0)
-
-RANGES: dict[str, Range] = {
-    "steps": COUNT,
-    "batch": COUNT,
-    "holdout_steps_fraction": SHARE,
-    "checkpoint_every": COUNT,
-    "log_every": COUNT,
-    "validate_every": COUNT,
-    "optimiser.cosine_start": SHARE,
-    "optimiser.final": SHARE,
-    "optimiser.ema_decay": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-}
-"""What numbers of the loop may be, and words for it."""
+from ..core.settings import Count, Share, ShareBelow1, check
 
 
 @dataclass(frozen=True)
@@ -53,9 +21,9 @@ class AdamConfig:
 
     network: float = 1e-3
     warm_up: int = 100
-    cosine_start: float = 0.0
-    final: float = 0.01
-    ema_decay: float = 0.999
+    cosine_start: Share = 0.0
+    final: Share = 0.01
+    ema_decay: ShareBelow1 = 0.999
 
 
 @dataclass(frozen=True)
@@ -76,15 +44,14 @@ class LoopConfig:
         optimiser: learning rates and running mean.
     """
 
-    steps: int = 1000
-    batch: int = 1
-    holdout_steps_fraction: float = 0.7
+    steps: Count = 1000
+    batch: Count = 1
+    holdout_steps_fraction: Share = 0.7
     patience: int = 0
-    checkpoint_every: int = 2000
-    log_every: int = 100
-    validate_every: int = 1000
+    checkpoint_every: Count = 2000
+    log_every: Count = 100
+    validate_every: Count = 1000
     optimiser: AdamConfig = field(default_factory=AdamConfig)
-    ranges = RANGES  # what numbers may be; other models have more of them
 
     def __post_init__(self) -> None:
         """Refuse values that no fit can use.
@@ -92,7 +59,7 @@ class LoopConfig:
         Raises:
             InputError: naming the setting.
         """
-        checked(self, self.ranges)
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -109,25 +76,5 @@ class LoopOptions:
 
     def chosen(self) -> list[str]:
         """Those that are not null, as ``--set`` takes them."""
-        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(LoopOptions)}
+        values = {field.name: getattr(self, field.name) for field in fields(LoopOptions)}
         return [f"{name}={value}" for name, value in values.items() if value is not None]
-
-
-def checked(settings: Any, ranges: Mapping[str, Range]) -> dict[str, Any]:
-    """All values of settings by their dotted keys.
-
-    Args:
-        settings: a dataclass.
-        ranges: of its numbers; `NOT_NEGATIVE` for those that are not in it.
-
-    Raises:
-        InputError: a number that is not finite or out of its range.
-    """
-    values = dict(flat(dataclasses.asdict(settings), ""))
-    for name, value in values.items():
-        if not isinstance(value, int | float):
-            continue
-        good, words = ranges.get(name, NOT_NEGATIVE)
-        if not math.isfinite(value) or not good(value):
-            raise InputError(f"setting {name}: {value} is out of range, choose {words}")
-    return values

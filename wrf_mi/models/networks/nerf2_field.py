@@ -18,10 +18,11 @@ from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
 from ...core import InputError, Receiver, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
+from ...core.settings import Count
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
 from ...tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
-from ...training.loop_config import COUNT, AdamConfig
+from ...training.loop_config import AdamConfig
 from ..method import Inputs
 from .coordinates import Coordinates
 from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
@@ -59,16 +60,14 @@ class Nerf2Settings(NetworkSettings):
     validate_every: int = 500
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     networks: Networks = field(default_factory=Networks)
-    rays: int = 256
-    sphere_rays: int = 64
-    sphere_batch: int = 128
-    samples: int = 4
+    rays: Count = 256
+    sphere_rays: Count = 64
+    sphere_batch: Count = 128
+    samples: Count = 4
     near_m: float = 0.0
     far_m: float = 0.0
     tx_octaves: int = 4
     shared: bool = True
-
-    ranges = NetworkSettings.ranges | dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples"), COUNT)
 
     def __post_init__(self) -> None:
         """Refuse what is no march.

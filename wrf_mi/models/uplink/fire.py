@@ -33,10 +33,9 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...core import InputError, Record, Split
-from ...core.settings import settings_from
+from ...core.settings import Count, settings_from
 from ...core.types import IntArray
 from ...gaussians.network import Weights, init_layer, linear
-from ...training.loop_config import COUNT
 from ...training.session import FitSession
 from ..method import Inputs, Method
 from ..networks.tensors import columns
@@ -71,13 +70,11 @@ class FireSettings(NetworkSettings):
     batch: int = 256
     validate_every: int = 500
     sample: Sample = "auto"
-    row_batch: int = 64
-    latent: int = 32
-    width: int = 256
+    row_batch: Count = 64
+    latent: Count = 32
+    width: Count = 256
     beta: float = 1e-4
     spacing_hz: float = 312.5e3
-
-    ranges = NetworkSettings.ranges | dict.fromkeys(("latent", "width", "row_batch"), COUNT)
 
     def __post_init__(self) -> None:
         """Refuse what is no network.

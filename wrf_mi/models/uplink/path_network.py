@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ...backend.device import to_tensor
 from ...core.angles import FloatArray
+from ...core.settings import Count
 from ...core.types import IntArray
 from ...gaussians.network import Weights, init_layer, linear
 from ...training.loop_config import LoopConfig
@@ -49,8 +51,8 @@ class Simulation:
         noise_db: least and greatest ratio of signal to noise.
     """
 
-    channels: int = 3000
-    paths: int = 12
+    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  # to learn from and to validate
+    paths: Count = 12
     decay_db: float = 25.0
     noise_db: tuple[float, float] = (5.0, 30.0)
 
