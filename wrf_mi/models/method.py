@@ -13,9 +13,6 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..training.session import FitSession
 
-OnProgress = Callable[[str, float], None]
-"""Hears what is being done and the share of it that is done, 0 to 1."""
-
 
 @dataclass(frozen=True)
 class Inputs:

@@ -12,7 +12,8 @@ from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
-from ..method import Inputs, OnProgress
+from ...training.session import OnProgress
+from ..method import Inputs
 
 HEADING = "heading"
 """Key of the arrays that says whether headings were used."""

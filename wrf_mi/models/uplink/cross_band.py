@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Record, Split
-from ..method import Method, OnProgress
+from ...training.session import OnProgress
+from ..method import Method
 from .csi_bands import Bands, bands_of, relative_error, training_rows
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, Waves, waves_of

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Record, Split
 from ...core.types import IntArray
-from ...training.session import FitSession
-from ..method import Inputs, Method, OnProgress
+from ...training.session import FitSession, OnProgress
+from ..method import Inputs, Method
 from .csi_bands import finite_uplink, relative_error, training_rows
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
