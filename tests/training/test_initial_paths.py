@@ -19,8 +19,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import WrfGsPlus
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.training.config import InitialConfig, TrainConfig
-from wrf_mi.training.initial import initial_gaussians
-from wrf_mi.training.initial_paths import gaussians_from_mesh, gaussians_from_paths
+from wrf_mi.training.initial import gaussians_from_mesh, gaussians_from_paths, initial_gaussians
 
 
 @pytest.fixture(scope="module")

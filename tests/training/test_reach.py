@@ -167,7 +167,7 @@ def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
     trainer = Trainer(record, Split("own", 0, rows[:6], rows[6:7], rows[7:]), config, scene=scene)
     trainer.run()
     assert trainer.state.reach_m == 0
-    assert "6 training rows do not tell how far Gaussians hold" in caplog.text
+    assert "6 training rows do not suffice to choose a reach" in caplog.text
     assert np.abs(trainer.predictor()(position[7:])).max() > 0
 
 

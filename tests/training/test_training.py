@@ -16,8 +16,8 @@ from small_fits import official, settings, stop_after
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Record
 from wrf_mi.gaussians import FIELDS, random_gaussians
+from wrf_mi.tasks.losses import spectrum_loss
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tasks.spectrum_loss import spectrum_loss
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.loop import Progress
 from wrf_mi.training.predictor import Predictor

@@ -30,17 +30,17 @@ class Csi(Task):
     )
 
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """See `wrf_mi.tasks.scores.cea_db`."""
+        """Channel estimation accuracy (`wrf_mi.tasks.scores.cea_db`)."""
         return cea_db(prediction, truth)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
-        """The mean squared difference over what was received."""
+        """Mean squared difference over received observations."""
         from .losses import squared_error
 
         return squared_error(prediction, truth)
 
     def unit(self, observed: NDArray[Any]) -> float:
-        """Root mean square of a receiver's channels: one far away counts as much as a near one."""
+        """Root mean square of a receiver's channels: far and near receivers then have equal weight."""
         size = np.square(np.abs(np.asarray(observed, complex)))
         power = float(np.nanmean(size)) if np.isfinite(size).any() else 0.0
         return power**0.5 if power > 0 else 1.0
@@ -55,7 +55,7 @@ class Csi(Task):
         return ChannelInstrument(single.receivers, frequencies, record.tx_antenna)
 
     def check(self, record: Record) -> None:
-        """Refuse numbers of rows, antennas, subcarriers and frequencies that differ."""
+        """Refuse inconsistent numbers of rows, antennas, subcarriers and frequencies."""
         place, shape = record.source or record.name, record.observation.shape
         if len(shape) not in (3, 4):
             text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"

@@ -34,7 +34,7 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
 
     Args:
         prediction: flat Dr.Jit float array of ``batch * height * width`` values (a data range of one).
-        truth: the same shape and type; taken as constant.
+        truth: array of the same shape and type; taken as constant.
         batch: number of images.
         height: rows, at least 7.
         width: columns, at least 7.
@@ -61,7 +61,7 @@ def _check(prediction: Any, truth: Any, batch: int, height: int, width: int) -> 
 
 
 def _store(values: list[Any], float_type: Any) -> Any:
-    """Write four arrays [n] as one interleaved array [4 n]."""
+    """Interleave four arrays [n] into one [4 n]."""
     n = max(dr.width(v) for v in values)
     out = dr.empty(float_type, 4 * n)
     index = dr.arange(dr.uint32_array_t(float_type), n)
@@ -70,19 +70,17 @@ def _store(values: list[Any], float_type: Any) -> Any:
 
 
 def _middle(x: Any, y: Any, image: Any, height: int, width: int) -> tuple[Any, Any]:
-    """The middle pixel of an image, from which all of its pixels are counted.
+    """Central pixel of an image, from which its values are counted.
 
-    The reverse pass takes x_p - mean_x as a difference of two sums over windows. Counted from zero, a flat image's
-    would have no digit left.
+    The reverse pass computes x_p - mean_x as a difference of two sums over windows, which cancels on flat images.
     """
     place = image * (height * width) + (height // 2 * width + width // 2)
     return dr.gather(type(x), x, place), dr.gather(type(y), y, place)
 
 
 def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
-    """Of 7 pixels of a row: means of x and y from `_middle`, squared deviations of both together, and co-deviations.
-
-    Shape [batch * height, width - 6, 4].
+    """Moments of 7 pixels of a row, [batch * height, width - 6, 4]: means of x and y from `_middle`, sum of their
+    squared deviations, co-deviation.
     """
     inner = width - BORDER
     i = dr.arange(dr.uint32_array_t(type(x)), batch * height * inner)
@@ -101,12 +99,11 @@ def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
 
 
 def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) -> tuple[Any, Any]:
-    """Similarity [batch, height - 6, width - 6] of each window, and what the reverse pass needs of it.
+    """Similarity [batch, height - 6, width - 6] of each window, and the coefficients of the reverse pass.
 
-    With the derivatives of the similarity by mean (a), variance (b) and covariance (c) of a window, pixel p
-    receives sum over its windows of a / 49 + b * 2 (x_p - mean_x) / 48 + c * (y_p - mean_y) / 48, which is
-    box(offset) + x_p box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0), where x and y count
-    from `_middle`.
+    With the derivatives of the similarity by mean (a), variance (b) and covariance (c) of a window, pixel p receives
+    the sum over its windows of a / 49 + b * 2 (x_p - mean_x) / 48 + c * (y_p - mean_y) / 48, which is box(offset) + x_p
+    box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0), with x and y relative to `_middle`.
     """
     float_type = type(moments)
     inner_h, inner_w = height - BORDER, width - BORDER

@@ -1,4 +1,4 @@
-"""Settings of the training loop, which all models that are trained by gradients have under the same keys."""
+"""Settings of the training loop, with the same keys for all models that are trained by gradients."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class AdamConfig:
         network: rate of all networks.
         warm_up: steps over which rates rise from zero.
         cosine_start: share of the steps after which rates begin to fall.
-        final: share of each rate that is left at the last step.
-        ema_decay: decay per step of the running mean of the parameters, which is what is evaluated and stored.
+        final: final factor of each rate.
+        ema_decay: decay per step of the running mean of the parameters, which is evaluated and stored.
     """
 
     network: float = 1e-3
@@ -32,12 +32,12 @@ class LoopConfig:
 
     Attributes:
         steps: optimiser steps.
-        batch: samples in a step, at most.
+        batch: largest number of samples in a step.
         holdout_steps_fraction: share of the steps in which the validation rows are kept out of training. 1 keeps them
             out to the end, as every choice of settings must; less ends with a fit on all training rows.
-        patience: scores on the validation rows without a better one after which no more are waited for. From the best
-            of them the fit then goes on with all training rows, for a share of the steps that led there. 0: all steps
-            are taken, and the last ones count.
+        patience: number of scores on the validation rows without improvement after which the fit goes on from the best
+            state with all training rows, for a share of the steps that led to it. 0: all steps are taken, and the last
+            state counts.
         checkpoint_every: steps between two checkpoints.
         log_every: steps between two lines of the log.
         validate_every: steps between two scores on the validation rows.
@@ -64,7 +64,7 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Settings of the loop (`LoopConfig`) of a model that may be trained; null: those that it begins with."""
+    """Settings of the loop (`LoopConfig`) of a model that may be trained; null: the default of the training."""
 
     steps: int | None = None
     batch: int | None = None
@@ -75,6 +75,6 @@ class LoopOptions:
     validate_every: int | None = None
 
     def chosen(self) -> list[str]:
-        """Those that are not null, as ``--set`` takes them."""
+        """Settings that are not null, as ``--set`` takes them."""
         values = {field.name: getattr(self, field.name) for field in fields(LoopOptions)}
         return [f"{name}={value}" for name, value in values.items() if value is not None]
