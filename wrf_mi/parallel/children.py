@@ -24,15 +24,10 @@ def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None)
     """Run ``python -m module arguments`` and wait for it.
 
     In a worker the child computes with the worker's number of threads and prints nothing; it is stopped, as by Ctrl-C,
-    when the client cancels the part. Elsewhere it writes to this process's standard error.
-
-    Args:
-        module: name of the module.
-        arguments: arguments of the command line.
-        quiet: keep its standard error instead of showing it; None: in a worker only.
+    when the client cancels the part. Elsewhere it writes to this process's standard error unless ``quiet``.
 
     Returns:
-        The exit status, and the last line on standard error where that was kept.
+        The exit status, and the last line of a quiet child's standard error.
 
     Raises:
         KeyboardInterrupt: in this process; the child has ended then.

@@ -34,16 +34,10 @@ class SchedulerFailed(RuntimeError):
 
 
 def row_parts(count: int, workers: int, least: int = 1, most: int = 1024) -> list[slice]:
-    """Consecutive rows in parts of nearly equal size.
+    """Consecutive slices that cover ``count`` rows, for a number of workers, nearly equal in size.
 
-    Args:
-        count: rows, 1 or more.
-        workers: number of workers that share them, 1 or more.
-        least: least number of rows of a part (but for the last), where a part costs something whatever its size.
-        most: largest number of rows of a part, which bounds the size of a message and the loss with a worker.
-
-    Returns:
-        Slices that cover 0..count - 1 in order.
+    A part has ``least`` rows at least (but for the last), where it costs something whatever its size, and ``most`` at
+    most, which bounds the size of a message and the loss with a worker.
     """
     size = min(max(-(-count // (PARTS_EACH * workers)), least), most)
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]

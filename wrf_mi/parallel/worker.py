@@ -81,17 +81,10 @@ def run_part(
     function: Callable[..., Any],
     part: Any,
 ) -> Any:
-    """Compute one part in a worker.
+    """Compute one part in a worker: ``function(part)``, or ``function(opener(), part)``.
 
     A worker with several threads still computes one part at a time: Dr.Jit traces one program per process, and the
-    working directory belongs to the process.
-
-    Args:
-        environment: environment of the client.
-        token: identifier of the call of ``map``; the result of ``opener`` is kept until the next call.
-        opener: makes the first argument of ``function``; None: there is none.
-        function: function to compute.
-        part: its last argument.
+    working directory belongs to the process. The result of ``opener`` is kept until a call with another ``token``.
 
     Raises:
         InputError: the environment differs from the client's; or raised by ``opener`` or ``function``.

@@ -56,27 +56,27 @@ class Csi(Task):
 
     def check(self, record: Record) -> None:
         """Refuse inconsistent numbers of rows, antennas, subcarriers and frequencies."""
-        place, shape = record.source or record.name, record.observation.shape
+        source, shape = record.source or record.name, record.observation.shape
         if len(shape) not in (3, 4):
             text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"
-            raise InputError(f"{place}: channel coefficients {list(shape)}; {text}")
+            raise InputError(f"{source}: channel coefficients {list(shape)}; {text}")
         frequencies = record.frequencies_hz
         if frequencies is not None and len(frequencies) not in (1, shape[-1]):
-            raise InputError(_differ(place, "", shape[-1], len(frequencies)))
+            raise InputError(_differ(source, "", shape[-1], len(frequencies)))
         if record.uplink is None:
             return
         antennas = shape[2] if len(shape) == 4 else 1
         if record.uplink.ndim != 3 or record.uplink.shape[:2] != (shape[1], antennas):
             raise InputError(
-                f"{place}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
+                f"{source}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
                 "antennas; give both for the same ones"
             )
         if record.uplink_hz is not None and len(record.uplink_hz) != record.uplink.shape[2]:
-            raise InputError(_differ(place, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
+            raise InputError(_differ(source, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
 
 
-def _differ(place: str, what: str, subcarriers: int, frequencies: int) -> str:
-    return f"{place}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
+def _differ(source: str, what: str, subcarriers: int, frequencies: int) -> str:
+    return f"{source}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
 
 
 TASK = Csi()

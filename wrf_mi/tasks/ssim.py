@@ -74,8 +74,8 @@ def _middle(x: Any, y: Any, image: Any, height: int, width: int) -> tuple[Any, A
 
     The reverse pass computes x_p - mean_x as a difference of two sums over windows, which cancels on flat images.
     """
-    place = image * (height * width) + (height // 2 * width + width // 2)
-    return dr.gather(type(x), x, place), dr.gather(type(y), y, place)
+    centre = image * (height * width) + (height // 2 * width + width // 2)
+    return dr.gather(type(x), x, centre), dr.gather(type(y), y, centre)
 
 
 def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
@@ -112,18 +112,18 @@ def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) 
     start = i + image * (BORDER * inner_w)
     rows = [dr.gather(quads(float_type), moments, start + k * inner_w) for k in range(WINDOW)]
     total = sum(rows)
-    own_x, own_y = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
+    mean_x, mean_y = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
     squares: Any = 0
     products: Any = 0
     for row in rows:
-        dx, dy = row[0] - own_x, row[1] - own_y
+        dx, dy = row[0] - mean_x, row[1] - mean_y
         squares = dr.fma(dx, dx, dr.fma(dy, dy, squares))
         products = dr.fma(dx, dy, products)
     variances = (total[2] + WINDOW * squares) * (1 / (PIXELS - 1))
     covariance = (total[3] + WINDOW * products) * (1 / (PIXELS - 1))
 
     mid_x, mid_y = _middle(x, y, image, height, width)
-    ux, uy = mid_x + own_x, mid_y + own_y
+    ux, uy = mid_x + mean_x, mid_y + mean_y
     means_below = dr.rcp(dr.fma(ux, ux, dr.fma(uy, uy, C1)))
     spread_below = dr.rcp(variances + C2)
     means = dr.fma(2 * ux, uy, C1) * means_below
@@ -132,9 +132,9 @@ def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) 
     by_x = similarity * spread_below * (-2 / (PIXELS - 1))
     by_y = means * spread_below * (2 / (PIXELS - 1))
     # (uy - ux means) without its cancellation: means = 1 - apart^2 means_below.
-    apart = (mid_y - mid_x) + (own_y - own_x)
+    apart = (mid_y - mid_x) + (mean_y - mean_x)
     by_mean = spread * apart * dr.fma(ux * apart, means_below, 1) * means_below * (2 / PIXELS)
-    offset = by_mean - by_x * own_x - by_y * own_y
+    offset = by_mean - by_x * mean_x - by_y * mean_y
     return similarity, _store([offset, by_x, by_y, float_type(0)], float_type)
 
 

@@ -37,7 +37,7 @@ class NonFiniteReport:
 
     @classmethod
     def none(cls, names: Iterable[str]) -> NonFiniteReport:
-        """An empty report, for parameters of these names."""
+        """An empty report for parameters of these names."""
         none = cls(mi.UInt32(0), dr.zeros(mi.Float, 1 + len(watched_groups(names))))
         dr.make_opaque(none)  # a constant would be recorded as one
         return none
@@ -67,11 +67,12 @@ def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
 def guarded_step(
     adam: Adam, params: Params, loss: Any, mean: Params, decay: Any, number: Any, trouble: NonFiniteReport
 ) -> tuple[Params, NonFiniteReport, Any]:
-    """Differentiate a loss and take a step of Adam in place, unless a value is or was not finite.
+    """Differentiate a loss of ``params`` (`rated_params`) and take a step of Adam in place, unless a value is or was
+    not finite.
 
     Args:
         adam: optimiser that owns the parameters.
-        params: parameters from `rated_params`; they hold gradients afterwards.
+        params: parameters, which hold gradients afterwards.
         loss: loss, one value.
         mean: running mean of the parameters.
         decay: decay of the running mean.

@@ -158,13 +158,13 @@ def compress(
     how: Compression,
     on_progress: Callable[[str, int, Progress], None] = lambda stage, steps, progress: None,
 ) -> tuple[TrainConfig, Params]:
-    """A smaller field from a trained one, by training rows only.
+    """A smaller field from the settings and parameters of a trained one, by training and validation rows only.
 
     Args:
         config: settings of the trained field.
         params: its parameters.
         record: record of its fit.
-        split: split whose training and validation rows are used.
+        split: split of its fit.
         how: settings of the compression.
         on_progress: progress callback: stage, its number of steps, and the progress.
 

@@ -63,7 +63,7 @@ class Reach:
 
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
-        found = [self.distance(own, r) for r, own in enumerate(tx_pos_m) if len(own) and len(self.known_m[r])]
+        found = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]
         largest = float(np.max(np.concatenate(found), initial=0.0)) if found else 0.0
         return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
 
@@ -116,7 +116,7 @@ def choose_reach(
         The first reach with the best mean, metres, and its median score. Without held-out transmitters, the given reach
         and NaN.
     """
-    held = [r for r, own in enumerate(tx_pos_m) if len(own)]
+    held = [r for r, tx in enumerate(tx_pos_m) if len(tx)]
     best: tuple[float, float, float] = (-np.inf, reach.length_m, np.nan)
     for length in lengths if held else []:
         tried = replace(reach, length_m=length)

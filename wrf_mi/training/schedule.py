@@ -117,12 +117,12 @@ def density_rounds(config: DensityConfig, steps: int, first_stage: int = 0) -> f
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
-    counts = [len(own) // batch for own in rows]
+    counts = [len(known) // batch for known in rows]
     epochs = -(-steps // sum(counts))
     batches, owners = [], []
     for _ in range(epochs):
         chosen = np.concatenate(
-            [rng.permutation(own)[: n * batch].reshape(n, batch) for own, n in zip(rows, counts, strict=True)]
+            [rng.permutation(known)[: n * batch].reshape(n, batch) for known, n in zip(rows, counts, strict=True)]
         )
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])

@@ -42,7 +42,7 @@ def stands_still(field: Any) -> bool:
 
 
 class RecordedSignals:
-    """Signals of any field with static geometry, by its Dr.Jit function (`wrf_mi.gaussians.static_signals.Signals`)."""
+    """Signals of a field with static geometry, by its Dr.Jit function (`wrf_mi.gaussians.static_signals.Signals`)."""
 
     factors: ComplexArray | None = None
 
@@ -66,16 +66,7 @@ class RecordedSignals:
 
 
 class StaticOperator:
-    """A field with static geometry, evaluated by operator.
-
-    Args:
-        field: the model.
-        params: its parameters as NumPy arrays.
-        receivers: the receivers.
-        height: rows of a spectrum.
-        width: columns of a spectrum.
-        folder: folder in which operators are stored; None: in memory only.
-    """
+    """A field with static geometry at receivers, evaluated by operators that ``folder`` caches (None: memory only)."""
 
     def __init__(
         self,

@@ -120,9 +120,8 @@ def make_step(
         evaluation: evaluation of the report's Gaussians; None: one that Dr.Jit can record.
 
     Returns:
-        ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
-            StepReport)``: takes step ``number`` (from 1) of ``adam`` in place and returns the new running mean of the
-            parameters. Once ``trouble`` reports a value that is not finite, nothing changes any more.
+        Function that takes step ``number`` (from 1) of ``adam`` in place and returns the new running mean of the
+        parameters, the report of values that are not finite, after which nothing changes any more, and a `StepReport`.
     """
     values = math.prod(shape)
 
@@ -194,14 +193,10 @@ def evaluated(
 
 
 class CompiledPredictor:
-    """A prediction ``predict(params, tx_pos, pose, plane) -> greys``, without gradients.
+    """A prediction ``predict(params, tx_pos, pose, plane) -> greys`` of a field, without gradients.
 
     It is recorded, except for fields whose number of Gaussians needs chunks (`gaussians_in_parts`): recording saves
     nothing there, and lists of tiles, which a recorded function cannot count, have room for all.
-
-    Args:
-        field: the model.
-        skip: contributions that are not evaluated.
     """
 
     def __init__(self, field: Field, skip: Skip = NOTHING) -> None:
