@@ -29,7 +29,7 @@ SIZE = (20, 40)
 FIELDS = st.builds(
     lambda seed, count: made(count, np.random.default_rng(seed)), st.integers(0, 10**6), st.sampled_from([1, 8, 40])
 )
-FEW = settings(max_examples=12, deadline=None)
+FEW = settings(max_examples=8, deadline=None)
 
 
 def render(field: Field, blending: str, receiver: Receiver = RECEIVER) -> np.ndarray:

@@ -125,8 +125,11 @@ def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, 
     assert_same_bits(*both(serial, positions(load(flat)), two, tmp_path))
 
 
-def test_parallel_trace_of_random_paths_equals_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
+def test_parallel_trace_of_random_paths_equals_serial(
+    flat: Path, room: Path, two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Diffuse reflections are searched from receivers, diffraction from transmitters."""
+    monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind in ({"scattering": True}, {"diffraction": True}):
         options = TraceOptions(max_depth=1, rays=1 << 8, **kind)
         name = next(iter(kind))

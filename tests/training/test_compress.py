@@ -205,7 +205,7 @@ def test_sizes_of_networks_are_settings() -> None:
         ("model=wrf-gs", "network.phase_hz=1e9"),
         ("network.terms=4",),
     ):
-        with pytest.raises(InputError, match="leave it away"):
+        with pytest.raises(InputError, match="omit it"):
             field(*bad)
 
 
@@ -223,7 +223,7 @@ def test_skip_settings_reach_predictions(run: Path, one_gateway: Record) -> None
     assert 0 < np.abs(say[1.0][1] - say[0.0][1]).max() <= 1.0 + 1e-3
 
 
-def test_spectrum_times_are_interleaved(folder: Path, one_gateway: Record, tmp_path: Path) -> None:
+def test_budgets_are_stored_and_compared(folder: Path, one_gateway: Record, tmp_path: Path) -> None:
     record = replace(one_gateway, source=str(folder))
     small_one = ("model=factorised", "network.terms=2", "network.width=8")
     given = {

@@ -105,7 +105,7 @@ def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
         gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
 
 
-def test_initial_settings_accept_one_source(tmp_path: Path) -> None:
+def test_gaussians_start_from_the_source_in_the_settings(tmp_path: Path) -> None:
     scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
     own = receiver([3.0, 2.0, 1.0])
     record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))

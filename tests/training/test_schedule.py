@@ -180,7 +180,7 @@ def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
         plan_of(split_of(0, 1), 1, steps=10)
 
 
-def test_batch_size_counts_rows_that_join_at_step_zero() -> None:
+def test_without_hold_out_validation_rows_train_from_step_zero() -> None:
     split = split_of(0, 4)
     schedule = plan_of(split, 1, steps=10, batch=4, holdout_steps_fraction=0.0)
     assert schedule.rows.shape == (10, 4)

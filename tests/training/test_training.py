@@ -261,7 +261,7 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
     assert [p.gaussians for p in received] == [8, 8, 12, 12, 12, 18, 18, 18, 18, 18]
 
 
-def test_records_of_unsupported_tasks_are_refused(one_gateway: Record) -> None:
+def test_unsuitable_receivers_and_models_are_refused(one_gateway: Record) -> None:
     levels = replace(one_gateway, task="rssi", observation=one_gateway.observation[..., 0, 0])
     with pytest.raises(InputError, match="receiver model array does not report rssi; choose from power"):
         Trainer(levels, official(levels), settings("receiver=array"))

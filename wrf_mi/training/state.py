@@ -101,11 +101,10 @@ class FitState:
 
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and reset its momentum (opacity reset)."""
-        _, _, count = self.moments()
+        first, second, count = self.moments()
         self.adam[name] = to_tensor(values)
-        self.adam.reset(name)
-        value, promoted, rate, (_, m, v, _) = self.adam.state[name]
-        self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
+        nothing = {name: np.zeros_like(values)}
+        self._set_moments(first | nothing, second | nothing, count)
 
     def keep_best(self, score: float) -> None:
         """Keep the state if its score is the best so far."""
