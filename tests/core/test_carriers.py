@@ -226,9 +226,7 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("setting", ["calibration=gain", "target_error_db=1"])
-def test_calibration_and_target_error_refuse_several_carriers(
-    setting: str, flat: Record, room: Path, tmp_path: Path
-) -> None:
+def test_calibration_and_target_error_refuse_carriers(setting: str, flat: Record, room: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"rows at 2 carriers, .* calibration and target_error_db serve one carrier"):
         train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=[setting])
 
