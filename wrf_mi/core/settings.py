@@ -45,12 +45,17 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint)
 
 
+def _range(limits: Any) -> tuple[TypeAdapter[Any], str]:
+    return TypeAdapter(Annotated[float, limits, Field(allow_inf_nan=False)]), limits.description
+
+
 @cache
-def _limits(kind: Any) -> dict[str, Any]:
-    """Ranges of the numbers of a class; a subclass that changes a default keeps the range."""
+def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
+    """Ranges of all fields of a class, as if they were numbers; a subclass that changes a default keeps the range."""
     hints = [typing.get_type_hints(base, include_extras=True) for base in reversed(kind.__mro__)]
     items = (item for found in hints for item in found.items())
-    return {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
+    stated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
+    return {field.name: _range(stated.get(field.name, NOT_NEGATIVE)) for field in dataclasses.fields(kind)}
 
 
 def check(settings: Any, prefix: str = "") -> None:
@@ -60,17 +65,15 @@ def check(settings: Any, prefix: str = "") -> None:
         InputError: naming the setting, its value and the range.
     """
     kind: Any = type(settings)
-    limits_of = _limits(kind)
-    for field in dataclasses.fields(settings):
-        name, value = f"{prefix}{field.name}", getattr(settings, field.name)
+    for name, (adapter, words) in _ranges(kind).items():
+        value = getattr(settings, name)
         if dataclasses.is_dataclass(value):
-            check(value, f"{name}.")
+            check(value, f"{prefix}{name}.")
         elif isinstance(value, int | float):
-            limits = limits_of.get(field.name, NOT_NEGATIVE)
             try:
-                _adapter(Annotated[float, limits, Field(allow_inf_nan=False)]).validate_python(value)
+                adapter.validate_python(value)
             except ValidationError:
-                raise InputError(f"setting {name}: {value} is out of range, choose {limits.description}") from None
+                raise InputError(f"setting {prefix}{name}: {value} is out of range, choose {words}") from None
 
 
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
