@@ -24,7 +24,6 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
 from wrf_mi.graph.learned import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator
-from wrf_mi.receivers import Array
 from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
@@ -127,7 +126,7 @@ def differences(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m:
     signal = (gaussians.signal[0].numpy() + 1j * gaussians.signal[1].numpy())[None]
     array = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)(None, splat(gaussians, pose, plane)).numpy()
     power = PowerReceiver(HEIGHT, WIDTH, (CARRIER_HZ,))(None, learned_field(gaussians, pose, plane, True)).numpy()
-    own = ArrayOperator.of(gaussians, pose, plane, Array(ELEMENTS, CARRIER_HZ))
+    own = ArrayOperator.of(gaussians, pose, plane, ELEMENTS, CARRIER_HZ)
     return {
         "array": relative(own.spectrum(signal)[0], array),
         "pixels": relative(
@@ -174,10 +173,10 @@ def main() -> dict[str, Any]:
     direct = Direct(field, params)
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     gaussians = direct.gaussians(tx[0])
-    pose, plane, array = direct.pose, direct.plane, Array(ELEMENTS, CARRIER_HZ)
+    pose, plane = direct.pose, direct.plane
     model = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)
     build: dict[str, Callable[[], Any]] = {
-        "array": lambda: ArrayOperator.of(gaussians, pose, plane, array),
+        "array": lambda: ArrayOperator.of(gaussians, pose, plane, ELEMENTS, CARRIER_HZ),
         "pixels": lambda: PixelOperator.of(gaussians, pose, plane),
         "sectors": lambda: SectorOperator.of(gaussians, pose, plane, *SECTORS),
     }

@@ -22,7 +22,6 @@ from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.models.physics.selection import kind_of
 from wrf_mi.receivers import bartlett_spectrum, element_signals
-from wrf_mi.receivers.footprints import gaussian_signals
 from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.runs.timing import Call
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
@@ -146,14 +145,6 @@ def _square(elements: int) -> Any:
     return planar_array(side, side, SPACING_M)
 
 
-def _antennas_of_gaussians(elements: int) -> Call:
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal((GAUSSIANS, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    array_m, size = _square(elements), np.full(GAUSSIANS, np.radians(5))
-    return lambda: gaussian_signals(direction, size, array_m, FREQUENCY_HZ)
-
-
 @cache
 def _paths() -> Any:
     scene = open_scene("laboratory", FREQUENCY_HZ)
@@ -207,7 +198,6 @@ AXES: list[Axis] = [
     Axis("gaussians-networks", "networks of WRF-GS+", "Gaussians", HALF_TENS, _networks),
     Axis("directions-splat", "splatting", "directions", DIRECTIONS, _splat_directions),
     Axis("directions-array", "Bartlett spectrum", "directions", DIRECTIONS, _spectrum_of_directions),
-    Axis("antennas-gaussians", "Gaussians in closed form", "antennas", ANTENNAS, _antennas_of_gaussians),
     Axis("antennas-paths", "paths", "antennas", ANTENNAS, _antennas_of_paths),
     Axis("antennas-spectrum", "Bartlett spectrum", "antennas", ANTENNAS, _spectrum_of),
     Axis("transmitters-field", "WRF-GS+ of 90 Gaussians", "transmitters", TRANSMITTERS, _field),

@@ -30,10 +30,9 @@ from .stress_fields import BLENDINGS, HARD, RECEIVER, Field, felt_values, gradie
 from .stress_joint import CANCELLING, COPLANAR, joint
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
-from .stress_receivers import derivatives, of_fields
+from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import EXACT, IMAGE, GradientWorst, Row, Worst, relative, row, worst_of
 from .stress_traced import phases, traced_gradients
-from .stress_twins import twins
 
 SIZE = (30, 60)
 SMALL = (8, 16)
@@ -200,7 +199,7 @@ def main() -> dict[str, Any]:
         *field_functions(),
         *of_fields(50, 5),
         *derivatives(2),
-        *twins(25),
+        of_paths(25),
         *losses(10),
         *phases(),
         *traced_gradients(),
@@ -221,7 +220,7 @@ QUICK: Sequence[Callable[[], list[Row]]] = (
     lambda: field_functions(tries=3),
     lambda: of_fields(2, 1),
     lambda: derivatives(1, ("spectrum", "RSSI"), ("random", *HARDEST[:1])),
-    lambda: twins(1),
+    lambda: [of_paths(1)],
     lambda: losses(1),
     lambda: phases(5),
     lambda: traced_gradients(2),

@@ -115,7 +115,7 @@ class TracedOracle:
 
     def _constant(self, quantity: str, stated: FloatArray, least: float, values: Values) -> FloatArray:
         slabs = self._traced.slabs
-        if slabs.of == "surface":
+        if slabs.grouping == "surface":
             whole = values.get(name_of(SURFACE, quantity))
             return stated if whole is None else least + np.exp(whole)
         entries = [values.get(name_of(name, quantity)) for name in slabs.names]

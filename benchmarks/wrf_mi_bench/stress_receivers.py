@@ -10,7 +10,6 @@ spectra, which are many such sums, in shares of their own norm.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wrf_mi.backend.device import on_device as to_device
-from wrf_mi.core import pixel_directions
+from wrf_mi.core import Paths, Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
@@ -29,7 +28,9 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.learned import hemisphere_pair, learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
-from wrf_mi.receivers import Array, Pattern, array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.graph.ports import Ports, path_sum
+from wrf_mi.receivers import array_response, bartlett_spectrum, csi, element_signals, minmax_scale
+from wrf_mi.tracing.traced_field import TracedPaths
 
 from .stress_fields import BLENDINGS, HARD, ComplexArray, Field, felt_values, gradient, made, on_device, pose, reference
 from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
@@ -47,15 +48,6 @@ MODELS: dict[str, Any] = {
 }
 """Of the physics model, in Dr.Jit: the ones that are trained through."""
 DOUBLE: Any = dr.float64_array_t(mi.Float)
-
-
-@cache
-def _array() -> Array:
-    """Elements that differ, with a pattern, on a mount: everything that `Array` knows."""
-    rng = np.random.default_rng(0)
-    gain = np.exp(rng.normal(0, 0.2, 16) + 1j * rng.uniform(-0.5, 0.5, 16))
-    turn = np.array([0.02, -0.03, 0.05, 1.0])
-    return Array(ELEMENTS_M, CARRIER_HZ, gain, Pattern(1.2), turn / np.linalg.norm(turn))
 
 
 def _ordinary(rng: np.random.Generator) -> Field:
@@ -124,12 +116,12 @@ def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray
 
 def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray, field: Field) -> dict[str, float]:
     """Errors of the operators, built once and applied to the signals."""
-    plane, half, array = perception_plane(*SIZE, mi.Float), seen.size // 2, _array()
+    plane, half = perception_plane(*SIZE, mi.Float), seen.size // 2
     directions, weight = hemisphere_pair(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
-    ports = array.response(directions[:half]).T * weight[:half]
-    operator = ArrayOperator(port_matrix(gaussians, pose(mi.Float), plane, ports), array, *SIZE)
+    ports = array_response(ELEMENTS_M, directions[:half], CARRIER_HZ).T * weight[:half]
+    operator = ArrayOperator(port_matrix(gaussians, pose(mi.Float), plane, ports), ELEMENTS_M, CARRIER_HZ, *SIZE)
     h = ports @ seen[:half]
-    spectrum = array.image(h, *SIZE)
+    spectrum = bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE)
     signal = field.signal[None]
     sectors = SectorOperator(port_matrix(gaussians, pose(mi.Float), plane, weight[None], sphere=True))
     waves, wave = float((weight * np.abs(seen)).sum()) or 1.0, (weight * seen).sum()
@@ -171,3 +163,45 @@ def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: It
             cases += 1
         rows.append(worst.row(f"receiver: derivatives of {name}, {cases} cases", GRADIENT))
     return rows
+
+
+def of_paths(count: int, each: int = 50) -> Row:
+    """Element signals and CSI of paths of 1 m to 100 km at 28 GHz, Dr.Jit against NumPy, both with float64 phases."""
+    worst, carrier_hz = Worst(), 28e9
+    here = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    elements, tones = planar_array(4, 4, 0.005), carrier_hz * np.linspace(0.98, 1.02, 16)
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        length = 10 ** rng.uniform(0, 5, each)
+        arrival = unit_vectors(rng.uniform(0, 2 * np.pi, each), rng.uniform(-1.5, 1.5, each))
+        gain = 10 ** rng.uniform(-15, 15, each) * np.exp(2j * np.pi * rng.uniform(size=each))
+        traced = TracedPaths(
+            (DOUBLE(gain.real.copy()), DOUBLE(gain.imag.copy())),
+            DOUBLE(length),
+            [DOUBLE(np.ascontiguousarray(c)) for c in arrival.T],
+            1,
+            each,
+        )
+        none = np.zeros((each, 0))
+        known = Paths(
+            tx=np.zeros(each, np.int64),
+            rx=np.zeros(each, np.int64),
+            gain=gain,
+            length_m=length,
+            departure=-arrival,
+            arrival=arrival,
+            interactions=none.astype(np.int32),
+            vertices_m=np.zeros((each, 0, 3)),
+            objects=none.astype(np.int32),
+            object_names=(),
+            n_tx=1,
+            n_rx=1,
+        )
+        for ports, truth in (
+            (Ports(elements, np.full(16, carrier_hz)), element_signals(known, here, elements, carrier_hz)),
+            (Ports(np.zeros((16, 3)), tones), csi(known, tones)),
+        ):
+            re, im = path_sum(traced, ports)
+            off = np.abs(re.numpy() + 1j * im.numpy() - truth.ravel())
+            worst.add(off.max() / np.abs(gain).sum())
+    return worst.row(f"receiver: elements and CSI of paths at 28 GHz, 1 m to 100 km, {2 * count} cases", IMAGE)

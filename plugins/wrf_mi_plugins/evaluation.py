@@ -24,7 +24,7 @@ from wrf_mi.gaussians.tiles import Plane
 from wrf_mi.graph.learned import facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
 from wrf_mi.tracing.field_calculator import Complex
-from wrf_mi.tracing.material_parameters import Materials, slabs_of_faces
+from wrf_mi.tracing.material_parameters import MaterialGrouping, slabs_of_faces
 from wrf_mi.tracing.surfaces import scene_surfaces
 
 from . import register_all
@@ -53,7 +53,7 @@ class SceneWalls:
         InputError: a surface whose material is no slab.
     """
 
-    def __init__(self, scene: Any, materials: Materials = "named") -> None:
+    def __init__(self, scene: Any, materials: MaterialGrouping = "named") -> None:
         surfaces = scene_surfaces(scene)
         self._slabs, slab = slabs_of_faces(scene, surfaces, materials)
         if (slab < 0).any():

@@ -15,9 +15,8 @@ from wrf_mi_bench.stress_fields import HARD, Field, image, made, reference
 from wrf_mi_bench.stress_joint import joint
 from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
-from wrf_mi_bench.stress_receivers import derivatives, of_fields
+from wrf_mi_bench.stress_receivers import derivatives, of_fields, of_paths
 from wrf_mi_bench.stress_traced import traced_gradients
-from wrf_mi_bench.stress_twins import twins
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
@@ -81,7 +80,7 @@ def test_fits_end_finite_or_say_where_not() -> None:
 
 def test_receivers() -> None:
     hard = ("random", "needles, 1e6 to 1", "signals of 1e-15 to 1e15", "none")
-    for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), *twins(1)]:
+    for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), of_paths(1)]:
         assert held(row), row
 
 

@@ -1,4 +1,4 @@
-"""Patterns and polarisations of antennas: against Sionna RT, in files, as options, and what is refused."""
+"""Patterns and polarisations of antennas against Sionna RT, in files and as options."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_field_is_finite_along_the_axis(pattern: str) -> None:
         assert np.isfinite(field).all()
 
 
-def test_default_is_vertical_in_the_world_however_the_array_is_turned() -> None:
+def test_default_is_vertical_in_the_world_for_any_array_orientation() -> None:
     for turn in Rotation.random(5, rng=3).as_quat():
         assert np.array_equal(Antenna().to_world(turn), np.eye(3))
         turned = Antenna(frame="array").to_world(turn)
@@ -78,32 +78,32 @@ def made(antenna: Antenna) -> Record:
     return Record("made", "rssi", np.ones((2, 3)), receivers, np.zeros((2, 2), np.float32))
 
 
-def test_options_replace_what_the_data_state_and_leave_the_rest() -> None:
+def test_options_replace_only_the_given_properties() -> None:
     record = made(Antenna("dipole", "H"))
     assert AntennaOptions().of(record) is record
     changed = AntennaOptions(rx_polarization="V", tx_pattern="hw_dipole").of(record)
-    assert [astuple(one.antenna) for one in changed.receivers] == [("dipole", "V", "world")] * 2
+    assert [astuple(receiver.antenna) for receiver in changed.receivers] == [("dipole", "V", "world")] * 2
     assert changed.tx_antenna == Antenna("hw_dipole")
     with pytest.raises(InputError, match="state frame array"):
         AntennaOptions(rx_pattern="tr38901").of(record)
     assert AntennaOptions(rx_pattern="tr38901", rx_frame="array").of(record).receivers[1].antenna.frame == "array"
 
 
-def test_stored_receivers_are_the_same(tmp_path: Path) -> None:
+def test_stored_receivers_are_read_back(tmp_path: Path) -> None:
     words = [(p, q, f) for p in PATTERNS for q in POLARIZATIONS for f in FRAMES]
-    stated = [Antenna(*one) for one in words if (one[0], one[2]) != ("tr38901", "world")]
+    stated = [Antenna(p, q, f) for p, q, f in words if (p, f) != ("tr38901", "world")]
     rng = np.random.default_rng(2)
     given = [Receiver(f"r{i}", rng.normal(size=3), rng.normal(size=4), antenna) for i, antenna in enumerate(stated)]
     np.savez(tmp_path / "receivers.npz", **receiver_arrays(given))
     with np.load(tmp_path / "receivers.npz", allow_pickle=False) as arrays:
         read = stored_receivers(arrays)
-    for one, other in zip(given, read, strict=True):
-        assert (one.name, one.antenna) == (other.name, other.antenna)
-        np.testing.assert_array_equal(one.position_m, other.position_m)
-        np.testing.assert_array_equal(one.orientation_xyzw, other.orientation_xyzw)
+    for before, after in zip(given, read, strict=True):
+        assert (before.name, before.antenna) == (after.name, after.antenna)
+        np.testing.assert_array_equal(before.position_m, after.position_m)
+        np.testing.assert_array_equal(before.orientation_xyzw, after.orientation_xyzw)
 
 
-def test_turning_twice_is_the_same_antenna() -> None:
+def test_turning_the_polarisation_twice_is_the_identity() -> None:
     antenna = Antenna("dipole", "H", "array")
     assert antenna.turned.turned == antenna
     assert antenna.turned == replace(antenna, polarization="V")

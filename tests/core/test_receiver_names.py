@@ -54,13 +54,12 @@ def public_functions() -> dict[str, Callable[..., Any]]:
     from wrf_mi.models.physics.rssi import RssiPhysics
     from wrf_mi.models.physics.selection import PhysicsModel
     from wrf_mi.models.physics.spectrum import SpectrumPhysics
-    from wrf_mi.receivers.calibrate import fit_array
     from wrf_mi.runs.api import Run
     from wrf_mi.training.predictor import Predictor
 
     models = (CsiPhysics, MeasuredSpectrumPhysics, RssiPhysics, SpectrumPhysics, PhysicsModel, Run)
     found = {model.__name__: model.predict for model in models}
-    return {**found, "Predictor": Predictor.__call__, "fit_array": fit_array}
+    return {**found, "Predictor": Predictor.__call__}
 
 
 def test_functions_say_that_they_take_names() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
+from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import (
     Gaussians,
@@ -25,7 +26,7 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
 from wrf_mi.graph.learned import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, sector_of
-from wrf_mi.receivers import Array, Pattern, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers import bartlett_spectrum, minmax_scale
 
 SINGLE = 1e-5
 """Relative L2 error in float32: the weights are the same numbers, a sum of some hundred terms in another order."""
@@ -160,7 +161,7 @@ def test_no_gaussians(product: bool) -> None:
     operator = PixelOperator.of(empty, pose, plane)
     assert operator.weights.shape == (23 * 61, 0)
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()
-    array = ArrayOperator.of(empty, pose, plane, Array(planar_array(2, 2, 0.16), 920e6))
+    array = ArrayOperator.of(empty, pose, plane, planar_array(2, 2, 0.16), 920e6)
     assert not array.spectrum(np.zeros((1, 0), np.complex64)).any()
 
 
@@ -189,7 +190,7 @@ def test_batches_and_factors() -> None:
 def test_array_is_quadrature_and_bartlett(product: bool, scale: bool) -> None:
     gaussians, signal = hard(product, mi.Float)
     elements, pose, plane = planar_array(4, 4, 0.16), pose_of(mi.Float), perception_plane(90, 360, mi.Float)
-    operator = ArrayOperator.of(gaussians, pose, plane, Array(elements, 920e6))
+    operator = ArrayOperator.of(gaussians, pose, plane, elements, 920e6)
     model = ArrayReceiver(90, 360, elements, 920e6, instrument_scale=scale)
     direct = model(None, splat(gaussians, pose, plane)).numpy().reshape(90, 360)
     assert error(operator.spectrum(signal[None], scale)[0], direct) < ARRAY
@@ -209,32 +210,10 @@ def test_spectrum_of_element_signals(arrangement: str) -> None:
     }[arrangement]
     rng = np.random.default_rng(4)
     h = rng.standard_normal((5, len(elements))) + 1j * rng.standard_normal((5, len(elements)))
-    operator = ArrayOperator(np.eye(len(elements)), Array(elements, 920e6), 20, 31)
+    operator = ArrayOperator(np.eye(len(elements)), elements, 920e6, 20, 31)
     expected = bartlett_spectrum(h, elements, 920e6, 20, 31)
     assert error(operator.spectrum(h), expected) < SINGLE
     assert error(operator.spectrum(h[:1]), expected[:1]) < SINGLE
-
-
-def test_array_as_it_is_built() -> None:
-    """Gains, pattern and mount of the elements are in the matrix; the processor knows none of them."""
-    gaussians, signal = hard(False, mi.Float)
-    rng = np.random.default_rng(2)
-    array = Array(
-        planar_array(2, 3, 0.16),
-        920e6,
-        gain=rng.standard_normal(6) + 1j * rng.standard_normal(6),
-        pattern=Pattern(1.3),
-        mount_xyzw=np.array([0.1, 0.0, 0.0, np.sqrt(0.99)]),
-    )
-    pose, plane = pose_of(mi.Float), perception_plane(30, 120, mi.Float)
-    operator = ArrayOperator.of(gaussians, pose, plane, array)
-    field = complex_of(splat(gaussians, pose, plane)).astype(complex)
-    elevation = np.arange(30) * (np.pi / 60)
-    weight = np.cos(elevation) * (np.pi / 60) * (2 * np.pi / 120)
-    weight[0] /= 2
-    expected = array.signals(field * np.repeat(weight, 120), pixel_directions(30, 120).reshape(-1, 3))
-    assert error(operator.signals(signal[None])[0], expected) < ARRAY
-    assert error(operator.spectrum(signal[None])[0], array.image(expected, 30, 120)) < ARRAY
 
 
 @pytest.mark.parametrize("product", [True, False])
@@ -250,7 +229,10 @@ def test_sectors(product: bool) -> None:
     directions = np.concatenate([upper, upper * [1, -1, -1]])
     elevation = np.abs(np.arcsin(np.clip(directions[:, 2], -1, 1)))
     weight = np.cos(elevation) * (np.pi / 60) * (2 * np.pi / 90) * np.where(elevation < 1e-9, 0.5, 1)
-    pattern = Pattern(0.5)
+
+    def pattern(unit: FloatArray) -> FloatArray:
+        return np.sqrt(np.maximum(unit[..., 2], 0))
+
     field = complex_of(sphere) * weight * pattern(directions)
     inside = sector_of(directions, 6, 4)
     assert set(inside) == set(range(24))

@@ -1,11 +1,10 @@
-"""The registry of models: one from outside the package, by registration and by an installed entry point."""
+"""Registry of models: a model from outside the package, by registration and by an installed entry point."""
 
 from __future__ import annotations
 
 import csv
 import json
 import os
-import subprocess
 import sys
 import types
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, in_subprocess, refused
 
 import wrf_mi
 from wrf_mi import models
@@ -84,16 +83,16 @@ def registered() -> Iterator[None]:
     del models._MODELS._known["nearest"], sys.modules[module.__name__]
 
 
-def test_registered_model_is_trained_resumed_evaluated_asked_and_compared(
+def test_registered_model_is_trained_resumed_evaluated_and_compared(
     registered: None, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
         train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
     refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
-    told: list[tuple[str, float]] = []
-    run = resume(out, on_progress=lambda stage, share, _: told.append((stage, share)))
-    assert told == [("nearest rows", 0.0)]
+    reported: list[tuple[str, float]] = []
+    run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
+    assert reported == [("nearest rows", 0.0)]
     assert (run.metrics["model"], run.metrics["rows"]) == ("nearest", 24)
     assert 0 < run.metrics["inside_90"] <= 1
     assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
@@ -101,7 +100,7 @@ def test_registered_model_is_trained_resumed_evaluated_asked_and_compared(
     one = open_run(out).predict(record.tx_pos_m[:1], "anchor1")
     nearest = np.argsort(np.linalg.norm(record.tx_pos_m[:24] - record.tx_pos_m[0], axis=1))[:2]
     assert one.mean == pytest.approx([record.observation[0, nearest].mean()])
-    with pytest.raises(InputError, match="does not know how the transmitter is turned; leave heading_rad away"):
+    with pytest.raises(InputError, match="does not know how the transmitter is turned; omit heading_rad"):
         run.predict(record.tx_pos_m[:1], 0, [0.5])
     other = train(flat_folder, tmp_path / "blocked", "nearest", split="blocked")
     compare([out, other.folder], tmp_path / "page")
@@ -123,28 +122,26 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def test_model_of_an_installed_package_is_one_of_the_commands(
+def test_commands_find_the_model_of_an_installed_package(
     installed: dict[str, str], flat_folder: Path, tmp_path: Path
 ) -> None:
-    def command(*arguments: Any) -> str:
-        words = [sys.executable, "-m", "wrf_mi.cli", *map(str, arguments)]
-        done = subprocess.run(words, env=installed, capture_output=True, text=True, timeout=300, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
     out = tmp_path / "run"
-    trained = json.loads(
-        command("train", flat_folder, "--model", "nearest", "--set", "neighbours=1", "--out", out, "--json")
-    )
+    settings = ("--set", "neighbours=1", "--out", out, "--json")
+    (trained,) = in_subprocess(installed, ("train", flat_folder, "--model", "nearest", *settings))
     for name in ("model.npz", "metrics.json", "predictions.npz"):  # as a run that was stopped
         (out / name).unlink()
-    resumed, scored = (json.loads(command(*what, out, "--json")) for what in (("train", "--resume"), ("evaluate",)))
-    assert trained["abs_error_db"] == resumed["abs_error_db"] == scored["abs_error_db"]
     (tmp_path / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
-    command("predict", out, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz")
+    resumed, scored, *_ = in_subprocess(
+        installed,
+        ("train", "--resume", out, "--json"),
+        ("evaluate", out, "--json"),
+        ("predict", out, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz"),
+        ("compare", out, "--out", tmp_path / "page"),
+    )
+    errors = [json.loads(text)["abs_error_db"] for text in (trained, resumed, scored)]
+    assert errors[0] == errors[1] == errors[2]
     with np.load(tmp_path / "p.npz") as predicted:
         assert predicted["prediction"].shape == predicted["std"].shape == (2, 2)
-    command("compare", out, "--out", tmp_path / "page")
     assert "nearest" in (tmp_path / "page" / "index.html").read_text()
 
 
@@ -186,7 +183,7 @@ def test_runs_of_version_0_1_are_refused_by_every_command(
         assert call(["train", "--help"], capsys)[0] == 0
 
 
-def test_registry_imports_an_entry_when_it_is_asked_for() -> None:
+def test_registry_imports_entries_on_access() -> None:
     registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
     assert list(registry) == ["json"]
     assert registry["json"] is json.loads

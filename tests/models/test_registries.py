@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calling import in_subprocess
 from wrf_mi_bench import bench
 from wrf_mi_bench.bench import CHECKS, Check
 
@@ -77,7 +77,7 @@ def registered() -> Iterator[Any]:
     del receivers._RECEIVERS._known["attenuated"], sys.modules["attenuators"]
 
 
-def test_registered_receiver_is_trained_resumed_evaluated_asked_and_compared(
+def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
     registered: Any, flat_folder: Path, tmp_path: Path
 ) -> None:
     out, steps = tmp_path / "run", 0
@@ -100,7 +100,7 @@ def test_registered_receiver_is_trained_resumed_evaluated_asked_and_compared(
     assert compare([out], tmp_path / "page")
 
 
-def test_receiver_of_another_task_or_none_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
+def test_receiver_of_another_task_or_unknown_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="receiver model pixel does not report rssi; choose from power, attenuated"):
         train(flat_folder, tmp_path / "run", receiver="pixel")
     with pytest.raises(InputError, match="receiver model 'horn': unknown; choose from power, attenuated"):
@@ -124,22 +124,19 @@ def test_receivers_and_benchmarks_of_installed_packages_are_found(
     (site / "own_check.py").write_text(check)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *(part for part in sys.path if part)])}
 
-    def command(*arguments: Any) -> str:
-        words = [sys.executable, "-m", "wrf_mi.cli", *map(str, arguments)]
-        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    settings = [word for one in SETTINGS for word in ("--set", one)]
-    asked = ["train", flat_folder, "--receiver", "attenuated", "--out", tmp_path / "run", "--json", *settings]
-    assert json.loads(command(*asked))["task"] == "rssi"
-    command("bench", "attenuator", "--out", tmp_path / "results", "--runs", tmp_path / "runs")
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    trained, _ = in_subprocess(
+        environment,
+        ["train", flat_folder, "--receiver", "attenuated", "--out", tmp_path / "run", "--json", *settings],
+        ["bench", "attenuator", "--out", tmp_path / "results", "--runs", tmp_path / "runs"],
+    )
+    assert json.loads(trained)["task"] == "rssi"
     stored = json.loads((tmp_path / "results" / "attenuator.json").read_text())
     assert stored["figures"]["rows"] == [{"what": "attenuation", "value": "17.0 dB", "asked": "17 dB"}]
     assert "attenuation" in (tmp_path / "results" / "README.md").read_text()
 
 
-def test_a_registered_benchmark_is_one_of_the_checks() -> None:
+def test_registered_benchmark_is_listed() -> None:
     bench.register("own", Check("own", "json:dumps"))
     try:
         assert "own" in CHECKS

@@ -1,4 +1,4 @@
-"""The array in NumPy against closed forms, and against what the real spectra obey."""
+"""Array response and Bartlett spectrum against closed forms, and against measured spectra."""
 
 import os
 from pathlib import Path
@@ -27,7 +27,7 @@ needs_data = pytest.mark.skipif(
 )
 
 
-def test_planar_array():
+def test_planar_array_is_a_centred_grid():
     array = planar_array(2, 3, 0.1)
     np.testing.assert_allclose(
         array,
@@ -39,7 +39,7 @@ def test_planar_array():
             planar_array(*wrong)
 
 
-def test_response_is_the_phase_of_the_shorter_way():
+def test_element_nearer_to_the_source_leads_in_phase():
     """An element half a wavelength nearer to the source leads by pi; one across the wave is in phase."""
     half = speed_of_light / FREQUENCY_HZ / 2
     response = array_response([[0, 0, 0], [half, 0, 0], [0, half, 0], [half / 2, 0, 0]], [1, 0, 0], FREQUENCY_HZ)
@@ -48,7 +48,7 @@ def test_response_is_the_phase_of_the_shorter_way():
 
 @settings(max_examples=30, deadline=None)
 @given(row=st.integers(0, 29), column=st.integers(0, 89), phase=st.floats(0, 6), gain=st.floats(0.1, 10))
-def test_one_plane_wave_peaks_at_its_direction(row: int, column: int, phase: float, gain: float):
+def test_spectrum_of_a_plane_wave_peaks_at_its_direction(row: int, column: int, phase: float, gain: float):
     """Height 30 and width 90: the direction of a pixel is a sample, so the peak's value is exact."""
     array = planar_array(4, 4, SPACING_M)
     wave = gain * np.exp(1j * phase) * array_response(array, pixel_directions(30, 90)[row, column], FREQUENCY_HZ)
@@ -57,7 +57,7 @@ def test_one_plane_wave_peaks_at_its_direction(row: int, column: int, phase: flo
     assert spectrum.max() <= 16 * gain * (1 + EXACT)
 
 
-def test_spectrum_of_two_waves_is_their_array_factor():
+def test_spectrum_of_a_plane_wave_is_the_array_factor():
     """With the wave u, the spectrum at v is the product of two Dirichlet kernels of k d (u - v)."""
     array = planar_array(4, 4, SPACING_M)
     u = unit_vectors(0.7, 0.4)
@@ -70,14 +70,14 @@ def test_spectrum_of_two_waves_is_their_array_factor():
     assert several.shape == (2, 5, 9, 36)
 
 
-def test_minmax_scale():
+def test_minmax_scale_maps_constant_images_to_zero():
     images = np.array([[[1.0, 3], [2, 5]], [[7, 7], [7, 7]]])
     np.testing.assert_allclose(minmax_scale(images), [[[0, 0.5], [0.25, 1]], [[0, 0], [0, 0]]])
 
 
 @needs_data
 @pytest.mark.parametrize(("first_row", "obeys"), [(0, True), (1, False)])
-def test_real_spectra_are_bartlett_spectra_of_this_array(first_row: int, obeys: bool):
+def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, obeys: bool):
     """Squared, they lie in the span of the array's 49 lag harmonics; with elevations 1 to 90 they would not."""
     squared = load(Path(DATA or "", "rfid-lab")).observation[0].astype(float).reshape(200, -1) ** 2
     u = unit_vectors(np.radians(np.arange(360))[None, :], np.radians(np.arange(90) + first_row)[:, None])

@@ -16,6 +16,17 @@ EXACT = 1e-9
 IRREGULAR = np.array([[0, 0, 0], [0.13, 0.02, 0], [-0.03, 0.11, 0], [0.09, 0.15, 0.05]])
 
 
+def lags_of(lags: Lags, h: np.ndarray) -> np.ndarray:
+    """Lags [..., count] of snapshots [..., m]."""
+    products = (h[..., :, None] * h[..., None, :].conj()).reshape(*h.shape[:-1], -1)
+    return products.real @ lags.pairs[0] + products.imag @ lags.pairs[1]
+
+
+def squared(lags: Lags, values: np.ndarray) -> np.ndarray:
+    """Squared spectra [..., height, width] of lags [..., count]."""
+    return (values @ lags.basis.T).reshape(*values.shape[:-1], *lags.shape)
+
+
 def signals(count: int, batch: int = 3) -> np.ndarray:
     rng = np.random.default_rng(count)
     return rng.normal(size=(batch, count)) + 1j * rng.normal(size=(batch, count))
@@ -32,55 +43,52 @@ def signals(count: int, batch: int = 3) -> np.ndarray:
     ],
 )
 def test_lags_give_the_squared_spectrum_of_their_signals(elements: np.ndarray, count: int):
-    """A regular a x b array has (2 a - 1)(2 b - 1) lags; n elements without order n (n - 1) + 1; twins add none."""
+    """A regular a x b array has (2 a - 1)(2 b - 1) lags; n irregular ones n (n - 1) + 1; coinciding ones add none."""
     lags, h = Lags(elements, FREQUENCY_HZ, 10, 40), signals(len(elements))
-    squared = bartlett_spectrum(h, elements, FREQUENCY_HZ, 10, 40) ** 2
+    expected = bartlett_spectrum(h, elements, FREQUENCY_HZ, 10, 40) ** 2
     assert lags.count == count
-    np.testing.assert_allclose(lags.squared(lags.of_signals(h)), squared, atol=EXACT)
+    np.testing.assert_allclose(squared(lags, lags_of(lags, h)), expected, atol=EXACT)
     if elements is not IRREGULAR:
-        np.testing.assert_allclose(lags.of_squared(squared), lags.of_signals(h), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(lags.coordinates(expected), lags.to_coordinates(lags_of(lags, h)), atol=1e-7)
 
 
 def test_lags_of_a_plane_wave_are_those_of_its_direction():
     """h = exp(+j k p . u): each of the (4 - a)(4 - b) pairs of a lag has the phase k l . u; r_0 is 16."""
     elements, u = planar_array(4, 4, 0.16), pixel_directions(9, 36)[4, 7]
     lags = Lags(elements, FREQUENCY_HZ, 9, 36)
-    found = lags.of_signals(array_response(elements, u, FREQUENCY_HZ))
+    found = lags_of(lags, array_response(elements, u, FREQUENCY_HZ))
     assert found[0] == pytest.approx(16)
     steps = np.rint(np.abs(lags.lag_m[1:]) / 0.16)
     expected = (4 - steps[:, 0]) * (4 - steps[:, 1]) * array_response(lags.lag_m[1:], u, FREQUENCY_HZ)
     np.testing.assert_allclose(found[1:25] + 1j * found[25:], np.sqrt(2) * expected, atol=EXACT)
 
 
-def test_nearest_lags_of_an_image_that_has_none():
-    """Noise: what is left is across the span, so no other lags are nearer; a mean of snapshots is a mean of lags."""
+def test_residual_is_orthogonal_to_all_squared_spectra():
+    """So the projection is the nearest squared spectrum; coordinates keep distances of images in the span."""
     elements = planar_array(3, 3, 0.15)
     lags = Lags(elements, FREQUENCY_HZ, 12, 48)
     image = np.random.default_rng(0).normal(size=(2, 12, 48))
-    fitted = lags.of_squared(image)
-    left = image - lags.squared(fitted)
-    np.testing.assert_allclose(left, lags.residual(image), atol=EXACT)
-    np.testing.assert_allclose(left.reshape(2, -1) @ lags.basis, 0, atol=1e-8)
-    h = signals(9, 50)
+    np.testing.assert_allclose(lags.residual(image).reshape(2, -1) @ lags.basis, 0, atol=1e-8)
+    spectra = bartlett_spectrum(signals(9, 2), elements, FREQUENCY_HZ, 12, 48) ** 2
+    np.testing.assert_allclose(lags.residual(spectra), 0, atol=EXACT)
+    distance = np.linalg.norm(lags.coordinates(spectra[0]) - lags.coordinates(spectra[1]))
+    assert distance == pytest.approx(np.linalg.norm(spectra[0] - spectra[1]))
+
+
+def test_mean_of_snapshots_has_the_mean_of_their_lags():
+    elements, h = planar_array(3, 3, 0.15), signals(9, 50)
+    lags = Lags(elements, FREQUENCY_HZ, 12, 48)
     mean = (bartlett_spectrum(h, elements, FREQUENCY_HZ, 12, 48) ** 2).mean(axis=0)
-    np.testing.assert_allclose(lags.squared(lags.of_signals(h).mean(axis=0)), mean, atol=EXACT)
+    np.testing.assert_allclose(squared(lags, lags_of(lags, h).mean(axis=0)), mean, atol=EXACT)
 
 
-def test_row_offset_raises_all_elevations():
-    elements, h = planar_array(2, 2, 0.16), signals(4)
-    raised = Lags(elements, FREQUENCY_HZ, 9, 36, row_offset=1)
-    squared = raised.squared(raised.of_signals(h))
-    plain = bartlett_spectrum(h, elements, FREQUENCY_HZ, 9, 36) ** 2
-    np.testing.assert_allclose(squared[:, :-1], plain[:, 1:], atol=EXACT)
-
-
-def test_what_cannot_be_told_apart_is_refused():
+def test_ambiguous_grids_and_wrong_elements_are_refused():
     upright = planar_array(4, 4, 0.16) @ np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
     lags = Lags(np.concatenate([upright, [[0.03, 0.02, 0.01]]]), FREQUENCY_HZ, 2, 5)
     with pytest.raises(InputError, match="cannot be told apart"):
-        lags.of_squared(np.zeros((2, 5)))
+        lags.coordinates(np.zeros((2, 5)))
     with pytest.raises(InputError, match="build the lags for its grid"):
-        Lags(planar_array(2, 2, 0.1), FREQUENCY_HZ, 9, 36).of_squared(np.zeros((3, 9, 35)))
+        Lags(planar_array(2, 2, 0.1), FREQUENCY_HZ, 9, 36).coordinates(np.zeros((3, 9, 35)))
     for wrong in (np.zeros((4, 2)), np.full((4, 3), np.nan), np.zeros((0, 3))):
         with pytest.raises(InputError, match="give finite"):
             Lags(wrong, FREQUENCY_HZ, 9, 36)

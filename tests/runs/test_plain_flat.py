@@ -135,5 +135,5 @@ def test_length_over_headings_is_refused(
 ) -> None:
     assert load(plain_flat_folder).tx_heading_rad is None
     given = ["train", plain_flat_folder, "--model", "kriging", "--out", tmp_path / "run", "--set", "heading_length=1"]
-    refused(given, "plain: has no headings for kriging's heading_length; leave the setting away", capsys)
+    refused(given, "plain: has no headings for kriging's heading_length; omit the setting", capsys)
     assert not (tmp_path / "run").exists()

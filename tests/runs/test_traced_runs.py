@@ -144,7 +144,7 @@ def test_headings_are_refused_where_unused_and_demanded_where_used(
     heading = np.zeros(len(read_run(run).row))
     for folder, headings, message in [
         (calibrated, None, "the model needs headings; give heading_rad"),
-        (run, heading, "does not know how the transmitter is turned; leave heading_rad away"),
+        (run, heading, "does not know how the transmitter is turned; omit heading_rad"),
     ]:
         asked = asked_rows(folder, record, tmp_path / "tx.csv", headings)
         status, _, err = call(["predict", folder, "--tx", asked, "--out", out], capsys)
@@ -166,7 +166,7 @@ def test_calibrated_run_of_data_without_headings_predicts_without(
     predict_to_file(run, record.tx_pos_m[read.row], tmp_path / "p.npz")
     with np.load(tmp_path / "p.npz") as stored:
         assert stored["prediction"] == pytest.approx(read.prediction, abs=FLOAT32_DB)
-    with pytest.raises(InputError, match="leave heading_rad away"):
+    with pytest.raises(InputError, match="omit heading_rad"):
         predict_to_file(run, record.tx_pos_m[:2], tmp_path / "q.npz", np.zeros(2))
 
 

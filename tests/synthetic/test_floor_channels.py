@@ -15,14 +15,13 @@ from wrf_mi_scenes.furnished import measured_parts, write_scene
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, read_nerf2_csi
-from wrf_mi.receivers import csi, element_signals
+from wrf_mi.receivers import array_channels, csi, element_signals
 from wrf_mi.runs.evaluate import evaluate
 from wrf_mi.synthetic import load_record, walked_channels
 from wrf_mi.synthetic.floor_channels import CARRIER_HZ, DOWNLINK_HZ, PLACES, UPLINK_HZ, Walk, users_way, with_noise
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.array_channels import array_channels
 from wrf_mi.tracing.devices import check_devices
 from wrf_mi.tracing.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer

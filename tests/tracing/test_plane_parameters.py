@@ -1,4 +1,4 @@
-"""Planes and materials of surfaces as parameters of the traced side: what moves, what it costs, who shares it."""
+"""Planes and materials of surfaces as parameters of traced fields, and corrected scenes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ import mitsuba as mi
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.material_parameters import Materials
+from wrf_mi.tracing.material_parameters import MaterialGrouping
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
 from wrf_mi.tracing.surfaces import scene_surfaces
 from wrf_mi.tracing.walls import walls_of
@@ -39,9 +39,9 @@ OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
 FILE_M = 1e-6
 """Corners of mesh files are float32: 5e-7 m at 6 m, and as much again after a reflection."""
 GAIN = 3e-6
-"""Relative; gains change with the length that corners in float32 give them."""
+"""Relative; gains change with lengths, which follow float32 corners."""
 SHIFT_M, TILT_RAD = 0.05, 0.02
-MATERIALS: tuple[Materials, ...] = ("named", "surface")
+MATERIALS: tuple[MaterialGrouping, ...] = ("named", "surface")
 TURNED = np.array([[np.cos(TILT_RAD), 0, np.sin(TILT_RAD)], [0, 1, 0], [-np.sin(TILT_RAD), 0, np.cos(TILT_RAD)]])
 
 
@@ -81,7 +81,7 @@ def tensors(traced: TracedField) -> dict[str, Any]:
 
 
 def strongest(traced: TracedField, parameters: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths, sorted, and gains of all paths in that order."""
+    """Lengths of all paths in ascending order, and their gains."""
     paths, there = traced(parameters), traced.exists
     length = paths.length_m.numpy()[there]
     gain = (paths.gain[0].numpy() + 1j * paths.gain[1].numpy())[there]
@@ -90,11 +90,11 @@ def strongest(traced: TracedField, parameters: dict[str, Any]) -> tuple[np.ndarr
 
 
 @pytest.mark.parametrize(("shift_m", "tilted"), [(SHIFT_M, False), (0.0, True), (-SHIFT_M, True)])
-def test_moved_planes_are_those_of_a_scene_that_has_them_there(tmp_path: Path, shift_m: float, tilted: bool) -> None:
+def test_paths_at_moved_planes_are_those_of_a_moved_mesh(tmp_path: Path, shift_m: float, tilted: bool) -> None:
     """Lengths and gains of reflections at a shifted and tilted ceiling, from a mesh of it and from parameters."""
-    options, own = TracedOptions(replace(OPTIONS, max_depth=1)), receiver((30, 20, 10))
-    stated = TracedField(room(tmp_path / "stated", CEILING), transmitters(4), own, options)
-    there = TracedField(room(tmp_path / "there", ceiling(shift_m, tilted)), transmitters(4), own, options)
+    options, array = TracedOptions(replace(OPTIONS, max_depth=1)), receiver((30, 20, 10))
+    stated = TracedField(room(tmp_path / "stated", CEILING), transmitters(4), array, options)
+    there = TracedField(room(tmp_path / "there", ceiling(shift_m, tilted)), transmitters(4), array, options)
     length, gain = strongest(stated, moved_values(stated.scene, shift_m, tilted))
     expected = strongest(there, {})
     assert len(length) == 8
@@ -103,8 +103,7 @@ def test_moved_planes_are_those_of_a_scene_that_has_them_there(tmp_path: Path, s
     assert np.abs(length - strongest(stated, {})[0]).max() > 0.005
 
 
-def test_planes_move_as_those_of_the_physics_model(scene: Any) -> None:
-    """`Walls.moved` in NumPy."""
+def test_planes_move_as_walls_in_numpy(scene: Any) -> None:
     surfaces = scene_surfaces(scene)
     change = np.random.default_rng(0).normal(0, 0.05, (len(surfaces.normal), 3))
     expected = walls_of(surfaces).moved(change)
@@ -113,8 +112,8 @@ def test_planes_move_as_those_of_the_physics_model(scene: Any) -> None:
     np.testing.assert_allclose(offset.numpy(), expected.offset_m, atol=1e-14)
 
 
-def test_planes_as_stated_are_where_they_were(scene: Any) -> None:
-    """Zeros change nothing but the last digits; shared surfaces start from their named material."""
+def test_zero_parameters_leave_paths_unchanged(scene: Any) -> None:
+    """To rounding; surfaces start from their named material."""
     plain = TracedField(scene, transmitters(3), receiver(), TracedOptions(OPTIONS))
     each = TracedField(scene, transmitters(3), receiver(), TracedOptions(OPTIONS, materials="surface", planes=True))
     assert not {SHIFT, TILT} & set(plain.parameters())
@@ -126,8 +125,8 @@ def test_planes_as_stated_are_where_they_were(scene: Any) -> None:
         np.testing.assert_allclose(gain, expected[1], rtol=1e-12, atol=1e-18)
 
 
-def test_held_planes_cost_nothing(scene: Any) -> None:
-    """Without their parameters kernels are the same, number and code, as of a field that has no planes to move."""
+def test_fixed_planes_take_no_kernels(scene: Any) -> None:
+    """Without parameters of planes the kernels are those of a field without movable planes."""
 
     def kernels(options: TracedOptions, *names: str) -> list[str]:
         traced = TracedField(scene, transmitters(3), receiver(), options)
@@ -147,7 +146,7 @@ def test_held_planes_cost_nothing(scene: Any) -> None:
 
 
 def test_each_surface_has_a_material(scene: Any) -> None:
-    """Walls of one material differ once theirs do; a path that meets none of them stays as it is."""
+    """A surface's material changes only the paths that meet the surface."""
     options = TracedOptions(replace(OPTIONS, max_depth=1), materials="surface")
     traced = TracedField(scene, transmitters(2), receiver(), options)
     names = [name.partition("/")[0] for name in traced.slabs.names]
@@ -166,9 +165,9 @@ def test_each_surface_has_a_material(scene: Any) -> None:
     assert not set(changes["west"]) & set(changes["north"])
 
 
-def test_a_material_that_is_no_slab_is_named(scene: Any) -> None:
-    for of in MATERIALS:
-        traced = TracedField(scene, transmitters(2), receiver(), TracedOptions(OPTIONS, materials=of))
+def test_material_that_is_not_a_slab_is_refused(scene: Any) -> None:
+    for grouping in MATERIALS:
+        traced = TracedField(scene, transmitters(2), receiver(), TracedOptions(OPTIONS, materials=grouping))
         traced._slab_of_face[:] = -1  # as of a material without a permittivity
         with pytest.raises(InputError, match="is not a slab"):
             traced.search(receiver().position_m)
@@ -182,13 +181,18 @@ def record_of(receivers: tuple[Receiver, ...], tx: np.ndarray, observation: np.n
 def trainer_of(record: Record, scene: Any, parts: str, *settings: str) -> Trainer:
     """Paths alone, trained on all rows."""
     rows = np.arange(len(record))
-    own = ("traced.rays=4096", "optimiser.warm_up=10", "holdout_steps_fraction=0", "patience=0", f"batch={len(record)}")
-    config = with_settings(calibration_config(parts.split(","), record.task == "spectrum"), [*own, *settings])
+    common = (
+        "traced.rays=4096",
+        "optimiser.warm_up=10",
+        "holdout_steps_fraction=0",
+        "patience=0",
+        f"batch={len(record)}",
+    )
+    config = with_settings(calibration_config(parts.split(","), record.task == "spectrum"), [*common, *settings])
     return Trainer(record, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=scene)
 
 
-def test_planes_are_found_again(scene: Any, tmp_path: Path) -> None:
-    """Channels of a room whose ceiling hangs lower and slants tell where it is."""
+def test_training_finds_a_lowered_and_tilted_ceiling(scene: Any, tmp_path: Path) -> None:
     tx, model = transmitters(12, seed=3), CsiReceiver(2, 4, (FREQUENCY_HZ, 1.02 * FREQUENCY_HZ))
     options = TracedOptions(replace(OPTIONS, max_depth=1), planes=True)
     true = TracedField(room(tmp_path, {**WALLS, **ceiling(-0.02, True), **PARTITION}), tx, receiver(), options)
@@ -201,7 +205,7 @@ def test_planes_are_found_again(scene: Any, tmp_path: Path) -> None:
     miss = np.abs(trainer.predictor()(tx) - observed).mean() / np.abs(observed).mean()
     plane, values = plane_of(scene, "ceiling"), trainer.state.params()
     expected = {name: value.numpy() for name, value in moved_values(scene, -0.02, True).items()}
-    # Where the ceiling is met, not at its centre: shift and tilt are told apart over 0.3 m of it alone.
+    # Height at the reflections, not at the centre: over 0.3 m of the ceiling, shift and tilt are hardly distinct.
     spot = np.array([3.0, 2.3, HEIGHT])
     tables = walls_of(scene_surfaces(scene))
 
@@ -216,12 +220,12 @@ def test_planes_are_found_again(scene: Any, tmp_path: Path) -> None:
 
 
 def test_receivers_share_planes_and_keep_their_recordings(scene: Any) -> None:
-    """A search for paths at one receiver, and steps on it, leave the recorded steps of the others as they are."""
+    """A new search at a receiver, and its steps, leave the recorded steps of the others unchanged."""
     array = planar_array(3, 3, 0.16)
-    own = replace(receiver((10, 5, 0)), array_m=array)
-    other = Receiver("tag", np.array([1.0, 4.0, 2.0]), own.orientation_xyzw, array_m=array)
+    moving = replace(receiver((10, 5, 0)), array_m=array)
+    other = Receiver("tag", np.array([1.0, 4.0, 2.0]), moving.orientation_xyzw, array_m=array)
     tx, spectra = transmitters(4), np.random.default_rng(0).uniform(0, 1, (2, 4, 8, 16)).astype(np.float32)
-    record = record_of((own, other), tx, spectra, "spectrum")
+    record = record_of((moving, other), tx, spectra, "spectrum")
     settings = "traced.materials=surface", "traced.material=0.05", "traced.position=1e-4", "steps=40"
     trainer = trainer_of(record, scene, "planes", "traced.depth=2", *settings)
     names = {SHIFT, TILT, "material.surface.permittivity", "receiver.array.position", "receiver.tag.position"}
@@ -230,35 +234,35 @@ def test_receivers_share_planes_and_keep_their_recordings(scene: Any) -> None:
     first, second = trainer._steps[0, 1, True], trainer._steps[1, 1, True]
     recordings = second.n_recordings
     before = trainer.state.params()
-    # As a step does once the receiver is further than a quarter of a wavelength from where it was.
+    # As a step does once the receiver has moved by more than a quarter of a wavelength.
     side = trainer._sides[0]
     assert side is not None
-    side.search(own.position_m + np.array([0.05, 0, 0]))
+    side.search(moving.position_m + np.array([0.05, 0, 0]))
     trainer.run(stop=stop_after(6))
     assert [side.searches for side in trainer._sides if side is not None] == [2, 1]
     assert trainer._steps[0, 2, True] is not first
     assert trainer._steps[1, 1, True] is second
     assert (0, 1, True) not in trainer._steps
     assert second.n_recordings == recordings
-    # Steps at either receiver move the planes, and the replayed step sees where they are.
+    # Steps at either receiver move the planes.
     assert np.abs(trainer.state.params()[SHIFT] - before[SHIFT]).max() > 0
 
 
-def test_rates_of_the_configuration(scene: Any) -> None:
-    """Planes are held unless a rate is given; every parameter has a rate, and a prefix by which training knows it."""
+def test_planes_have_no_learning_rate_by_default(scene: Any) -> None:
+    """Every parameter has a rate, and a prefix by which training recognises it."""
     options = TracedOptions(OPTIONS, 1, materials="surface", planes=True)
     names = TracedField(scene, transmitters(1), receiver(), options).parameters()
     assert all(name.startswith(TRACED_NAMES) for name in names)
-    held = {name for name in names if TracedConfig().rate(name) == 0}
-    assert held == {SHIFT, TILT, "receiver.array.position", "receiver.array.turn"}
+    fixed = {name for name in names if TracedConfig().rate(name) == 0}
+    assert fixed == {SHIFT, TILT, "receiver.array.position", "receiver.array.turn"}
     free = TracedConfig(shift=0.01, tilt=0.02)
     assert (free.rate(SHIFT), free.rate(TILT)) == (0.01, 0.02)
     assert free.moves_planes
     assert not TracedConfig().moves_planes
 
 
-def test_a_corrected_scene_has_its_planes_there_and_stays_closed(scene: Any, tmp_path: Path) -> None:
-    """Paths of the folder that is written are those of the parameters; edges of the room are shared as before."""
+def test_corrected_scene_has_moved_planes_and_stays_closed(scene: Any, tmp_path: Path) -> None:
+    """Its paths are those of the parameters; the corners of the room stay shared."""
     rng, options = np.random.default_rng(2), TracedOptions(replace(OPTIONS, max_depth=1))
     traced = TracedField(scene, transmitters(3), receiver((30, 20, 10)), replace(options, planes=True))
     count = len(traced.surfaces.normal)
@@ -270,8 +274,8 @@ def test_a_corrected_scene_has_its_planes_there_and_stays_closed(scene: Any, tmp
     np.testing.assert_allclose(length, expected[0], atol=FILE_M)
     np.testing.assert_allclose(gain, expected[1], rtol=GAIN, atol=GAIN * np.abs(gain).max())
 
-    def corners(of: Any) -> int:
-        return len(np.unique(np.round(scene_surfaces(of).triangles.reshape(-1, 3), 4), axis=0))
+    def corners(folder_scene: Any) -> int:
+        return len(np.unique(np.round(scene_surfaces(folder_scene).triangles.reshape(-1, 3), 4), axis=0))
 
     # Eight of the room and four of the partition, before as after.
     assert corners(scene) == corners(again) == 12

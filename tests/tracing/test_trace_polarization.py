@@ -1,4 +1,4 @@
-"""Antennas of traced arrays: turned frames, cross-polarised links and what is said of them, the command's options."""
+"""Antennas of traced arrays: turned frames, warnings of cross-polarised links, the command's options."""
 
 from __future__ import annotations
 
@@ -14,18 +14,24 @@ from calling import call
 from scipy.spatial.transform import Rotation
 from traced_rooms import SHOEBOX, write_xml
 
-from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record
+from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.core.settings import with_settings
+from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
 from wrf_mi.tracing.polarization import GAIN_DB, cross_polarized
+from wrf_mi.training.config import TrainConfig
+from wrf_mi.training.trainer import Trainer
 
 HZ = 920e6
 OPTIONS = TraceOptions(max_depth=1, rays=1 << 12)
 ARRAY_M = planar_array(4, 4, 0.16)
 STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # boresight -x, the array's y axis up
+
+
+WARNING = "try --rx-polarization H or --rx-frame world"
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +80,16 @@ def median(run: Path) -> float:
 
 
 def test_turning_the_frame_about_its_normal_rolls_the_spectrum(scene: Any) -> None:
-    """A square array sees the same sky from another azimuth: antennas that are vertical in the world stay so."""
+    """A square array sees the same sky from another azimuth if its antennas stay vertical in the world."""
     tx, turned = places(4), 90 // 3
     spectra = [spectra_of(scene, array(degrees, Antenna()), tx) for degrees in (0, 90)]
     np.testing.assert_allclose(np.roll(spectra[0], -turned, axis=-1), spectra[1], atol=1e-4)
-    own = [spectra_of(scene, array(degrees, Antenna(frame="array")), tx) for degrees in (0, 90)]
-    np.testing.assert_allclose(own[0], spectra[0], atol=1e-4)  # the array's y axis is up
-    assert np.abs(np.roll(own[0], -turned, axis=-1) - own[1]).max() > 0.1
+    framed = [spectra_of(scene, array(degrees, Antenna(frame="array")), tx) for degrees in (0, 90)]
+    np.testing.assert_allclose(framed[0], spectra[0], atol=1e-4)  # the array's y axis is up
+    assert np.abs(np.roll(framed[0], -turned, axis=-1) - framed[1]).max() > 0.1
 
 
-def test_a_turned_array_is_traced_as_it_measured(
+def test_spectra_of_a_turned_array_are_traced(
     xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert median(train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS).folder) > 0.99
@@ -125,7 +131,7 @@ def test_only_cross_polarised_receivers_are_found(scene: Any) -> None:
     assert found["gateway2"] > GAIN_DB
 
 
-def test_receivers_with_different_antennas_are_each_traced_with_their_own(scene: Any) -> None:
+def test_each_receiver_is_traced_with_its_antenna(scene: Any) -> None:
     antennas = [Antenna(), Antenna("dipole", "H"), Antenna("tr38901", "V", "array"), Antenna("hw_dipole")]
     receivers = [replace(array(20, a), name=f"gateway{i}") for i, a in enumerate(antennas)]
     tx = places(3)
@@ -135,8 +141,8 @@ def test_receivers_with_different_antennas_are_each_traced_with_their_own(scene:
         np.testing.assert_allclose(together.gain[together.rx == index], alone.gain, rtol=1e-5, atol=1e-9)
 
 
-def test_transmitters_antenna_is_traced(scene: Any) -> None:
-    """Along a horizontal line of sight a horizontal transmitter reaches a horizontal antenna alone."""
+def test_transmitters_are_traced_with_their_antenna(scene: Any) -> None:
+    """Along a horizontal line of sight a horizontal transmitter reaches a horizontal antenna only."""
     tx = np.array([[2.0, 2.4, 1.1]])
     direct = TraceOptions(max_depth=0)
     gains = {
@@ -152,9 +158,7 @@ def test_transmitters_antenna_is_traced(scene: Any) -> None:
     assert max(gains["H", "V"], gains["V", "H"]) < 1e-5 * gains["V", "V"]
 
 
-def test_a_run_predicts_with_the_antennas_that_it_was_traced_with(
-    scene: Any, xml: Path, turned_folder: Path, tmp_path: Path
-) -> None:
+def test_run_predicts_with_its_antennas(scene: Any, xml: Path, turned_folder: Path, tmp_path: Path) -> None:
 
     antennas = AntennaOptions(rx_pattern="tr38901", rx_frame="array", rx_polarization="H", tx_pattern="dipole")
     out = train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas).folder
@@ -180,29 +184,31 @@ def test_antenna_options_are_refused_where_nothing_is_traced(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
+def test_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_path: Path) -> None:
     antennas = AntennaOptions(rx_pattern="tr38901")
     with pytest.raises(InputError, match="state frame array"):
         train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas)
     assert not (tmp_path / "run").exists()
 
 
-def test_the_physics_follows_the_stated_antennas(xml: Path, turned_folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_physics_has_the_stated_antennas_and_warns_of_crossed_ones(
+    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any
+) -> None:
     """Physics alone: its spectra are those of the ray tracer with the same antennas."""
     for name, stated in (("vertical", []), ("crossed", ["--rx-frame", "array"])):
         asked = ["train", turned_folder, "--model", "physics", "--scene", xml, "--n-train", "0", *stated]
         status, _, err = call([*asked, "--set", "reflections=1", "--out", tmp_path / name], capsys)
         assert status == 0, err
+        assert (WARNING in caplog.text) is (name == "crossed")
     assert median(tmp_path / "vertical") > median(tmp_path / "crossed") + 0.1
 
 
-@pytest.mark.parametrize("model", ["physics", "wrf-gs+"])
-def test_training_with_a_scene_warns_of_crossed_polarisation(
-    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any, model: str
+def test_joint_training_warns_of_crossed_polarisation(
+    scene: Any, turned_folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    quick = {"physics": ["--n-train", "0", "--set", "reflections=1"], "wrf-gs+": ["--set", "steps=1"]}[model]
-    asked = ["train", turned_folder, "--model", model, "--scene", xml, *quick]
-    for stated, warned in (([], False), (["--rx-frame", "array"], True)):
-        status, _, err = call([*asked, *stated, "--out", tmp_path / str(warned)], capsys)
-        assert status == 0, err
-        assert ("try --rx-polarization H or --rx-frame world" in caplog.text) is warned
+    rows = np.arange(4)
+    split = Split("all", 0, rows, rows[:0], rows[:0])
+    config = with_settings(TrainConfig(), ["model=wrf-gs+", "traced.depth=1", "traced.rays=4096"])
+    for options, warned in ((AntennaOptions(), False), (AntennaOptions(rx_frame="array"), True)):
+        Trainer(options.of(load(turned_folder)), split, config, scene=scene)
+        assert (WARNING in caplog.text) is warned

@@ -1,4 +1,4 @@
-"""Paths as a file, and their gains anew for other materials, frequencies and antennas."""
+"""Files of traces, and recomputed gains for other materials, frequencies and antennas."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -39,7 +39,7 @@ def close(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_allclose(a, b, atol=SINGLE * np.abs(b).max())
 
 
-def test_a_file_gives_back_what_was_written(traced: TraceResult, tmp_path: Path):
+def test_stored_traces_are_read_back(traced: TraceResult, tmp_path: Path):
     read = load_trace(save_trace(tmp_path / "paths.npz", traced))
     for field in fields(Paths):
         np.testing.assert_array_equal(getattr(read.paths, field.name), getattr(traced.paths, field.name))
@@ -56,7 +56,7 @@ def test_a_file_gives_back_what_was_written(traced: TraceResult, tmp_path: Path)
     assert {path.name for path in tmp_path.iterdir()} == {"paths.npz"}
 
 
-def test_wrong_files(traced: TraceResult, tmp_path: Path, scene: Any):
+def test_wrong_files_are_refused(traced: TraceResult, tmp_path: Path, scene: Any):
     with pytest.raises(InputError, match="missing; trace"):
         load_trace(tmp_path / "none.npz")
     (tmp_path / "bad.npz").write_bytes(b"PK no")
@@ -92,7 +92,7 @@ def test_recomputed_gains_are_the_traced_ones(traced: TraceResult, scene: Any, t
     np.testing.assert_array_equal(recompute(read, scene).paths.gain, traced.paths.gain)
 
 
-def test_other_materials_give_what_a_new_trace_gives(traced: TraceResult, scene: Any):
+def test_recomputed_gains_for_other_materials_are_those_of_a_new_trace(traced: TraceResult, scene: Any):
     for name, thickness in (("itu_concrete", 0.37), ("itu_plasterboard", 0.013)):
         scene.radio_materials[name].thickness = thickness
     brick = scene.radio_materials["itu_brick"]
@@ -105,14 +105,14 @@ def test_other_materials_give_what_a_new_trace_gives(traced: TraceResult, scene:
     assert np.abs(again.gain - traced.paths.gain).max() > 1e-2 * np.abs(traced.paths.gain).max()
 
 
-def test_another_frequency(traced: TraceResult, xml: Path):
+def test_recomputed_gains_at_another_frequency_are_those_of_a_new_trace(traced: TraceResult, xml: Path):
     scene = open_scene(xml, 5.2e9)
     again = recompute(traced, scene)
     assert again.frequency_hz == pytest.approx(5.2e9, rel=1e-6)
     close(again.paths.gain, trace_paths(scene, traced.tx_pos_m, traced.receivers, OPTIONS).paths.gain)
 
 
-def test_a_dipole_has_its_pattern(traced: TraceResult, scene: Any):
+def test_recomputed_gains_of_dipoles_have_their_pattern(traced: TraceResult, scene: Any):
     """A half-wave dipole's directivity is 1.64 at the horizon, and cos(pi/2 cos) / sin elsewhere, at both ends."""
     direct = traced.select(traced.paths.bounces == 0)
     assert len(direct.paths)
@@ -123,7 +123,7 @@ def test_a_dipole_has_its_pattern(traced: TraceResult, scene: Any):
     np.testing.assert_allclose(np.abs(dipole / direct.paths.gain), pattern, rtol=1e-3)  # of the rounded 1.643
 
 
-def test_reversed_interactions(traced: TraceResult, scene: Any):
+def test_reversed_legs_have_reversed_interactions(traced: TraceResult, scene: Any):
     legs = traced.legs(scene_surfaces(scene))
     back = legs.reverse()
     for index in np.flatnonzero(traced.paths.bounces == 3)[:5]:
@@ -133,9 +133,8 @@ def test_reversed_interactions(traced: TraceResult, scene: Any):
 
 
 @pytest.mark.gradcheck
-@pytest.mark.parametrize("quantity", ["relative_permittivity", "conductivity", "thickness"])
-def test_derivatives_by_materials(traced: TraceResult, scene: Any, quantity: str):
-    """Against central differences; single precision leaves three digits."""
+def test_derivatives_by_materials_are_central_differences(traced: TraceResult, scene: Any):
+    """Single precision leaves three digits."""
     import drjit as dr
     import mitsuba as mi
 
@@ -143,16 +142,19 @@ def test_derivatives_by_materials(traced: TraceResult, scene: Any, quantity: str
     buffer = to_buffer(traced.legs(surfaces), surfaces, valid=True)
     material = scene.radio_materials["itu_brick"]
     material.frequency_update_callback = None
-    value = float(np.ravel(getattr(material, quantity))[0])
+    names = "relative_permittivity", "conductivity", "thickness"
+    stated = {name: float(np.ravel(getattr(material, name))[0]) for name in names}
 
-    def power(at: Any) -> Any:
-        setattr(material, quantity, at)
+    def power(**changes: Any) -> Any:
+        for name, value in stated.items():
+            setattr(material, name, changes.get(name, mi.Float(value)))
         real, imaginary = field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
         return dr.sum(dr.square(real) + dr.square(imaginary)) * 1e6
 
-    variable = mi.Float(value)
-    dr.enable_grad(variable)
-    dr.backward(power(variable))
-    step = 2e-3 * value  # a slab of half a wavelength resonates
-    difference = (float(power(mi.Float(value + step))[0]) - float(power(mi.Float(value - step))[0])) / (2 * step)
-    assert float(dr.grad(variable)[0]) == pytest.approx(difference, rel=2e-2)
+    variables = {name: mi.Float(value) for name, value in stated.items()}
+    dr.enable_grad(variables)
+    dr.backward(power(**variables))
+    for name, value in stated.items():
+        step = 2e-3 * value  # a slab of half a wavelength resonates
+        high, low = (float(power(**{name: mi.Float(value + sign * step)})[0]) for sign in (1, -1))
+        assert float(dr.grad(variables[name])[0]) == pytest.approx((high - low) / (2 * step), rel=2e-2), name

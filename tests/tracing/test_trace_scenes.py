@@ -1,4 +1,4 @@
-"""Scenes of every kind, and one clear line for each that cannot be used."""
+"""Scenes of every kind, one clear line for each unusable one, positions of antennas, planes of surfaces."""
 
 import logging
 import re
@@ -27,7 +27,7 @@ def refused(words: str, source: Any, frequency_hz: float = FREQUENCY_HZ, **how: 
     assert "\n" not in str(error.value)
 
 
-def test_a_name_opens_an_embedded_scene():
+def test_name_opens_an_embedded_scene():
     scene = open_scene("laboratory", 920e6)
     assert "wall_north" in scene.objects
     assert float(scene.radio_materials["itu_brick"].thickness[0]) == pytest.approx(0.2)
@@ -35,7 +35,7 @@ def test_a_name_opens_an_embedded_scene():
     assert float(thinner.radio_materials["itu_brick"].thickness[0]) == pytest.approx(0.05)
 
 
-def test_a_scene_folder_follows_its_materials(tmp_path: Path):
+def test_scene_folder_has_the_materials_of_its_file(tmp_path: Path):
     surfaces = []
     for name, kind in (("floor", "floor"), ("west", "wall")):
         mesh = SHOEBOX[name][1]
@@ -50,7 +50,7 @@ def test_a_scene_folder_follows_its_materials(tmp_path: Path):
 
 
 @pytest.mark.parametrize("ending", ["stl", "ply", "obj", "glb"])
-def test_a_bare_mesh_needs_a_material(tmp_path: Path, ending: str):
+def test_bare_mesh_needs_a_material(tmp_path: Path, ending: str):
     file = tmp_path / f"room.{ending}"
     box((0, 0, 0), (6, 5, 3)).export(file)
     scene = open_scene(file, FREQUENCY_HZ, material="concrete")
@@ -69,7 +69,7 @@ def test_a_bare_mesh_needs_a_material(tmp_path: Path, ending: str):
     refused("material 'cheese': unknown", file, material="cheese")
 
 
-def test_wrong_scenes(tmp_path: Path):
+def test_wrong_scenes_are_refused(tmp_path: Path):
     refused("no such scene file; give a name", tmp_path / "none.xml")
     refused("no such scene file", "no-such-room")
     (tmp_path / "empty").mkdir()
@@ -92,8 +92,8 @@ def test_wrong_scenes(tmp_path: Path):
     refused("invalid vertex position", write_xml(tmp_path / "nan", {"floor": ("itu_concrete", mesh)}))
 
 
-def test_the_remedy_for_an_unknown_frequency_opens_the_scene(tmp_path: Path):
-    """Brick ends at 40 GHz; the constants that the line asks for are put into the file as it says."""
+def test_remedy_for_a_frequency_out_of_range_opens_the_scene(tmp_path: Path):
+    """Brick ends at 40 GHz; the file gets the constants that the message asks for."""
     xml = write_xml(tmp_path, {name: ("itu_brick", part) for name, (_, part) in SHOEBOX.items()})
     with pytest.raises(InputError, match="itu_brick: not known at 47 GHz") as caught:
         open_scene(xml, 47e9)
@@ -113,8 +113,8 @@ def in_a_room(tmp_path: Path, *parts: trimesh.Trimesh) -> Any:
     return scene_surfaces(open_scene(write_xml(tmp_path, {**SHOEBOX, **named}), FREQUENCY_HZ))
 
 
-def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """Mounted on a wall that a mesh has a millimetre too far inside."""
+def test_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Mounted on a wall that the mesh has too far inside."""
     surfaces = in_a_room(tmp_path, sheet(2, 0.7, (2.0, 3.0), (2.0, 3.0)))
     scene = open_scene(tmp_path / "scene.xml", FREQUENCY_HZ)
     tx, options = [[1.0, 2, 1]], TraceOptions(max_depth=2)
@@ -125,23 +125,23 @@ def test_an_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, cap
     np.testing.assert_allclose(np.sort(behind), np.sort(on), atol=2e-4)
     assert not far
     assert "1 of 1 antennas lie up to 1 cm behind an outer wall (first: receiver rx)" in caplog.text
-    # Of what stands in a room nobody knows which side is meant; outside is not where walls end.
+    # Sheets inside a room have no right side; beyond a wall's edges nothing is moved.
     places = np.array([[2.5, 2.5, 0.695], [2.5, 2.5, 0.705], [0.0, 2.5, 1.3], [-2e-3, 9.0, 1.3]])
     np.testing.assert_array_equal(before_walls(surfaces, places), places)
 
 
-def test_rays_for_an_antenna_behind_its_wall_are_settled_before_it(tmp_path: Path):
-    """From behind the wall no ray finds a path, and the fewest would do."""
+def test_number_of_rays_for_an_antenna_behind_its_wall_converges_before_it(tmp_path: Path):
+    """From behind the wall no ray finds a path, and the smallest number would converge."""
     write_xml(tmp_path, SHOEBOX)
     tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(max_depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
     before, behind = (PowerInstrument((receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
-    wanted, found = (RayTracer(tmp_path / "scene.xml", one, options).rays(tx) for one in (before, behind))
+    wanted, found = (RayTracer(tmp_path / "scene.xml", side, options).rays(tx) for side in (before, behind))
     assert found == wanted
 
 
-def test_an_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """A room is closed too, and its antennas are in it."""
+def test_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """A room is closed, too, but not solid."""
     shell = in_a_room(tmp_path / "a", box((-0.2, -0.2, -0.2), (6.2, 5.2, 3.2)))
     check_devices(shell, np.array([[1.0, 1, 1]]), ["transmitter 1"])
     surfaces = in_a_room(tmp_path / "b", box((2, 2, 0), (3, 2.5, 1.2)), box((4, 1, 0), (4.15, 4, 3)))
@@ -158,8 +158,8 @@ def test_an_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.
         trace_paths(scene, places[[0, 2]], receiver([1, 1, 2]))
 
 
-def test_a_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path: Path):
-    """Exporters number shapes: such an id tells nobody what to look for."""
+def test_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path: Path):
+    """Exporters number shapes, so the id alone does not identify the object."""
     column = {"column": ("itu_concrete", box((2, 2, 0), (2.5, 2.5, 2.8)))}
     xml = write_xml(tmp_path, {**SHOEBOX, **column})
     text = xml.read_text()
@@ -175,7 +175,7 @@ def test_a_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path: Pat
         trace_paths(open_scene(tmp_path / "pillar.stl", FREQUENCY_HZ, material="wood"), inside_it, receiver([1, 1, 2]))
 
 
-def test_winding_number():
+def test_winding_number_is_one_inside_and_zero_outside():
     sphere = trimesh.creation.icosphere(subdivisions=2)
     inside = np.random.default_rng(0).normal(size=(50, 3))
     inside *= 0.9 * np.random.default_rng(1).uniform(size=(50, 1)) / np.linalg.norm(inside, axis=1, keepdims=True)
@@ -183,8 +183,8 @@ def test_winding_number():
     np.testing.assert_allclose(winding_number(sphere.triangles, places), [1] * 50 + [0, 0], atol=1e-9)
 
 
-def test_planes():
-    """Coplanar faces of either turn are one plane, rounded slivers included; parallel and tilted ones are not."""
+def test_coplanar_faces_share_a_plane():
+    """Of either orientation, slivers with inexact normals included; parallel and tilted faces do not."""
     wall = trimesh.Trimesh([[0, 0, 0], [4, 0, 0], [4, 0, 3], [0, 0, 3]], [[0, 1, 2], [3, 2, 0]], process=False)
     sliver = np.array([[[1, 1e-6, 0], [1.001, 0, 0], [1, 0, 3]]])  # its own normal is 1e-3 rad off
     parallel = wall.triangles + np.array([0, 0.01, 0])
@@ -197,9 +197,9 @@ def test_planes():
     assert surfaces.plane[3] == surfaces.plane[4] != surfaces.plane[0]
     assert surfaces.face[surfaces.plane[0]] in (0, 1)
     for k in range(3):
-        own = surfaces.triangles[surfaces.plane == k].reshape(-1, 3)
-        np.testing.assert_allclose(own @ surfaces.normal[k], surfaces.offset[k], atol=2e-5)
-        along = own @ surfaces.axes[k].T
+        corners = surfaces.triangles[surfaces.plane == k].reshape(-1, 3)
+        np.testing.assert_allclose(corners @ surfaces.normal[k], surfaces.offset[k], atol=2e-5)
+        along = corners @ surfaces.axes[k].T
         np.testing.assert_allclose([along.min(axis=0), along.max(axis=0)], [surfaces.low[k], surfaces.high[k]])
     assert surfaces.object_of(np.array([0, 5])).tolist() == [0, 0]
 

@@ -1,4 +1,4 @@
-"""Traced paths against closed forms, reciprocity, and what must not change them."""
+"""Traced paths against closed forms and Sionna RT, reciprocity, and independence from chunks and seeds."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -39,9 +39,9 @@ SINGLE = 2e-4
 EXACT_M = 1e-12
 """Lengths are float64 where the planes are: those of the shoebox are whole numbers."""
 OFF_SURFACE = 2e-3
-"""Of the largest gain; Sionna RT's own points are some 1e-4 m off the surfaces."""
+"""Of the largest gain; Sionna RT's points are some 1e-4 m off the surfaces."""
 EDGE_OF_TWO = 0.05
-"""Of the largest gain; which face of an edge diffracts depends on the ray that comes first."""
+"""Of the largest gain; the face of an edge that diffracts depends on the first ray."""
 UPRIGHT = TraceOptions()
 
 
@@ -71,7 +71,7 @@ def equal(a: Paths, b: Paths) -> None:
         np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), field.name)
 
 
-def test_free_space_is_friis(empty: Any):
+def test_free_space_gain_is_that_of_friis(empty: Any):
     tx = np.array([[3.0, 4.0, 0.0], [0.0, 30.0, 0.0]])
     paths = trace_paths(empty, tx, receiver([0, 0, 0]), UPRIGHT).paths
     np.testing.assert_allclose(paths.length_m, [5, 30], atol=EXACT_M)
@@ -88,14 +88,14 @@ def test_lengths_in_a_shoebox_are_those_of_the_mirror_images(shoebox: Any):
     paths = trace_paths(shoebox, tx, rx, UPRIGHT).paths
     for i in range(4):
         for k in range(2):
-            own = paths.length_m[(paths.tx == i) & (paths.rx == k)]
-            np.testing.assert_allclose(own, image_lengths(tx[i], rx[k].position_m, 3), atol=EXACT_M)
+            length = paths.length_m[(paths.tx == i) & (paths.rx == k)]
+            np.testing.assert_allclose(length, image_lengths(tx[i], rx[k].position_m, 3), atol=EXACT_M)
     order = np.lexsort((paths.length_m, paths.tx, paths.rx))
     np.testing.assert_array_equal(order, np.arange(len(paths)))
 
 
-def test_images_in_a_corner_and_where_the_line_to_them_meets_a_plane():
-    """Three perpendicular planes reflect a point through their corner; a chain may end, or begin, with no plane."""
+def test_images_in_a_corner_and_points_of_reflection():
+    """Three perpendicular planes reflect a point through their corner; a chain may end, or begin, without a plane."""
     normal, offset = np.eye(3)[[2, 0, 1]], np.array([3.0, 1.0, 2.0])
     source, target = np.array([0.2, 0.3, 0.5]), np.array([[0.7, 1.1, 1.4]])
     images = image_sources(normal, offset, np.array([[0, 1, 2], [1, -1, -1], [-1, -1, 1]]), source)
@@ -107,7 +107,7 @@ def test_images_in_a_corner_and_where_the_line_to_them_meets_a_plane():
     np.testing.assert_array_equal(meeting_point(target, target + np.eye(3)[1], normal[[1]], offset[[1]])[0], target)
 
 
-def test_points_of_reflection_lie_on_the_walls_that_are_named(shoebox: Any):
+def test_points_of_reflection_lie_on_their_walls(shoebox: Any):
     paths = trace_paths(shoebox, inside(3), receiver([1.0, 1.0, 1.5]), UPRIGHT).paths
     walls = {"floor": (2, 0), "ceiling": (2, HEIGHT), "west": (0, 0), "east": (0, LENGTH), "south": (1, 0)}
     walls["north"] = (1, WIDTH)
@@ -119,8 +119,8 @@ def test_points_of_reflection_lie_on_the_walls_that_are_named(shoebox: Any):
     assert (np.isnan(paths.vertices_m[..., 0]) == (paths.interactions == 0)).all()
 
 
-def test_two_rays_over_a_perfect_ground(tmp_path: Path):
-    """A vertical field keeps its sign in the image below a perfect conductor, but for the angle of both ends."""
+def test_gains_over_a_perfect_ground_are_those_of_two_rays(tmp_path: Path):
+    """A vertical field keeps its sign in the image below a perfect conductor."""
     from sionna import rt
 
     scene = room(tmp_path, {"ground": ("itu_metal", sheet(2, 0.0, (-300.0, 300.0), (-300.0, 300.0)))})
@@ -145,7 +145,7 @@ def slab(thickness_m: float, permittivity: float, conductivity: float) -> tuple[
     return r * (1 - through**2) / (1 - r**2 * through**2), (1 - r**2) * through / (1 - r**2 * through**2)
 
 
-def test_a_slab_at_normal_incidence(tmp_path: Path):
+def test_gains_at_a_slab_at_normal_incidence(tmp_path: Path):
     scene = room(tmp_path, {"wall": ("itu_brick", sheet(0, 0.0, (-50.0, 50.0), (-50.0, 50.0)))})
     brick = scene.radio_materials["itu_brick"]
     expected = slab(0.1, float(brick.relative_permittivity[0]), float(brick.conductivity[0]))
@@ -160,7 +160,7 @@ def test_a_slab_at_normal_incidence(tmp_path: Path):
     assert np.angle(behind.gain[0] / expected[1]) == pytest.approx(0, abs=SINGLE)
 
 
-def test_paths_go_through_walls_only_if_they_may(divided: Any):
+def test_paths_pass_walls_with_transmission_only(divided: Any):
     tx, rx = [[1.0, 1.0, 1.0]], receiver([5.0, 1.0, 1.0])
     closed = trace_paths(divided, tx, rx, replace(UPRIGHT, max_depth=1)).paths
     opened = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, max_depth=2)).paths
@@ -175,7 +175,7 @@ def test_paths_go_through_walls_only_if_they_may(divided: Any):
 
 
 @pytest.mark.parametrize("transmission", [False, True])
-def test_reciprocity(divided: Any, transmission: bool):
+def test_paths_are_reciprocal(divided: Any, transmission: bool):
     here, there = inside(5, 3), [receiver(p, f"rx{k}") for k, p in enumerate(inside(3, 4))]
     options = replace(UPRIGHT, transmission=transmission)
     forth = trace_paths(divided, here, there, options)
@@ -192,12 +192,12 @@ def test_reciprocity(divided: Any, transmission: bool):
     np.testing.assert_array_equal(np.count_nonzero(b.interactions[order], axis=1), a.bounces)
 
 
-def test_the_same_seed_gives_the_same_paths_in_any_parts(divided: Any, monkeypatch: pytest.MonkeyPatch):
-    tx, rx = inside(12, 5), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 6))]
-    options = replace(UPRIGHT, transmission=True, rays=1 << 13)
+def test_paths_of_a_seed_do_not_depend_on_chunks(divided: Any, monkeypatch: pytest.MonkeyPatch):
+    tx, rx = inside(6, 5), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 6))]
+    options = replace(UPRIGHT, transmission=True, max_depth=2, rays=1 << 12)
     whole = trace_paths(divided, tx, rx, options).paths
     equal(trace_paths(divided, tx, rx, options).paths, whole)
-    monkeypatch.setattr(solve_module, "TARGETS_PER_CHUNK", 5)
+    monkeypatch.setattr(solve_module, "TARGETS_PER_CHUNK", 4)
     monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
     monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
     monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
@@ -207,16 +207,16 @@ def test_the_same_seed_gives_the_same_paths_in_any_parts(divided: Any, monkeypat
     equal(replace(parts, gain=whole.gain), whole)
 
 
-def test_one_position_is_traced_as_it_is_among_others(divided: Any):
+def test_paths_of_a_position_do_not_depend_on_others(divided: Any):
     tx, rx = inside(6, 7), receiver([1.0, 4.0, 2.0])
     together = trace_paths(divided, tx, rx, UPRIGHT).paths
     alone = trace_paths(divided, tx[3:4], rx, UPRIGHT).paths
-    own = together.select(together.tx == 3)
-    np.testing.assert_array_equal(own.length_m, alone.length_m)
-    np.testing.assert_allclose(own.gain, alone.gain, rtol=1e-5)
+    some = together.select(together.tx == 3)
+    np.testing.assert_array_equal(some.length_m, alone.length_m)
+    np.testing.assert_allclose(some.gain, alone.gain, rtol=1e-5)
 
 
-def test_what_is_off_is_not_searched(shoebox: Any, empty: Any, monkeypatch: pytest.MonkeyPatch):
+def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypatch: pytest.MonkeyPatch):
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("searched")
 
@@ -233,7 +233,7 @@ def test_what_is_off_is_not_searched(shoebox: Any, empty: Any, monkeypatch: pyte
     assert not len(trace_paths(shoebox, tx, rx, without).paths)
 
 
-def test_rays_by_convergence(shoebox: Any, divided: Any):
+def test_number_of_rays_converges(shoebox: Any, divided: Any):
     tx, rx = inside(5), receiver([1.0, 1.0, 1.0])
     found = trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays="auto", max_depth=2))
     assert found.rays == solve_module.FIRST_RAYS  # a shoebox is easy
@@ -313,7 +313,7 @@ def test_scattering_takes_power_from_reflections(shoebox: Any):
     np.testing.assert_allclose(recompute(traced, shoebox).paths.gain, traced.paths.gain, rtol=1e-6)
 
 
-def test_wrong_arguments(empty: Any):
+def test_wrong_arguments_are_refused(empty: Any):
     for wrong in ([[1.0, 2]], [[1.0, 2, np.nan]]):
         with pytest.raises(ValueError, match="finite"):
             trace_paths(empty, wrong, receiver([0, 0, 0]))

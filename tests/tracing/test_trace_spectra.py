@@ -1,4 +1,4 @@
-"""Traced paths and spectra against closed forms and against Sionna RT's own arrays; the embedded laboratory."""
+"""Traced paths and spectra against closed forms and against Sionna RT's arrays; the embedded laboratory."""
 
 import logging
 from dataclasses import replace
@@ -69,7 +69,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path]:
 
 
 @pytest.mark.parametrize("turn_deg", [0, 37, 200])
-def test_free_space(empty: Any, turn_deg: float):
+def test_paths_and_spectra_in_free_space(empty: Any, turn_deg: float):
     receiver = upright(turn_deg, (1.0, 2.0, 3.0))
     towards = receiver.to_world @ np.array([0.2, 0.1, 1.0])
     positions = receiver.position_m + np.array([4.0, 40.0])[:, None] * towards
@@ -98,7 +98,7 @@ def test_free_space(empty: Any, turn_deg: float):
         assert abs(column - azimuth) * np.cos(np.radians(elevation)) < PEAK_DEG
 
 
-def test_two_paths_over_a_metal_floor(ground: Any):
+def test_signals_over_a_metal_floor_are_those_of_two_paths(ground: Any):
     """The reflected wave comes from the image below the floor; a vertical field keeps its sign."""
     receiver = upright(10, (0.0, 0.0, 1.5))
     source = np.array([[6.0, 1.0, 1.1]])
@@ -114,7 +114,7 @@ def test_two_paths_over_a_metal_floor(ground: Any):
     np.testing.assert_allclose(signals, expected, atol=10 * SINGLE * np.abs(expected).max())
 
 
-def test_a_transmitter_without_a_path_is_dark(ground: Any):
+def test_signals_of_a_transmitter_without_a_path_are_zero(ground: Any):
     paths = trace_paths(ground, [[3.0, 0, -1], [3.0, 0, 1]], upright(0, (0.0, 0, 1))).paths
     assert set(paths.tx.tolist()) == {1}
     signals = element_signals(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)[0]
@@ -123,7 +123,7 @@ def test_a_transmitter_without_a_path_is_dark(ground: Any):
 
 
 def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
-    """In a bare room every element sees every path, so Sionna RT's own sum for each element is a reference."""
+    """In a bare room every element sees every path, so that Sionna RT's sum for each element is a reference."""
     import mitsuba as mi
     from sionna import rt
 
@@ -153,7 +153,7 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
 
 
 UP_AND_DOWN = ([0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
-"""Where angles are not unique."""
+"""Orientations with many equivalent angles."""
 
 
 @pytest.mark.parametrize("quaternion", [*np.random.default_rng(0).normal(size=(5, 4)), *UP_AND_DOWN])
@@ -169,7 +169,7 @@ def test_orientation_turns_a_device_as_the_quaternion_turns_the_array(quaternion
     np.testing.assert_allclose(device, array[:, [2, 0, 1]], atol=1e-6)  # single precision
 
 
-def test_materials_below_their_range(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_materials_below_their_range_have_constants(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     from sionna.rt.radio_materials.itu import itu_material
 
     for name, constants in BELOW_1_GHZ.items():
@@ -196,7 +196,7 @@ def test_materials_below_their_range(tmp_path: Path, caplog: pytest.LogCaptureFi
     assert float(at_2_4.radio_materials["itu_brick"].conductivity[0]) == pytest.approx(0.0238 * 2.4**0.16, rel=1e-5)
 
 
-def test_wrong_arguments(empty: Any, tmp_path: Path):
+def test_wrong_arguments_are_refused(empty: Any, tmp_path: Path):
     receiver = upright(0, (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="the scene is at"):
         trace_spectra(empty, [[1.0, 0, 1]], receiver, ARRAY_M, 915e6)
@@ -211,7 +211,7 @@ def test_wrong_arguments(empty: Any, tmp_path: Path):
     assert "\n" not in str(error.value)
 
 
-def test_the_laboratory_looks_at_its_transmitter(laboratory: tuple[Record, Path]):
+def test_laboratory_spectra_peak_at_the_transmitter(laboratory: tuple[Record, Path]):
     record, _ = laboratory
     assert record.observation.shape == (1, 200, 90, 360)
     spectra = record.observation[0]
@@ -223,7 +223,7 @@ def test_the_laboratory_looks_at_its_transmitter(laboratory: tuple[Record, Path]
     np.testing.assert_array_equal(record.tx_pos_m, transmitter_path())
     assert (np.ptp(record.tx_pos_m, axis=0) <= [0.501, 1.001, 0.201]).all()
 
-    # Reflections pull single spectra's peaks away; where the average peaks is the line of sight.
+    # Reflections shift the peaks of single spectra; the mean peaks in the line of sight.
     sight = (record.tx_pos_m - record.receivers[0].position_m) @ record.receivers[0].to_world
     azimuth, elevation = np.degrees(azimuth_elevation(sight.mean(axis=0)))
     row, column = np.unravel_index(spectra.mean(axis=0).argmax(), spectra[0].shape)
@@ -231,7 +231,7 @@ def test_the_laboratory_looks_at_its_transmitter(laboratory: tuple[Record, Path]
     assert abs(column - azimuth) * np.cos(np.radians(elevation)) < 3
 
 
-def test_the_laboratory_is_kept_and_traced_alike(
+def test_laboratory_is_cached_and_reproducible(
     laboratory: tuple[Record, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     record, folder = laboratory
@@ -256,7 +256,7 @@ def test_the_laboratory_is_kept_and_traced_alike(
     recipe.write_text(kept)
 
 
-def test_scene_registry(tmp_path: Path):
+def test_embedded_scene_is_intact_and_rebuilt_alike(tmp_path: Path):
     info = scenes()["laboratory"]
     assert info.is_intact()
     assert (info.licence, info.units) == ("MIT", "m")
@@ -266,7 +266,7 @@ def test_scene_registry(tmp_path: Path):
     assert content_sha256(tmp_path, info.xml.name) != info.sha256
 
 
-def test_both_tracers_open_the_laboratory():
+def test_mitsuba_and_sionna_rt_open_the_laboratory():
     backend.init()
     import mitsuba as mi
 
@@ -281,6 +281,6 @@ def test_both_tracers_open_the_laboratory():
         assert float(material.thickness[0]) == pytest.approx(info.thickness_m[name])
     bounds = plain.bbox()
     np.testing.assert_allclose([bounds.min, bounds.max], [[0, 0, 0], [9, 7, 3]], atol=1e-6)
-    # What the two antennas stand in is air.
+    # Antennas are in air.
     for place in (*transmitter_path()[::20], RECEIVER.position_m):
         assert not any(mesh.is_watertight and mesh.contains([place])[0] for mesh in meshes.values())

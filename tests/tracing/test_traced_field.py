@@ -1,5 +1,4 @@
-"""The traced side of a physics model against Sionna RT: gains, lengths, derivatives; what moves and what is searched
-again."""
+"""Traced fields against Sionna RT: gains, lengths, derivatives, moved receivers, repeated searches."""
 
 from __future__ import annotations
 
@@ -13,6 +12,7 @@ from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, tr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import speed_of_light
+from scipy.special import sph_harm_y
 
 from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Antenna, InputError, Receiver
@@ -77,7 +77,7 @@ def existing(traced: TracedField, parameters: dict[str, Any]) -> tuple[np.ndarra
     ],
 )
 def test_paths_are_those_of_sionna_rt(scene: Any, turn: tuple[float, float, float], rx: Antenna, tx: Antenna) -> None:
-    """Line of sight, reflections, passages and both, for arrays turned any way and every pattern and polarisation."""
+    """Line of sight, reflections, transmissions and both, for rotated arrays, all patterns and polarisations."""
     array = replace(receiver(turn), antenna=rx)
     reference = trace_paths(scene, transmitters(5), array, OPTIONS, tx_antenna=tx).paths
     traced = TracedField(scene, transmitters(5), array, TracedOptions(OPTIONS, tx_antenna=tx))
@@ -88,8 +88,8 @@ def test_paths_are_those_of_sionna_rt(scene: Any, turn: tuple[float, float, floa
     np.testing.assert_allclose(gain, reference.gain, atol=SINGLE * np.abs(reference.gain).max())
 
 
-def test_other_materials_and_gain(scene: Any) -> None:
-    """Parameters are what Sionna RT makes of the same values set in its scene; the scene keeps its own."""
+def test_gains_for_other_materials_are_those_of_sionna_rt(scene: Any) -> None:
+    """With the same values in its scene, which the traced field does not change."""
     found = trace_paths(scene, transmitters(3), receiver(), OPTIONS)
     traced = TracedField(scene, transmitters(3), receiver(), TracedOptions(OPTIONS), traced=found)
     assert traced.searches == 0
@@ -141,7 +141,7 @@ def test_slab_of_single_precision_is_that_of_double_down_to_grazing_incidence() 
 
 @pytest.mark.gradcheck
 def test_derivatives_by_materials_are_those_of_sionna_rt(scene: Any) -> None:
-    """Its field calculator in the mode that has a reverse pass, over the same paths."""
+    """Its field calculator in the differentiable mode, over the same paths."""
     found = trace_paths(scene, transmitters(3), receiver((0, 20, 0)), OPTIONS)
     rng = np.random.default_rng(1)
     weight = rng.standard_normal((2, len(found.paths)))
@@ -171,15 +171,15 @@ def test_derivatives_by_materials_are_those_of_sionna_rt(scene: Any) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=SLOPE)
 
 
-def test_a_moved_receiver_and_the_rule_for_searching_again(scene: Any) -> None:
-    """Followed paths are those that a new search finds, as long as it finds the same ones."""
-    own = receiver((10, 5, 0))
-    traced = TracedField(scene, transmitters(3), own, TracedOptions(OPTIONS))
+def test_paths_follow_a_moved_receiver_until_searched_again(scene: Any) -> None:
+    """Moved paths are those of a new search, as long as it finds the same ones."""
+    stated = receiver((10, 5, 0))
+    traced = TracedField(scene, transmitters(3), stated, TracedOptions(OPTIONS))
     assert traced.searches == 1
     shift, turn = np.array([0.03, -0.02, 0.04]), np.array([0.02, -0.03, 0.3])
     moved = tensors(traced) | {"receiver.array.position": Tensor64(shift), "receiver.array.turn": Tensor64(turn)}
     assert not traced.refresh(moved)
-    there = Receiver("array", own.position_m + shift, own.orientation_xyzw)
+    there = Receiver("array", stated.position_m + shift, stated.orientation_xyzw)
     reference = trace_paths(scene, transmitters(3), there, OPTIONS).paths
     _, length, arrival = existing(traced, moved)
     np.testing.assert_allclose(np.sort(length), np.sort(reference.length_m), rtol=DOUBLE)
@@ -190,15 +190,15 @@ def test_a_moved_receiver_and_the_rule_for_searching_again(scene: Any) -> None:
     assert traced.refresh(far)
     assert not traced.refresh(far)
     assert traced.searches == 2
-    there = replace(own, position_m=own.position_m + np.array([-1.6, 0, 0]))
+    there = replace(stated, position_m=stated.position_m + np.array([-1.6, 0, 0]))
     reference = trace_paths(scene, transmitters(3), there, OPTIONS).paths
     gain, length, _ = existing(traced, far)
     np.testing.assert_allclose(length, reference.length_m, rtol=DOUBLE)
     np.testing.assert_allclose(gain, reference.gain, atol=SINGLE * np.abs(reference.gain).max())
 
 
-def test_patterns(scene: Any) -> None:
-    """Degree one along an axis is a known function; a transmitter's turns with its heading."""
+def test_pattern_factors_are_exponentials_of_harmonics(scene: Any) -> None:
+    """Degree one along an axis is a known function; a transmitter's pattern turns with its heading."""
     direction = np.random.default_rng(0).standard_normal((3, 50))
     direction /= np.linalg.norm(direction, axis=0)
     coefficients = pattern_coefficients(2)
@@ -228,7 +228,25 @@ def test_patterns(scene: Any) -> None:
     np.testing.assert_allclose((changed / np.where(strong, plain, 1))[strong], expected[strong], rtol=1e-6)
 
 
-def test_rows_of_a_batch(scene: Any) -> None:
+@pytest.mark.parametrize("degree", [1, 4, 8])
+def test_pattern_factors_have_the_harmonics_of_scipy(degree: int) -> None:
+    """Real harmonics with the Condon-Shortley phase, by degree and order; Dr.Jit's constants are float32."""
+    rng = np.random.default_rng(3)
+    n = rng.normal(size=(50, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    polar, azimuth = np.arccos(n[:, 2]), np.arctan2(n[:, 1], n[:, 0])
+    harmonics = []
+    for level in range(1, degree + 1):
+        for order in range(-level, level + 1):
+            value = sph_harm_y(level, abs(order), polar, azimuth)
+            harmonics.append(value.real if order == 0 else np.sqrt(2) * (value.imag if order < 0 else value.real))
+    coefficients = rng.normal(size=(2, (degree + 1) ** 2 - 1)) / degree
+    re, im = pattern_factor(Tensor64(coefficients), [Float64(c) for c in n.T.copy()])
+    expected = np.exp(np.stack(harmonics, axis=1) @ (coefficients[0] + 1j * coefficients[1]))
+    np.testing.assert_allclose(re.numpy() + 1j * im.numpy(), expected, rtol=1e-5)
+
+
+def test_batch_has_the_paths_of_its_rows(scene: Any) -> None:
     traced = TracedField(scene, transmitters(4), receiver(), TracedOptions(OPTIONS))
     everything, some = traced(tensors(traced)), traced(tensors(traced), mi.UInt32([3, 1, 3]))
     assert (some.batch, some.each) == (3, everything.each)
@@ -237,7 +255,7 @@ def test_rows_of_a_batch(scene: Any) -> None:
 
 
 @given(share=st.floats(1e-4, 0.5), seed=st.integers(0, 99))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_error_of_faint_paths_left_out_is_bounded(scene: Any, share: float, seed: int) -> None:
     tx = transmitters(3, seed)
     whole = TracedField(scene, tx, receiver(), TracedOptions(OPTIONS))
@@ -249,44 +267,43 @@ def test_error_of_faint_paths_left_out_is_bounded(scene: Any, share: float, seed
         phase = np.exp(-2j * np.pi * FREQUENCY_HZ / speed_of_light * paths.length_m.numpy().reshape(3, -1))
         response[i], count[i] = (gain * phase).sum(1), traced.exists.reshape(3, -1).sum(1)
         amplitude = np.maximum(amplitude, np.abs(gain).sum(1))
-    # Which paths are faint is decided by gains in single precision.
+    # Faint paths are chosen by gains in single precision.
     assert (np.abs(response[0] - response[1]) <= (share + SINGLE) * amplitude).all()
     assert (count[1] <= count[0]).all()
     assert (count[1] > 0).all()
 
 
-def test_kernels_of_a_step_are_launched_without_faint_paths(scene: Any) -> None:
+def test_kernels_are_smaller_without_faint_paths(scene: Any) -> None:
     sizes = []
     for share in (0.0, 0.1):
         traced = TracedField(scene, transmitters(4), receiver(), TracedOptions(OPTIONS, faint=share))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             dr.eval(traced({}).gain)
-            sizes.append(max(one["size"] for one in dr.kernel_history([dr.KernelType.JIT])))
+            sizes.append(max(entry["size"] for entry in dr.kernel_history([dr.KernelType.JIT])))
         assert sizes[-1] == traced.exists.size
     assert sizes[1] < 0.8 * sizes[0]
 
 
-def test_free_space() -> None:
-    """An empty scene: Friis between vertical antennas of one height."""
+def test_free_space_gain_is_that_of_friis_in_double_precision() -> None:
+    """An empty scene, vertical antennas of the same height."""
     from sionna import rt
 
     scene = rt.load_scene()
     scene.frequency = FREQUENCY_HZ
-    own = receiver(position=(0.0, 0.0, 1.0))
-    traced = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions()))
+    array = receiver(position=(0.0, 0.0, 1.0))
+    traced = TracedField(scene, [[3.0, 4.0, 1.0]], array, TracedOptions(TraceOptions()))
     gain, length, arrival = existing(traced, tensors(traced))
     np.testing.assert_allclose(gain, [speed_of_light / traced.frequency_hz / (4 * np.pi * 5)], rtol=DOUBLE)
     np.testing.assert_allclose(length, [5.0], rtol=DOUBLE)
-    stronger = TracedField(scene, [[3.0, 4.0, 1.0]], own, TracedOptions(TraceOptions(), gain=30.0))
+    stronger = TracedField(scene, [[3.0, 4.0, 1.0]], array, TracedOptions(TraceOptions(), gain=30.0))
     np.testing.assert_allclose(existing(stronger, {})[0], 30 * gain, rtol=DOUBLE)
     np.testing.assert_allclose(arrival, [[0.6, 0.8, 0.0]], atol=DOUBLE)
 
 
-def test_nothing_arrives(tmp_path: Path) -> None:
-    """A transmitter behind metal: gains of zero and derivatives without NaN."""
-    parts = {"ceiling": CEILING["ceiling"]}
-    scene = room(tmp_path, parts)
+def test_transmitter_without_a_path_has_no_gain_and_finite_derivatives(tmp_path: Path) -> None:
+    """A transmitter behind metal."""
+    scene = room(tmp_path, {"ceiling": CEILING["ceiling"]})
     above = np.array([[2.0, 2.0, 5.0]])
     traced = TracedField(scene, above, receiver(), TracedOptions(TraceOptions(max_depth=1, rays=1024)))
     parameters = tensors(traced)
@@ -298,7 +315,7 @@ def test_nothing_arrives(tmp_path: Path) -> None:
     assert all(np.isfinite(dr.grad(p).numpy()).all() for p in parameters.values())
 
 
-def test_wrong_arguments(scene: Any) -> None:
+def test_wrong_arguments_are_refused(scene: Any) -> None:
     with pytest.raises(InputError, match="no derivative"):
         TracedOptions(TraceOptions(diffraction=True))
     with pytest.raises(ValueError, match="tx_pos_m has shape"):

@@ -6,14 +6,13 @@ is one dense matrix of few rows, A = P B:
 
 | | row of P | then |
 | --- | --- | --- |
-| array | w(u) g_m F(u) exp(+j k p_m . u) of element m, over the upper hemisphere | Bartlett spectrum of h = A S |
+| array | w(u) exp(+j k p_m . u) of element m, over the upper hemisphere | Bartlett spectrum of h = A S |
 | sectors | w(u) F(u) inside the sector, else 0, over the full sphere | power sum_s abs(h_s)^2 |
-
-The closed form of `wrf_mi.receivers.footprints` is of footprints that nothing stands before; blending needs directions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from ..gaussians.parameters import Gaussians
 from ..gaussians.tiles import Plane
 from ..receivers.array import array_response
 from ..receivers.beams import mirror_order
-from ..receivers.physical_array import Array, Pattern
 
 ComplexArray = NDArray[np.complex64]
 
@@ -85,16 +83,15 @@ class _MirroredSteering(Images):
         return np.block([[even.real, odd.imag], [even.imag, -odd.real]])
 
 
-def steering(array: Array, height: int, width: int) -> Images:
+def steering(elements_m: FloatArray, frequency_hz: float, height: int, width: int) -> Images:
     """From element signals to the processor's Bartlett spectrum, up to a phase in each pixel.
 
     Phases are those to the array's centre, wherever its origin is: magnitudes are the same, and an array that is its
     own mirror image is one about its centre.
     """
-    elements = np.asarray(array.elements_m, float)
-    centred, directions = elements - elements.mean(axis=0), pixel_directions(height, width).reshape(-1, 3)
-    response = array_response(centred, directions, array.frequency_hz)
-    opposite = mirror_order(elements)
+    centred, directions = elements_m - elements_m.mean(axis=0), pixel_directions(height, width).reshape(-1, 3)
+    response = array_response(centred, directions, frequency_hz)
+    opposite = mirror_order(elements_m)
     if opposite is not None:
         return _MirroredSteering(response, opposite, height, width)
     return Images(response.T.conj().astype(np.complex64), height, width)
@@ -105,22 +102,25 @@ class ArrayOperator:
 
     Args:
         matrix: [m, n].
-        array: its elements and carrier make the spectrum (its gains and pattern are in ``matrix``).
+        elements_m: positions of the array's elements [m, 3], metres.
+        frequency_hz: carrier frequency.
         height: elevations of the spectrum, over the upper hemisphere.
         width: azimuths.
     """
 
-    def __init__(self, matrix: ArrayLike, array: Array, height: int, width: int) -> None:
+    def __init__(self, matrix: ArrayLike, elements_m: FloatArray, frequency_hz: float, height: int, width: int) -> None:
         self.matrix: ComplexArray = np.ascontiguousarray(matrix, np.complex64)
-        self.array, self.height, self.width = array, height, width
-        self._steering = steering(array, height, width)
+        self._spectrum_of = elements_m, frequency_hz, height, width
+        self._steering = steering(*self._spectrum_of)
 
     @classmethod
-    def of(cls, gaussians: Gaussians, pose: Pose, plane: Plane, array: Array) -> ArrayOperator:
+    def of(
+        cls, gaussians: Gaussians, pose: Pose, plane: Plane, elements_m: FloatArray, frequency_hz: float
+    ) -> ArrayOperator:
         """The operator of Gaussians that stand still; quadrature and spectrum both on the directions of ``plane``."""
         directions = pixel_directions(plane.height, plane.width).reshape(-1, 3)
-        ports = array.response(directions).T * solid_angles(plane.height, plane.width)
-        return cls(port_matrix(gaussians, pose, plane, ports), array, plane.height, plane.width)
+        ports = array_response(elements_m, directions, frequency_hz).T * solid_angles(plane.height, plane.width)
+        return cls(port_matrix(gaussians, pose, plane, ports), elements_m, frequency_hz, plane.height, plane.width)
 
     def signals(self, signals: ArrayLike) -> ComplexArray:
         """Element signals [batch, m] of the Gaussians' complex signals [batch, n]."""
@@ -144,7 +144,7 @@ class ArrayOperator:
 
     def composed(self, factors: ArrayLike) -> ArrayOperator:
         """The operator of signals S = C c, for factors C [n, K]: it takes c [batch, K]."""
-        return ArrayOperator(self.matrix @ np.asarray(factors, np.complex64), self.array, self.height, self.width)
+        return ArrayOperator(self.matrix @ np.asarray(factors, np.complex64), *self._spectrum_of)
 
 
 def sector_of(directions: ArrayLike, azimuths: int, elevations: int) -> NDArray[np.int64]:
@@ -184,7 +184,7 @@ class SectorOperator:
         plane: Plane,
         azimuths: int = 1,
         elevations: int = 1,
-        pattern: Pattern | None = None,
+        pattern: Callable[[FloatArray], ArrayLike] | None = None,
     ) -> SectorOperator:
         """The operator of Gaussians that stand still, over the full sphere.
 
@@ -194,11 +194,13 @@ class SectorOperator:
             plane: pixels of each hemisphere.
             azimuths: see `sector_of`.
             elevations: likewise.
-            pattern: of the antenna, in the receiver's frame; None: isotropic.
+            pattern: the antenna's amplitude for unit vectors [..., 3] in the receiver's frame; None: isotropic.
         """
         upper = pixel_directions(plane.height, plane.width).reshape(-1, 3)
         directions = np.concatenate([upper, upper * [1, -1, -1]])
-        weight = np.tile(solid_angles(plane.height, plane.width), 2) * (1 if pattern is None else pattern(directions))
+        weight = np.tile(solid_angles(plane.height, plane.width), 2)
+        if pattern is not None:
+            weight = weight * np.asarray(pattern(directions))
         inside = sector_of(directions, azimuths, elevations) == np.arange(azimuths * elevations)[:, None]
         return cls(port_matrix(gaussians, pose, plane, inside * weight, sphere=True))
 

@@ -1,4 +1,4 @@
-"""Models: what can be fitted to measurements, or predicts without, under one name and in one form each."""
+"""Registry of models that are fitted to measurements or predict from a scene alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OWN: Mapping[str, Model | Method | str] = {
     "physics": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:METHOD",
-    "kriging": "wrf_mi.models.interpolation.kriging_model:METHOD",
+    "kriging": "wrf_mi.models.interpolation.kriging:METHOD",
     "trees": "wrf_mi.models.interpolation.trees:METHOD",
     "mri": "wrf_mi.models.interpolation.mri:METHOD",
     "vae": "wrf_mi.models.networks.vae:METHOD",
@@ -34,7 +34,7 @@ _OWN: Mapping[str, Model | Method | str] = {
 
 
 class _Models(Registry["Model | Method"]):
-    """Entries of the short form become `Model` when they are asked for."""
+    """Registry in which a `Method` becomes a `Model` on first access."""
 
     def __getitem__(self, name: str) -> Model:
         entry = super().__getitem__(name)
@@ -45,7 +45,7 @@ class _Models(Registry["Model | Method"]):
 
 _MODELS = _Models("model", ENTRY_POINTS, _OWN)
 MODELS: Mapping[str, Model] = _MODELS  # type: ignore[assignment]
-"""Every model by its name, as in ``wrf-mi train --model``."""
+"""All models by name, as in ``wrf-mi train --model``."""
 
 
 def register(model: Model | Method) -> None:

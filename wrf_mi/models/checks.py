@@ -1,9 +1,9 @@
-"""Data that a model does not serve, and inputs that it cannot predict from."""
+"""Checks of data that a model is fitted to, and of inputs that it predicts from."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,47 +13,21 @@ from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
 from .method import Inputs
 
-
-class Served(Protocol):
-    """What these checks know of a model or `Method`."""
-
-    @property
-    def name(self) -> str:
-        """As in ``wrf-mi train --model``."""
-        ...
-
-    @property
-    def tasks(self) -> tuple[str, ...] | None:
-        """Tasks that it serves; None: all."""
-        ...
-
-    @property
-    def several_carriers(self) -> bool:
-        """Whether it serves rows of several carriers."""
-        ...
-
-    @property
-    def needs_uplink(self) -> bool:
-        """Whether it predicts from the uplink alone."""
-        ...
-
-    def serves(self, task: str) -> bool:
-        """Whether it serves a task."""
-        ...
+if TYPE_CHECKING:
+    from .model import Model
 
 
-def check_record(method: Served, record: Record, others: Iterable[Served] = ()) -> None:
-    """Refuse a record that a method does not serve, or whose parts do not fit together.
+def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
+    """Refuse a record that a model does not serve, or whose parts do not fit together.
 
     Args:
-        method: that is to be fitted.
-        record: to this.
-        others: methods to be named where it does not serve.
+        method: model to be fitted.
+        record: data.
+        others: models to be named where it does not serve.
 
     Raises:
-        InputError: another task; no uplink for a method that needs one; rows of several carriers for a method that
-            serves one; numbers of rows, antennas, subcarriers and frequencies that differ; carriers, numbers of
-            readings or standard deviations that do not fit the observations.
+        InputError: another task; no uplink for a model that needs it; rows of several carriers for a model that serves
+            a single carrier; or as `check_parts`.
     """
     if not method.serves(record.task):
         *most, last = method.tasks or ("nothing",)
@@ -68,7 +42,7 @@ def check_record(method: Served, record: Record, others: Iterable[Served] = ()) 
         )
     check_parts(record)
     if record.carriers_hz is not None and not method.several_carriers:
-        able = [one.name for one in others if one.several_carriers and one.serves(record.task)]
+        able = [other.name for other in others if other.several_carriers and other.serves(record.task)]
         named = f" ({', '.join(able)})" if able else ""
         text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
         raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
@@ -78,15 +52,11 @@ def check_parts(record: Record) -> None:
     """Refuse a record whose parts do not fit together.
 
     Raises:
-        InputError: as `check_record`, whatever the method.
+        InputError: numbers of rows, antennas, subcarriers and frequencies that differ; carriers, numbers of readings or
+            standard deviations that do not fit the observations.
     """
     task_of(record).check(record)
-    _check_carriers(record)
     _check_noise(record)
-
-
-def _check_carriers(record: Record) -> None:
-    """Refuse carriers of rows that do not fit the rest of a record."""
     carriers, place = record.carriers_hz, place_of(record)
     if carriers is None:
         return
@@ -98,7 +68,6 @@ def _check_carriers(record: Record) -> None:
 
 
 def _check_noise(record: Record) -> None:
-    """Refuse numbers of readings and standard deviations that do not fit the observations."""
     stated = {"n_readings": record.n_readings, "std": record.std}
     for name, values in stated.items():
         if values is None:
@@ -116,15 +85,15 @@ def _check_noise(record: Record) -> None:
             raise InputError(f"{where}: {name} is {values[receiver, row]:g}; give a number above 0 where it received")
 
 
-def check_inputs(inputs: Inputs, record: Record, method: Served) -> None:
+def check_inputs(inputs: Inputs, record: Record, method: Model) -> None:
     """Refuse inputs that a model fitted to a record cannot predict from.
 
     Raises:
-        InputError: no uplink for a method that needs one, another number of antennas or subcarriers, or values that
-            are not finite.
+        InputError: no uplink for a model that needs it, another number of antennas or subcarriers, or values that are
+            not finite.
     """
     if record.uplink is None and inputs.uplink is not None:
-        raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; leave uplink away")
+        raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; omit uplink")
     if inputs.uplink is None:
         if method.needs_uplink:
             form = "uplink [m, antennas, subcarriers], in the file of `predict --input`"

@@ -1,29 +1,37 @@
-"""What a model predicts from (`Inputs`), and the short form of a model: one fitted to a record's rows alone."""
+"""Inputs of predictions, and the short form of a model: a method that is fitted to a record's rows alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Record, Split
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
+from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..training.session import FitSession
+from ..training.session import OnProgress as OnProgress
+
+Settings = TypeVar("Settings")
+PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
+"""Attributes that `Inputs` and `wrf_mi.core.Record` share."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a method may know of m rows that it predicts; never their observation.
+    """Known quantities of m rows to predict; never their observations.
 
     Attributes:
-        tx_pos_m: positions of the moving end [m, 3], metres; NaN where the data do not tell.
-        tx_heading_rad: how the transmitter is turned [m], or None.
+        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
+        tx_heading_rad: headings of the transmitter [m], or None.
         uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
         first_row: number of the first row, for messages.
-        carriers_hz: carrier of each row [m], Hz, or None where the data have one.
+        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
     """
 
     tx_pos_m: FloatArray
@@ -37,38 +45,28 @@ class Inputs:
         return len(self.tx_pos_m)
 
     def rows(self, chosen: slice) -> Inputs:
-        """Some of them."""
-        heading, uplink, carriers = self.tx_heading_rad, self.uplink, self.carriers_hz
-        return Inputs(
-            self.tx_pos_m[chosen],
-            None if heading is None else heading[chosen],
-            None if uplink is None else uplink[chosen],
-            self.first_row + (chosen.start or 0),
-            None if carriers is None else carriers[chosen],
-        )
+        """Inputs of some rows."""
+        return Inputs(**_chosen(self, chosen), first_row=self.first_row + (chosen.start or 0))
 
 
 def inputs_of(record: Record, rows: IntArray) -> Inputs:
-    """The inputs of some rows of a record."""
-    heading, uplink, carriers = record.tx_heading_rad, record.uplink, record.carriers_hz
-    return Inputs(
-        record.tx_pos_m[rows],
-        None if heading is None else heading[rows],
-        None if uplink is None else uplink[rows],
-        carriers_hz=None if carriers is None else carriers[rows],
-    )
+    """Inputs of some rows of a record."""
+    return Inputs(**_chosen(record, rows))
 
 
-class Fitted(Protocol):
-    """What a `Method` has fitted."""
+def _chosen(source: Inputs | Record, rows: slice | IntArray) -> dict[str, Any]:
+    every = {name: getattr(source, name) for name in PER_ROW}
+    return {name: None if values is None else values[rows] for name, values in every.items()}
+
+
+class FittedRows(Protocol):
+    """A fitted `Method`."""
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """What the receiver of that index observes, [m, ...] as in `wrf_mi.core.Record`."""
-        ...
+        """Observations of the receiver of that index, [m, ...] as in `wrf_mi.core.Record`."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that is needed to predict again: no key begins with ``run/``."""
-        ...
+        """All that `Method.load` needs: no key begins with ``run/``."""
 
 
 @dataclass(frozen=True)
@@ -76,15 +74,14 @@ class Method:
     """A model that is fitted to a record's rows alone, see `wrf_mi.models.Model` for all others.
 
     Attributes:
-        name: as in ``wrf-mi train --model``.
-        tasks: tasks of `wrf_mi.core.Record` that it serves; None: all.
+        name: name as in ``wrf-mi train --model``.
+        tasks: tasks that it serves; None: all.
         settings: frozen dataclass of its settings, all with defaults.
-        fit: ``fit(record, split, settings, seed, session)``. ``split.validation`` may choose what is open; what is
-            returned has seen all of ``split.all_train`` and no other row. What is trained step by step keeps a
-            checkpoint in the session's folder, from which it goes on; all else tells ``session.report`` of progress.
-        load: ``load(arrays, record)``, from `Fitted.arrays` and the record without its observations in mind: poses,
-            frequencies and shapes only.
-        source: where the method is from.
+        fit: ``fit(record, split, settings, seed, session)``. ``split.validation`` may choose settings; the result uses
+            all of ``split.all_train`` and no other row. Training step by step keeps a checkpoint in the session's
+            folder and continues from it; all other fits call ``session.report``.
+        load: ``load(arrays, record)``, from `FittedRows.arrays` and poses, frequencies and shapes of the record.
+        source: publication.
         needs_uplink: whether it predicts from the uplink alone.
         several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
     """
@@ -92,12 +89,58 @@ class Method:
     name: str
     tasks: tuple[str, ...] | None
     settings: type
-    fit: Callable[[Record, Split, Any, int, FitSession], Fitted]
-    load: Callable[[dict[str, NDArray[Any]], Record], Fitted]
+    fit: Callable[[Record, Split, Any, int, FitSession], FittedRows]
+    load: Callable[[dict[str, NDArray[Any]], Record], FittedRows]
     source: str
     needs_uplink: bool = False
     several_carriers: bool = False
 
-    def serves(self, task: str) -> bool:
-        """Whether it serves a task."""
-        return self.tasks is None or task in self.tasks
+
+def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
+    """Rows that a receiver received: those that train at first, and those that choose settings.
+
+    Without the former, the latter train.
+
+    Raises:
+        InputError: fewer than two rows.
+    """
+    received = np.isfinite(record.observation[receiver]).reshape(len(record), -1).all(axis=1)
+    train, validation = (rows[received[rows]] for rows in (split.train, split.validation))
+    count = len(train) + len(validation)
+    if count < 2:
+        who = record.receivers[receiver].name
+        raise InputError(f"{record.name}: receiver {who} received {count} training row; {name} needs two at least")
+    return (train, validation) if len(train) else (validation, train)
+
+
+def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
+    """Positions of the transmitter in some rows [n, 3], metres.
+
+    Raises:
+        InputError: unknown positions.
+    """
+    unknown = rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)]
+    if len(unknown):
+        text = f"no position in row {unknown[0]}: positions are not known, from which {name} predicts"
+        raise InputError(f"{record.name} has {text}; choose another model")
+    return record.tx_pos_m[rows]
+
+
+def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays with a prefix before their names."""
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
+
+
+def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def settings_array(settings: Any) -> NDArray[Any]:
+    """Settings as an array of a run file."""
+    return np.asarray(json.dumps(asdict(settings)))
+
+
+def stored_settings(kind: type[Settings], arrays: Mapping[str, NDArray[Any]], name: str) -> Settings:
+    """Settings of a run file, from `settings_array`."""
+    return settings_from(kind, json.loads(str(arrays["settings"])), name)

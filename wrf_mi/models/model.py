@@ -1,4 +1,4 @@
-"""What a model is: an entry of the registry, the problem that it is fitted to, and what has been fitted."""
+"""A model as an entry of the registry, the problem that it is fitted to, and a fitted model."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..training.checkpoint import checkpoint_seconds
 from ..training.session import FitSession
-from .method import Inputs, Method
+from .method import FittedRows, Inputs, Method
 
 Arrays = dict[str, NDArray[Any]]
-UNUSED_HEADING = "its model does not know how the transmitter is turned; leave heading_rad away"
-UNUSED_UPLINK = "its model does not predict from the uplink; leave uplink away"
+UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
+UNUSED_UPLINK = "its model does not predict from the uplink; omit uplink"
 
 
 @dataclass
@@ -31,12 +31,12 @@ class Problem:
     """Data, scene and settings that a model is fitted to, and loaded with.
 
     Attributes:
-        dataset: name, folder, or a record that was loaded.
-        settings: of the model's dataclass.
-        seed: of split and fit.
-        scene: name, scene folder, Mitsuba XML or mesh; None: none.
-        material: of a bare mesh, or None.
-        antennas: patterns and polarisations in place of what the data state.
+        dataset: name, folder, or a loaded record.
+        settings: settings of the model's class.
+        seed: seed of split and fit.
+        scene: name, scene folder, Mitsuba XML or mesh, or None.
+        material: material of a bare mesh, or None.
+        antennas: patterns and polarisations in place of those of the data.
         use_rows: whether training rows are used; False: the scene alone predicts.
         operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
     """
@@ -52,29 +52,28 @@ class Problem:
 
     @cached_property
     def record(self) -> Record:
-        """The data with the antennas that were stated, read when first asked for.
+        """The data with the stated antennas, read on first access.
 
         Raises:
             InputError: they cannot be read.
         """
         from ..synthetic import load_record
 
-        own = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
-        return self.antennas.of(own)
+        return self.antennas.of(self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset))
 
     @cached_property
     def opened_scene(self) -> Any | None:
-        """The scene (``sionna.rt.Scene``) at the record's carrier, opened when first asked for; None: none.
+        """The scene (``sionna.rt.Scene``) at the record's carrier, opened on first access, or None.
 
         Raises:
-            InputError: it cannot be opened, or the data do not tell the carrier.
+            InputError: it cannot be opened, or the carrier is unknown.
         """
         from ..tasks import instrument_of
 
         return None if self.scene is None else self.open_scene(instrument_of(self.record).carrier_hz)
 
     def open_scene(self, frequency_hz: float) -> Any | None:
-        """The scene at another frequency, Hz; None: none.
+        """The scene at another frequency, Hz, or None.
 
         Raises:
             InputError: it cannot be opened.
@@ -93,7 +92,7 @@ class Session(FitSession):
     """A session of a run.
 
     Attributes:
-        scheduler: computes parts of the work; None: this process.
+        scheduler: scheduler of parts of the work; None: this process.
         progress: show bars on standard error where the tracer takes time.
     """
 
@@ -107,9 +106,9 @@ class Fitted(ABC):
     """A fitted model.
 
     Attributes:
-        train_seconds: that the fit took over all sittings; None: as long as `Model.fit` did.
-        receivers: whose observations it predicts; None: those of the record.
-        uses_heading: whether `predict` takes headings; None: as `Model.headings` says.
+        train_seconds: duration of the fit over all sittings; None: that of the last call of `Model.fit`.
+        receivers: receivers whose observations it predicts; None: those of the record.
+        uses_heading: whether `predict` takes headings; None: as `Model.headings`.
     """
 
     train_seconds: float | None = None
@@ -118,7 +117,7 @@ class Fitted(ABC):
 
     @abstractmethod
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """What the receiver of that index observes, [m, ...] as in `wrf_mi.core.Record`.
+        """Observations of the receiver of that index, [m, ...] as in `wrf_mi.core.Record`.
 
         Raises:
             InputError: inputs that it cannot predict from.
@@ -129,11 +128,11 @@ class Fitted(ABC):
         """All that `Model.load` needs; no key begins with ``run/``."""
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
-        """Predictions for rows of the record where they are known already; None: `predict` makes them."""
+        """Stored predictions for rows of the record; None: `predict` makes them."""
         return None
 
     def facts(self) -> dict[str, Any]:
-        """What ``metrics.json`` says of it beside what it says of any."""
+        """Further entries of ``metrics.json``."""
         return {}
 
 
@@ -145,27 +144,27 @@ class Model:
     ``wrf_mi.models`` names.
 
     Attributes:
-        name: as in ``wrf-mi train --model``.
-        tasks: that it serves; None: all.
-        settings: frozen dataclass of its settings, all with defaults; or several by what they are for (`by_data`).
-        fit: ``fit(problem, split, session)``. ``split.validation`` may choose what is open; what is returned has seen
-            no row but ``problem.rows(split)``. It may go on from files that it left in ``session.folder``.
+        name: name as in ``wrf-mi train --model``.
+        tasks: tasks that it serves; None: all.
+        settings: frozen dataclass of its settings, all with defaults; or several by purpose (`by_data`).
+        fit: ``fit(problem, split, session)``. ``split.validation`` may choose settings; the result uses no row but
+            ``problem.rows(split)``. It may continue from its files in ``session.folder``.
         load: ``load(arrays, problem, folder)``, from `Fitted.arrays`; ``folder`` holds the fitted model.
-        source: where the model is from.
+        source: publication.
         scene: whether it takes a scene.
         uses_antennas: whether patterns and polarisations of antennas count in that scene.
         scene_alone: whether a scene predicts without training rows.
         several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         uplink: whether it predicts from the uplink.
-        headings: whether it may predict from how the transmitter is turned.
+        headings: whether it may predict from the transmitter's heading.
         complete: whether it needs every receiver's observation of every training row.
-        given: those of the arguments ``model``, ``seed``, ``deterministic``, ``receiver`` and ``evaluation`` of
-            `wrf_mi.train` that are settings of its own.
+        given: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
+            ``receiver`` or ``evaluation``.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
         presets: named settings, ``key=value``.
         check: ``check(problem, splits)`` raises `InputError` where a fit would, before anything is written.
-        prepare: ``prepare(problem, splits, session)``: the settings with what is still open in them resolved; called
-            before the first fit, and again where that was stopped.
+        prepare: ``prepare(problem, splits, session)``: settings without open choices; called before the first fit, and
+            again when an interrupted fit is resumed.
         by_data: ``by_data(task, with_scene)``: the entry of the same name for data of a task, with or without a scene.
     """
 
@@ -204,19 +203,18 @@ class Model:
 
 
 class FittedMethod(Fitted):
-    """What a `Method` has fitted."""
+    """A fitted `Method` as a fitted model, without standard deviations."""
 
-    def __init__(self, fitted: Any) -> None:
-        self.own = fitted
+    def __init__(self, fitted: FittedRows, train_seconds: float | None = None) -> None:
+        self.fitted, self.train_seconds = fitted, train_seconds
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """See `Fitted`; without standard deviations."""
-        return Prediction(self.own.predict(inputs, receiver))
+        """Observations of the receiver of that index, [m, ...]."""
+        return Prediction(self.fitted.predict(inputs, receiver))
 
     def arrays(self) -> Arrays:
-        """See `Fitted`."""
-        kept: Arrays = self.own.arrays()
-        return kept
+        """All that `Method.load` needs."""
+        return self.fitted.arrays()
 
 
 def model_of(method: Method) -> Model:
@@ -224,14 +222,17 @@ def model_of(method: Method) -> Model:
 
     def fit(problem: Problem, split: Split, session: Session) -> Fitted:
         before, start = checkpoint_seconds(session.folder), time.perf_counter()
-        fitted = FittedMethod(method.fit(problem.record, split, problem.settings, problem.seed, session))
-        fitted.train_seconds = before + time.perf_counter() - start
-        return fitted
+        fitted = method.fit(problem.record, split, problem.settings, problem.seed, session)
+        return FittedMethod(fitted, before + time.perf_counter() - start)
 
-    def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        return FittedMethod(method.load(arrays, problem.record))
-
-    needed: Any = "required" if method.needs_uplink else "optional"
-    ends = fit, load, method.source
-    kept: dict[str, Any] = {"uplink": needed, "several_carriers": method.several_carriers}
-    return Model(method.name, method.tasks, method.settings, *ends, **kept, headings=True)
+    return Model(
+        method.name,
+        method.tasks,
+        method.settings,
+        fit,
+        lambda arrays, problem, folder: FittedMethod(method.load(arrays, problem.record)),
+        method.source,
+        uplink="required" if method.needs_uplink else "optional",
+        several_carriers=method.several_carriers,
+        headings=True,
+    )

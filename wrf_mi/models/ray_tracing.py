@@ -1,12 +1,12 @@
-"""The model ``ray-tracing``: paths of a scene, and what is fitted to make them report as the receivers do.
+"""The model ``ray-tracing``: paths of a scene, optionally calibrated on the training rows.
 
 paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.tracing.load_trace`)
-corrected/        where planes were calibrated: the scene with these, a folder that plain Sionna RT opens
-convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all that was tried
+corrected/        where planes were calibrated: the corrected scene, a folder that plain Sionna RT opens
+convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all tried settings
 
-Signal strengths are not calibrated: an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows.
-For other tasks nothing is fitted. With ``calibration`` what it names is trained: the graph of `wrf_mi.graph.graph`
-without Gaussians, for every task.
+For signal strengths an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows. With
+``calibration``, parameters of the scene are trained for every task, by the graph of `wrf_mi.graph.graph` without
+Gaussians.
 """
 
 from __future__ import annotations
@@ -51,21 +51,21 @@ from .model import Arrays, Fitted, Model, Problem, Session
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
-"""Positions of one part at least, for a scheduler: candidates of fewer are made no faster. Where rays go out from the
-receivers alone, a part of any size costs as much as a few hundred positions, and the parts for a worker may be two."""
+"""Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
+alone, a part of any size costs as much as a few hundred positions."""
 
 
 @dataclass(frozen=True)
 class TracingSettings(LoopOptions, TraceOptions):
-    """What is traced and fitted, and with ``calibration`` settings of the training loop.
+    """Settings of tracing and calibration, and with ``calibration`` of the training loop.
 
     Attributes:
-        calibration: what is trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
-            ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null: nothing.
+        calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
+            receiver), ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null:
+            none.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters
-            (`wrf_mi.tracing.convergence`);
-            null: none are chosen.
+            (`wrf_mi.tracing.convergence`); null: none are chosen.
         target_kinds: kinds of path that may then be switched on, separated by commas.
     """
 
@@ -74,35 +74,25 @@ class TracingSettings(LoopOptions, TraceOptions):
     target_kinds: str = ",".join(CHOSEN_KINDS)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be traced or chosen.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Refuse settings out of range."""
         super().__post_init__()
         if self.calibration is None and (chosen := self.chosen()):
             raise InputError(f"setting {chosen[0]}: of a training, and nothing is calibrated; set calibration, too")
         if self.calibration is not None:
             with_settings(calibration_config(self.calibration.split(",")), self.chosen())
             if self.target_error_db is not None:
-                raise InputError("target_error_db chooses what is traced without calibration; leave one of them away")
+                raise InputError("target_error_db chooses what is traced without calibration; omit one of the two")
         if unknown := [kind for kind in self.target_kinds.split(",") if kind and kind not in CHOSEN_KINDS]:
             raise InputError(f"target_kinds {unknown[0]!r}: choose from {', '.join(CHOSEN_KINDS)}")
 
     @property
     def options(self) -> TraceOptions:
-        """What is traced."""
-        return TraceOptions(**{one.name: getattr(self, one.name) for one in fields(TraceOptions)})
+        """Options of the tracer."""
+        return TraceOptions(**{option.name: getattr(self, option.name) for option in fields(TraceOptions)})
 
 
 class FittedTracing(Fitted):
-    """A traced scene with what was fitted to training rows.
-
-    Args:
-        problem: data and scene.
-        arrays: from `arrays`.
-        paths: file of the paths of all rows.
-    """
+    """A traced scene with offsets that were fitted to training rows."""
 
     def __init__(self, problem: Problem, arrays: Arrays, paths: Path) -> None:
         self._problem, self._arrays, self._paths = problem, arrays, paths
@@ -113,7 +103,7 @@ class FittedTracing(Fitted):
 
     @cached_property
     def _tracer(self) -> RayTracer:
-        """With the number of rays that the run settled on, not one that new positions would."""
+        """Tracer with the number of rays of the run."""
         problem = self._problem
         assert problem.scene is not None
         options = replace(problem.settings.options, rays=int(self._arrays["rays"]))
@@ -128,35 +118,33 @@ class FittedTracing(Fitted):
         return self._reported(load_trace(self._paths))
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
-        """From the stored paths."""
+        """Predictions from the stored paths."""
         return Prediction(self._of_rows[receiver, rows])
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """See `Fitted`. Positions are traced for all receivers together.
+        """Predictions of a receiver; positions are traced for all receivers together.
 
         Raises:
             InputError: a position inside a solid object.
         """
-        # One receiver after the other is asked for; the same one again means anew, as where predictions are timed.
+        # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
         if self._last is None or receiver in self._last[2] or not _same(self._last[0], inputs):
-            ends = inputs.first_row, inputs.carriers_hz
-            traced = self._tracer.trace(inputs.tx_pos_m, False, *ends)
+            traced = self._tracer.trace(inputs.tx_pos_m, False, inputs.first_row, inputs.carriers_hz)
             self._last = inputs, self._reported(traced), set()
         self._last[2].add(receiver)
         return Prediction(self._last[1][receiver])
 
     def arrays(self) -> Arrays:
-        """See `Fitted`."""
+        """Numbers of rays and paths, duration of tracing, and offsets."""
         return self._arrays
 
     def facts(self) -> dict[str, Any]:
-        """Numbers of paths and rays, and what tracing took."""
-        own = {"trace_seconds": float(self._arrays["trace_seconds"])}
-        return own | {"paths": int(self._arrays["paths"]), "rays": int(self._arrays["rays"])}
+        """Duration of tracing, numbers of paths and rays."""
+        return {name: self._arrays[name].item() for name in ("trace_seconds", "paths", "rays")}
 
 
-def _same(one: Inputs, other: Inputs) -> bool:
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ("tx_pos_m", "tx_heading_rad", "carriers_hz")]
+def _same(left: Inputs, right: Inputs) -> bool:
+    pairs = [(getattr(left, name), getattr(right, name)) for name in ("tx_pos_m", "carriers_hz")]
     return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
@@ -170,12 +158,12 @@ class FittedCalibration(FittedField):
     """Traced paths whose materials, planes, antennas or poses were trained."""
 
     def facts(self) -> dict[str, Any]:
-        """What was trained, and how long."""
+        """Steps, and the trained parameters."""
         return super().facts() | {"calibration": self._problem.settings.calibration}
 
 
 def _graph_problem(problem: Problem) -> Problem:
-    """The same for the training loop: settings of paths alone."""
+    """The problem of the training loop, with settings of paths alone."""
     settings: TracingSettings = problem.settings
     assert settings.calibration is not None
     options = settings.options
@@ -183,12 +171,17 @@ def _graph_problem(problem: Problem) -> Problem:
         raise InputError("calibration: diffraction and scattering have no derivative here; trace without them")
     if not options.line_of_sight or options.seed != TraceOptions().seed:
         what = f"seed={options.seed}" if options.line_of_sight else "paths without line-of-sight"
-        raise InputError(f"calibration: {what} cannot be chosen there; leave it away")
-    own = [f"seed={problem.seed}", f"traced.depth={options.max_depth}", f"traced.reflections={_reflections(options)}"]
-    own += [f"traced.transmission={str(options.transmission).lower()}"]
-    own += [] if options.rays == "auto" else [f"traced.rays={options.rays}"]
-    own += settings.chosen()
-    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), own)
+        raise InputError(f"calibration: {what} cannot be chosen there; omit it")
+    reflections = options.max_depth if options.max_reflections is None else options.max_reflections
+    given = [
+        f"seed={problem.seed}",
+        f"traced.depth={options.max_depth}",
+        f"traced.reflections={reflections if options.reflection else 0}",
+        f"traced.transmission={str(options.transmission).lower()}",
+        *([] if options.rays == "auto" else [f"traced.rays={options.rays}"]),
+        *settings.chosen(),
+    ]
+    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), given)
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 
@@ -196,14 +189,8 @@ def _moves_planes(problem: Problem) -> bool:
     return "planes" in (problem.settings.calibration or "").split(",")
 
 
-def _reflections(options: TraceOptions) -> int:
-    if not options.reflection:
-        return 0
-    return options.max_depth if options.max_reflections is None else options.max_reflections
-
-
 def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-    """Train what is to be calibrated, or trace all rows, unless another fold has, and fit offsets of signal strengths.
+    """Train the calibrated parameters; or trace all rows, unless another fold has, and fit offsets of signal strengths.
 
     Raises:
         InputError: a receiver without a training row that a path reaches.
@@ -230,8 +217,8 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     seconds = time.perf_counter() - start
     facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
     arrays = {name: np.asarray(value) for name, value in facts.items()}
-    known = split.all_train
     if task_of(record).in_decibel:
+        known = split.all_train
         offsets = fit_offsets(tracer.observe(traced)[:, known], record.observation[:, known])
         arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
     fitted = FittedTracing(problem, arrays, path)
@@ -240,26 +227,25 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-    """What a fit's arrays describe; stored paths lie in the run folder, above the folds."""
+    """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
     if problem.settings.calibration is not None:
-        found = FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
-        return found
+        return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
     here = folder / PATHS
     return FittedTracing(problem, arrays, here if here.exists() else folder.parent / PATHS)
 
 
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
-    """Paths of all positions; each part with the number of rays that all of them settle on."""
+    """Paths of all positions; every part has the number of rays of all positions."""
     tx_pos_m, carriers, scheduler = problem.record.tx_pos_m, problem.record.carriers_hz, session.scheduler
     if scheduler is None:
         return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
     assert problem.scene is not None
     rays = tracer.rays(tx_pos_m)
     parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_PER_CHUNK)
-    ends = tracer.instrument, replace(tracer.options, rays=rays), problem.material
     given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
     sizes = [len(positions) for positions, *_ in given]
-    opener = partial(RayTracer, problem.scene, *ends)
+    options = replace(tracer.options, rays=rays)
+    opener = partial(RayTracer, problem.scene, tracer.instrument, options, problem.material)
     found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
     return replace(join_traces(found), options=tracer.options)
 
@@ -275,7 +261,7 @@ def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | Non
 
 
 def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
-    """Settings with those chosen by convergence, if any are; ``convergence.json`` says what was tried."""
+    """Settings, with those that are chosen by convergence; ``convergence.json`` lists all tried settings."""
     settings: TracingSettings = problem.settings
     path = session.run / CONVERGENCE
     if settings.target_error_db is None:
@@ -284,19 +270,19 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
         record, instrument = problem.record, instrument_of(problem.record)
         spectra = instrument.observe if task_of(record).image else None
         kinds = settings.target_kinds.split(",")
-        ends = settings.target_error_db, settings.options, kinds, spectra, record.tx_antenna
-        choice = choose_options(problem.opened_scene, record.tx_pos_m, record.receivers, *ends)
+        target = settings.target_error_db, settings.options, kinds, spectra, record.tx_antenna
+        choice = choose_options(problem.opened_scene, record.tx_pos_m, record.receivers, *target)
         write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
     with readable(path, f"{path}: missing; trace anew", "trace anew"):
         return replace(settings, **json.loads(path.read_text())["options"])
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse a scene that cannot be opened at every carrier, and what cannot be calibrated or chosen."""
+    """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
     settings, carriers = problem.settings, problem.record.carriers_hz
     if carriers is not None:
         if settings.calibration is not None or settings.target_error_db is not None:
-            text = "calibration and target_error_db serve one carrier; leave them away"
+            text = "calibration and target_error_db serve one carrier; omit both"
             raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
         for carrier_hz in np.unique(carriers):
             problem.open_scene(float(carrier_hz))

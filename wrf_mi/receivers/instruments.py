@@ -1,4 +1,4 @@
-"""What instruments report of traced paths: spectra, signal strengths, channel coefficients, in float64."""
+"""Instruments: spectra, signal strengths or channel coefficients of traced paths, in float64."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .channel import antenna_csi, csi, element_signals, rssi_dbm
 
 @dataclass(frozen=True)
 class Instrument(ABC):
-    """Receivers and what they report of traced paths.
+    """Receivers and their reports of traced paths.
 
     Attributes:
-        receivers: that measure.
-        frequencies_hz: of the carrier [1] or the subcarriers [k].
+        receivers: the ``n_rx`` receivers.
+        frequencies_hz: carrier frequency [1] or those of the subcarriers [k].
         tx_antenna: antenna of the transmitters.
     """
 
@@ -34,24 +34,32 @@ class Instrument(ABC):
 
     @property
     def carrier_hz(self) -> float:
-        """The frequency that is traced at: the middle of the subcarriers."""
+        """Frequency at which paths are traced: the mean of the subcarriers."""
         return float(np.mean(self.frequencies_hz))
 
     @abstractmethod
     def observe(self, paths: Paths) -> NDArray[Any]:
-        """What the receivers report of traced paths, [n_rx, n_tx, ...] as in a record of the task."""
+        """Observations [n_rx, n_tx, ...] of traced paths, as in a record of the task."""
 
     def observe_rows(self, paths: Paths, carriers_hz: FloatArray | None) -> NDArray[Any]:
-        """`observe` where each transmitter has the carrier in Hz of ``carriers_hz`` [n_tx]; None: the instrument's."""
+        """`observe` with a carrier in Hz for each transmitter, ``carriers_hz`` [n_tx]; None: the instrument's."""
         if carriers_hz is None:
             return self.observe(paths)
 
-        def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
-            own = paths.select(np.isin(paths.tx, rows))
-            own = replace(own, tx=np.searchsorted(rows, own.tx), n_tx=len(rows))
-            return replace(self, frequencies_hz=np.array([carrier_hz])).observe(own)
+        def at_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
+            some = paths.select(np.isin(paths.tx, rows))
+            some = replace(some, tx=np.searchsorted(rows, some.tx), n_tx=len(rows))
+            return replace(self, frequencies_hz=np.array([carrier_hz])).observe(some)
 
-        return by_carrier(carriers_hz, of_carrier, axis=1)
+        return by_carrier(carriers_hz, at_carrier, axis=1)
+
+    def by_receiver(self, paths: Paths) -> list[tuple[Receiver, Paths]]:
+        """Each receiver with its paths."""
+        parts = []
+        for index, receiver in enumerate(self.receivers):
+            some = paths if paths.n_rx == 1 else paths.select(paths.rx == index)
+            parts.append((receiver, replace(some, rx=np.zeros_like(some.rx), n_rx=1)))
+        return parts
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,7 @@ class PowerInstrument(Instrument):
     """Received power in dBm for 0 dBm sent, [n_rx, n_tx], NaN where no path arrives: powers of paths are added."""
 
     def observe(self, paths: Paths) -> NDArray[Any]:
-        """See `wrf_mi.receivers.channel.rssi_dbm`."""
+        """Received power, see `wrf_mi.receivers.rssi_dbm`."""
         return rssi_dbm(paths)
 
 
@@ -68,12 +76,12 @@ class ChannelInstrument(Instrument):
     """Channel coefficients, [n_rx, n_tx, k], or [n_rx, n_tx, m, k] of receivers with m antennas: fields are added."""
 
     def observe(self, paths: Paths) -> NDArray[Any]:
-        """See `wrf_mi.receivers.channel.csi` and ``antenna_csi``."""
-        if all(one.array_m is None for one in self.receivers):
+        """Channel coefficients, see `wrf_mi.receivers.csi` and `wrf_mi.receivers.antenna_csi`."""
+        if all(receiver.array_m is None for receiver in self.receivers):
             return csi(paths, self.frequencies_hz)
         channels = [
-            antenna_csi(own, receiver, receiver.array_m, self.frequencies_hz)[0]
-            for receiver, own in _by_receiver(self.receivers, paths)
+            antenna_csi(some, receiver, receiver.array_m, self.frequencies_hz)[0]
+            for receiver, some in self.by_receiver(paths)
             if receiver.array_m is not None
         ]
         return np.stack(channels)
@@ -81,7 +89,7 @@ class ChannelInstrument(Instrument):
 
 @dataclass(frozen=True)
 class SpectrumInstrument(Instrument):
-    """Bartlett spectra [n_rx, n_tx, height, width], each scaled to its own minimum and maximum as instruments do.
+    """Bartlett spectra [n_rx, n_tx, height, width], each scaled by its minimum and maximum as instruments do.
 
     Attributes:
         size: height and width of a spectrum.
@@ -90,22 +98,13 @@ class SpectrumInstrument(Instrument):
     size: tuple[int, int] = (90, 360)
 
     def observe(self, paths: Paths) -> NDArray[np.float32]:
-        """See `wrf_mi.receivers.array.bartlett_spectrum`; grey in 0..1, all 0 where no path arrives."""
+        """Spectra in 0..1, see `wrf_mi.receivers.bartlett_spectrum`; all 0 where no path arrives."""
         images = np.empty((len(self.receivers), paths.n_tx, *self.size), np.float32)
-        for index, (receiver, own) in enumerate(_by_receiver(self.receivers, paths)):
+        for index, (receiver, some) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
-            signals = element_signals(own, receiver, receiver.array_m, self.carrier_hz)[0]
-            # One transmitter at a time: an array of spectra in float64 would be several times what is kept.
+            signals = element_signals(some, receiver, receiver.array_m, self.carrier_hz)[0]
+            # One transmitter at a time: float64 spectra of all would take several times the memory of the result.
             for row, signal in enumerate(signals):
                 image = bartlett_spectrum(signal, receiver.array_m, self.carrier_hz, *self.size)
                 images[index, row] = minmax_scale(image)
         return images
-
-
-def _by_receiver(receivers: tuple[Receiver, ...], paths: Paths) -> list[tuple[Receiver, Paths]]:
-    """Each receiver with its own paths."""
-    parts = []
-    for index, receiver in enumerate(receivers):
-        own = paths if paths.n_rx == 1 else paths.select(paths.rx == index)
-        parts.append((receiver, replace(own, rx=np.zeros_like(own.rx), n_rx=1)))
-    return parts

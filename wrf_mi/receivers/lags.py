@@ -21,10 +21,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.constants import speed_of_light
-from scipy.linalg import solve_triangular
 
 from ..core import InputError
-from ..core.angles import FloatArray, azimuth_rad, elevation_rad, unit_vectors
+from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
 
 SAME_LAG = 1e-6
@@ -37,19 +36,22 @@ class Lags:
     """The linear map between lags and squared spectra of one array on one grid of directions.
 
     Args:
-        elements_m: elements [m, 3] in the array's frame, metres; any planar or other arrangement.
-        frequency_hz: of the carrier.
+        elements_m: elements [m, 3] in the array's frame, metres, in any arrangement.
+        frequency_hz: carrier frequency.
         height: elevations over the upper hemisphere.
         width: azimuths over the full circle.
-        row_offset: rows by which the first one lies above the horizon.
+
+    Attributes:
+        shape: height and width.
+        elements: number m of elements.
+        lag_m: differences of element positions over a half space, zero first, [l, 3].
+        basis: squared spectra of the unit vectors of lags, [height * width, count].
 
     Raises:
         InputError: element positions that are not finite [m, 3].
     """
 
-    def __init__(
-        self, elements_m: ArrayLike, frequency_hz: float, height: int, width: int, row_offset: float = 0.0
-    ) -> None:
+    def __init__(self, elements_m: ArrayLike, frequency_hz: float, height: int, width: int) -> None:
         elements = np.asarray(elements_m, float)
         if elements.ndim != 2 or elements.shape[1:] != (3,) or not len(elements) or not np.isfinite(elements).all():
             raise InputError(f"lags: elements of shape {elements.shape}; give finite [m, 3] in metres")
@@ -57,48 +59,27 @@ class Lags:
         self.elements = len(elements)
         self.lag_m, self._pair, self._side = _differences(elements)
         wavenumber = 2 * np.pi * frequency_hz / speed_of_light
-        rise = row_offset * np.pi / 2 / height
-        directions = unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None] + rise)
-        phase = wavenumber * (directions.reshape(-1, 3) @ self.lag_m.T)
-        # cos for the real part; Re(r exp(-j phase)) has + sin for the imaginary one.
+        phase = wavenumber * (pixel_directions(height, width).reshape(-1, 3) @ self.lag_m.T)
+        # Re(r exp(-j phase)) = Re(r) cos(phase) + Im(r) sin(phase).
         parts = [np.ones((len(phase), 1)), np.sqrt(2) * np.cos(phase[:, 1:]), np.sqrt(2) * np.sin(phase[:, 1:])]
         self.basis: FloatArray = np.concatenate(parts, axis=1)
 
     @property
     def count(self) -> int:
-        """Real numbers in a vector of lags."""
+        """Number of real numbers in a vector of lags."""
         return self.basis.shape[1]
-
-    def of_signals(self, signals: ArrayLike) -> FloatArray:
-        """Lags [..., count] of one snapshot of complex element signals [..., m]; snapshots' lags may be averaged."""
-        h = np.asarray(signals, complex)
-        products = (h[..., :, None] * h[..., None, :].conj()).reshape(*h.shape[:-1], -1)
-        return products.real @ self.pairs[0] + products.imag @ self.pairs[1]
 
     @cached_property
     def pairs(self) -> FloatArray:
         """Matrices [2, m * m, count] that add real and imaginary parts of products h_m conj(h_n) up to lags."""
-        half, place, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
-        matrices = np.zeros((2, len(place), self.count))
+        half, lag_of, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
+        matrices = np.zeros((2, len(lag_of), self.count))
         for pair in np.flatnonzero(side > 0):
-            lag = place[pair]
+            lag = lag_of[pair]
             matrices[0, pair, lag] = np.sqrt(2) if lag else 1
             if lag:
                 matrices[1, pair, half + lag] = np.sqrt(2)
         return matrices
-
-    def squared(self, lags: ArrayLike) -> FloatArray:
-        """Squared spectra [..., height, width] of lags [..., count]; below 0 where no signals have such lags."""
-        values = np.asarray(lags, float)
-        return (values @ self.basis.T).reshape(*values.shape[:-1], *self.shape)
-
-    def of_squared(self, squared: ArrayLike) -> FloatArray:
-        """Lags [..., count] whose squared spectrum is nearest, in the mean over pixels, to [..., height, width].
-
-        Raises:
-            InputError: an array whose lags this grid does not tell apart.
-        """
-        return solve_triangular(self._triangle, self.coordinates(squared)[..., None], lower=False)[..., 0]
 
     def coordinates(self, squared: ArrayLike) -> FloatArray:
         """Coordinates [..., count] in an orthonormal basis of all squared spectra: distances are those of pixels."""
@@ -113,18 +94,9 @@ class Lags:
         return np.asarray(lags, float) @ self._triangle.T
 
     def residual(self, image: ArrayLike) -> FloatArray:
-        """What no squared spectrum of this array can have, of images [..., height, width]; the same shape."""
+        """Part of images [..., height, width] outside the span of this array's squared spectra; the same shape."""
         values = np.asarray(image, float)
         return values - (self.coordinates(values) @ self._orthonormal.T).reshape(values.shape)
-
-    @cached_property
-    def _factors(self) -> tuple[FloatArray, FloatArray]:
-        orthonormal, triangle = np.linalg.qr(self.basis)
-        values = np.linalg.svd(triangle, compute_uv=False)
-        if len(values) < self.count or values[-1] < LEAST_CONDITION * values[0]:
-            text = f"{self.count} lags on {self.shape[0]} x {self.shape[1]} directions cannot be told apart"
-            raise InputError(f"lags: {text}; take more directions, or elements no further apart than half a wavelength")
-        return orthonormal, triangle
 
     @property
     def _orthonormal(self) -> FloatArray:
@@ -134,9 +106,19 @@ class Lags:
     def _triangle(self) -> FloatArray:
         return self._factors[1]
 
+    @cached_property
+    def _factors(self) -> tuple[FloatArray, FloatArray]:
+        """QR decomposition of the basis."""
+        orthonormal, triangle = np.linalg.qr(self.basis)
+        values = np.linalg.svd(triangle, compute_uv=False)
+        if len(values) < self.count or values[-1] < LEAST_CONDITION * values[0]:
+            text = f"{self.count} lags on {self.shape[0]} x {self.shape[1]} directions cannot be told apart"
+            raise InputError(f"lags: {text}; take more directions, or elements no further apart than half a wavelength")
+        return orthonormal, triangle
+
 
 def _differences(elements_m: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Lags [l, 3] of a half space, zero first; which lag a pair is, [m, m], and 1 or, in the other half, -1."""
+    """Lags [l, 3] of a half space, zero first; lag of each pair of elements [m, m], and its sign, -1 if mirrored."""
     count = len(elements_m)
     difference = (elements_m[:, None, :] - elements_m[None, :, :]).reshape(-1, 3)
     grain = SAME_LAG * max(float(np.ptp(elements_m, axis=0).max()), np.finfo(float).tiny)
@@ -144,5 +126,5 @@ def _differences(elements_m: FloatArray) -> tuple[FloatArray, IntArray, IntArray
     first = np.argmax(steps != 0, axis=1)
     side = np.where(steps[np.arange(len(steps)), first] < 0, -1, 1)
     # Each leads with a positive number, so zero sorts first.
-    _, index, place = np.unique(side[:, None] * steps, axis=0, return_index=True, return_inverse=True)
-    return side[index, None] * difference[index], place.reshape(count, count), side.reshape(count, count)
+    _, index, lag = np.unique(side[:, None] * steps, axis=0, return_index=True, return_inverse=True)
+    return side[index, None] * difference[index], lag.reshape(count, count), side.reshape(count, count)

@@ -1,14 +1,14 @@
-"""From a stored spectrum back to the complex signals of the array's elements.
+"""Retrieval of the complex element signals of an array from a stored spectrum.
 
-A spectrum that was scaled to its own minimum and maximum and cut to grey levels still tells the element signals, up to
-a common factor:
+A spectrum that was scaled by its minimum and maximum and cut to grey levels determines the element signals up to a
+common factor:
 
-1. The lowest magnitude. Scaling took off a constant c of the magnitude; (grey + c)^2 lies in the span of the array's
-   lags, grey^2 alone does not. So c is linear least squares.
-2. The signals. Lags are sums of products h_m conj(h_n); for a planar array of two or more rows and columns they have
-   more numbers than the signals. Their inverse, phase retrieval from an autocorrelation, is unique up to a common
-   phase and, where the array is its own mirror image through its centre, the exchange of h_m with the conjugate of the
-   opposite element's signal, which leaves the magnitude as it is. It has local minima: it is started several times.
+1. The lowest magnitude. Scaling subtracted a constant c from the magnitude; (grey + c)^2 lies in the span of the
+   array's lags, grey^2 alone does not. So c is a linear least-squares problem.
+2. The signals. Lags are sums of products h_m conj(h_n); for a planar array of two or more rows and columns there are
+   more lags than signals. Phase retrieval from an autocorrelation is unique up to a common phase and, where the array
+   is its own mirror image through its centre, the exchange of h_m with the conjugate of the opposite element's signal,
+   which leaves the magnitude unchanged. It has local minima, hence several random starts.
 
 Source: Hayes, "The reconstruction of a multidimensional sequence from the phase or magnitude of its Fourier transform"
 (1982) for uniqueness; More, "The Levenberg-Marquardt algorithm" (1978).
@@ -30,22 +30,24 @@ from .lags import Lags
 ComplexArray = NDArray[np.complex128]
 
 STARTS = 200
-"""Of the retrieval of one spectrum; of 160 measured ones half needed 5 or fewer, the slowest 76."""
+"""Random starts for one spectrum at most; half of 160 measured spectra needed 5 or fewer, the slowest 76."""
 GOOD_ENOUGH = 4.0
-"""A start has found the signals when what is left is this many times what the grey levels explain."""
+"""A start has converged when its residual is at most this many times that of the grey levels."""
 STEPS = 120
-"""Evaluations of one start; those that arrive take 20 to 60."""
+"""Evaluations of one start; starts that converge take 20 to 60."""
+LEVELS = 255
+"""Highest grey level; digits below a level are cut off."""
 
 
 @dataclass(frozen=True)
 class Unscaled:
-    """Spectra with what scaling took off put back, in units of each spectrum's range.
+    """Spectra before their minimum was subtracted, in units of each spectrum's range.
 
     Attributes:
         squared: squared magnitudes [n, height, width].
         lowest: c, the magnitude that became 0, over the range that became 1, [n].
-        residual: root mean square over pixels of what no squared spectrum of the array can have, [n].
-        rounding: what the grey levels alone would leave, [n].
+        residual: root mean square over pixels of the part outside the span of the array's lags, [n].
+        rounding: the residual that the grey levels alone explain, [n].
     """
 
     squared: FloatArray
@@ -54,26 +56,23 @@ class Unscaled:
     rounding: FloatArray
 
 
-def unscale(grey: ArrayLike, lags: Lags, bits: int = 8, cut: bool = True) -> Unscaled:
-    """Undo the scaling of stored spectra, see `wrf_mi.receivers.physical_array.instrument_report`.
+def unscale(grey: ArrayLike, lags: Lags) -> Unscaled:
+    """Undo the scaling of stored spectra.
 
     Args:
-        grey: stored spectra [n, height, width], 0 to 1.
-        lags: of the array on their grid.
-        bits: of a level.
-        cut: digits were cut off at whole levels; False: rounded.
+        grey: stored spectra [n, height, width], 0 to 1, magnitudes cut to multiples of 1 / `LEVELS`.
+        lags: lags of the array on the spectra's grid.
 
     Raises:
         InputError: another grid.
     """
-    levels = 2**bits - 1
     stored = np.asarray(grey, float)
     # Cutting off takes half a level on average, but not from the highest.
-    middle = stored + 0.5 / levels * (stored < 1) if cut else stored
+    middle = stored + 0.5 / LEVELS * (stored < 1)
     curved, straight = (lags.residual(image).reshape(len(stored), -1) for image in (middle**2, middle))
-    # Levels' rounding is in both: what its variance adds to either sum is taken off. Where nothing but rounding lies
-    # outside the span, c cannot be told; it is then estimated too low, not at random.
-    rounding = (1 - lags.count / middle[0].size) * middle[0].size / (12 * levels**2)
+    # The variance of the levels' rounding is subtracted from both sums. Where only rounding lies outside the span, c is
+    # not determined; it is then estimated too low, not at random.
+    rounding = (1 - lags.count / middle[0].size) * middle[0].size / (12 * LEVELS**2)
     across = (curved * straight).sum(axis=1) - 2 * middle.mean(axis=(1, 2)) * rounding
     square = np.square(straight).sum(axis=1)
     lowest = np.maximum(-across / (2 * np.maximum(square - rounding, rounding)), 0)
@@ -83,7 +82,7 @@ def unscale(grey: ArrayLike, lags: Lags, bits: int = 8, cut: bool = True) -> Uns
         magnitude**2,
         lowest,
         np.sqrt(np.square(left).mean(axis=1)),
-        np.sqrt(np.square(2 * magnitude / levels).mean(axis=(1, 2)) / 12),
+        np.sqrt(np.square(2 * magnitude / LEVELS).mean(axis=(1, 2)) / 12),
     )
 
 
@@ -92,9 +91,9 @@ class Retrieved:
     """Element signals of spectra.
 
     Attributes:
-        signals: [n, m], each spectrum's up to a common phase (and the exchange with its mirror image).
-        residual: root mean square over pixels of the squared spectrum in the span of the lags that they leave, [n].
-        found: whether that is what grey levels explain, [n]; the others are a local minimum or no single snapshot.
+        signals: [n, m], each row up to a common phase (and the exchange with its mirror image).
+        residual: root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n].
+        found: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
     """
 
     signals: ComplexArray
@@ -103,16 +102,16 @@ class Retrieved:
 
 
 def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:
-    """Signals whose squared spectra are nearest.
+    """Signals whose squared spectra are nearest in the least-squares sense.
 
     Args:
-        unscaled: from `unscale`.
-        lags: the same.
-        seed: of the starts.
-        starts: at most so many for each spectrum.
+        unscaled: spectra from `unscale`.
+        lags: lags of the array on the spectra's grid.
+        seed: seed of the random starts.
+        starts: largest number of starts for each spectrum.
 
     Raises:
-        InputError: an array whose lags do not tell its signals: a line, or one of fewer than four elements.
+        InputError: an array whose lags do not determine its signals: a line, or fewer than four elements.
     """
     m = lags.elements
     extent = np.linalg.svd(lags.lag_m, compute_uv=False)
@@ -141,7 +140,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
 
 
 def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
-    """Levenberg-Marquardt from one start: the signals, real and imaginary parts, and the norm of what is left."""
+    """Levenberg-Marquardt from one start: real and imaginary parts of the signals, and the norm of the residual."""
     size = len(start)
     flat = form.reshape(size, -1)
 
@@ -161,17 +160,17 @@ def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[F
 
 
 def align_signals(signals: ArrayLike, tx_pos_m: ArrayLike, elements_m: ArrayLike) -> ComplexArray:
-    """Choose each spectrum's common phase, and of the two mirror images one, so that neighbours in space agree.
+    """Choose each row's common phase, and one of its two mirror images, so that neighbours in space agree.
 
-    Rows are joined nearest first (Prim's tree). One exchange of all with their mirror images is left open.
+    Rows are joined nearest first (Prim's tree). The exchange of all rows with their mirror images stays undetermined.
 
     Args:
-        signals: [n, m].
-        tx_pos_m: of the transmitters, [n, 3], metres.
-        elements_m: [m, 3].
+        signals: element signals [n, m].
+        tx_pos_m: transmitter positions [n, 3], metres.
+        elements_m: element positions [m, 3], metres.
 
     Returns:
-        Shape [n, m].
+        Aligned signals [n, m].
     """
     aligned, positions = np.array(signals, complex), np.asarray(tx_pos_m, float)
     opposite = mirror_order(elements_m)

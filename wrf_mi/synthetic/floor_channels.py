@@ -37,7 +37,7 @@ from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import load, make_splits, read_nerf2_csi, user_cache, write_nerf2_csi
 from ..datasets.registry import locate
-from ..tracing.array_channels import array_channels
+from ..receivers.channel import array_channels
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
 from ..tracing.solve import trace_paths

@@ -36,8 +36,8 @@ from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import read_spectrum_folder, user_cache, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum, minmax_scale
+from ..receivers.channel import array_channels
 from ..scene.scan import simulate_scan
-from ..tracing.array_channels import array_channels
 from ..tracing.devices import solids, winding_number
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene

@@ -25,7 +25,7 @@ from ..datasets.registry import locate
 from ..scene.scan import simulate_scan
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
-from ..tracing.spectra import trace_spectra
+from ..tracing.tracer import trace_spectra
 
 logger = logging.getLogger(__name__)
 

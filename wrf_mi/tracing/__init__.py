@@ -1,4 +1,4 @@
-"""Ray tracing by Sionna RT: scenes, paths, spectra."""
+"""Ray tracing by Sionna RT: scenes, paths, spectra, and paths with derivatives."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from .options import TraceOptions
 from .result import TraceResult, load_trace, recompute, save_trace
 from .scenes import open_scene
 from .solve import trace_paths
-from .spectra import trace_spectra
+from .tracer import RayTracer, trace_spectra
 
 __all__ = [
+    "RayTracer",
     "TraceOptions",
     "TraceResult",
     "load_trace",

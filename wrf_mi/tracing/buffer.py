@@ -1,8 +1,7 @@
-"""Our plain arrays to and from Sionna RT's ``PathsBuffer``, and its two stages that work on one.
+"""Conversion of plain arrays to and from Sionna RT's ``PathsBuffer``, and its image method.
 
-Sionna RT's path solver is three stages: a search for candidates, the image method that makes exact paths of them, and
-the field calculator. Only this module touches the attributes of ``PathsBuffer`` that have no setter; the version is
-pinned.
+Sionna RT's path solver has three stages: a search for candidates, the image method that makes exact paths of them, and
+the field calculator. This module alone sets attributes of ``PathsBuffer`` that have no setter; the version is pinned.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 
 @dataclass(frozen=True)
 class Legs:
-    """What Sionna RT's stages need to know of p paths, from source to target.
+    """Interactions of p paths from source to target, the input of Sionna RT's stages.
 
     Attributes:
-        source, target: which point each path joins, shape [p].
+        source, target: indices of the points that each path joins, shape [p].
         interactions: ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last.
-        face: index into `Surfaces.triangles` of what is met, shape [p, depth], -1 beyond the last.
-        vertices_m: interaction points [p, depth, 3], NaN beyond the last.
-        probability: with which a random search chose the interaction, shape [p, depth]; 1 in an exhaustive one.
+        face: index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last.
+        vertices_m: interaction points [p, depth, 3], metres, NaN beyond the last.
+        probability: probability of the interaction in a random search, shape [p, depth]; 1 in an exhaustive one.
         wedge: edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction.
     """
 
@@ -52,7 +51,7 @@ class Legs:
         return len(self.source)
 
     def select(self, which: NDArray[Any] | slice) -> Legs:
-        """Those of a mask or of indices."""
+        """The paths of a mask or of indices."""
         wedge = {name: array[which] for name, array in self.wedge.items()}
         return Legs(**{name: getattr(self, name)[which] for name in ARRAYS}, wedge=wedge)
 
@@ -61,29 +60,22 @@ class Legs:
         depth = self.interactions.shape[1]
         last = np.count_nonzero(self.interactions, axis=1)[:, None] - 1
         level = np.arange(depth)
-        place = np.arange(len(self))[:, None], np.where(level <= last, last - level, level)
-        return replace(
-            self,
-            source=self.target,
-            target=self.source,
-            interactions=self.interactions[place],
-            face=self.face[place],
-            vertices_m=self.vertices_m[place],
-            probability=self.probability[place],
-        )
+        turned = np.arange(len(self))[:, None], np.where(level <= last, last - level, level)
+        arrays = {name: getattr(self, name)[turned] for name in ("interactions", "face", "vertices_m", "probability")}
+        return replace(self, source=self.target, target=self.source, **arrays)
 
 
 def specular_legs(
     source: IntArray, target: IntArray, interactions: NDArray[np.uint8], face: IntArray, vertices_m: FloatArray
 ) -> Legs:
-    """Paths without random choices."""
+    """Legs of an exhaustive search without diffraction."""
     return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
 
 
 def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     """A ``PathsBuffer`` of these paths, as candidates for the image method or (``valid``) as found.
 
-    A transmission without a face is a place holder: any will do.
+    Candidates may hold transmissions without a face: the image method finds it.
     """
     import drjit as dr
     import mitsuba as mi
@@ -115,14 +107,14 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     if legs.wedge:
         for name in WEDGE:
             kind: Any = type(getattr(buffer._diffracting_wedges, name))
-            own = to_vectors if dr.depth_v(kind) > 1 else on_device
-            setattr(buffer._diffracting_wedges, name, own(legs.wedge[name], kind))
+            convert = to_vectors if dr.depth_v(kind) > 1 else on_device
+            setattr(buffer._diffracting_wedges, name, convert(legs.wedge[name], kind))
     buffer._paths_counter = mi.UInt32(count)
     return buffer
 
 
 def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
-    """The valid paths of a buffer and their places in it."""
+    """Indices of the valid paths in a buffer, and the paths."""
     import drjit as dr
 
     buffer.schedule()
@@ -144,7 +136,7 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
 
 
 def exact_paths(scene: Any, surfaces: Surfaces, buffer: Any, sources_m: Any, targets_m: Any) -> tuple[IntArray, Legs]:
-    """Sionna RT's image method on candidates: which of them exist, unobstructed, with the faces really met."""
+    """Sionna RT's image method: indices of the candidates that are unobstructed paths, and these paths."""
     from sionna.rt.path_solvers.image_method import ImageMethod
 
     done = ImageMethod()(
@@ -159,14 +151,14 @@ def exact_paths(scene: Any, surfaces: Surfaces, buffer: Any, sources_m: Any, tar
 
 
 def join(parts: list[Legs], depth: int) -> Legs:
-    """All of them in a row; an empty list gives no path of that depth."""
+    """Concatenate legs; an empty list gives no paths of that depth."""
     if not parts:
         none = np.zeros(0, np.int64)
         return specular_legs(
             none, none, np.zeros((0, depth), np.uint8), np.zeros((0, depth), np.int64), np.zeros((0, depth, 3))
         )
     wedge: dict[str, NDArray[Any]] = {}
-    for name, like in ((name, part.wedge[name]) for part in parts for name in part.wedge):
-        empty = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
-        wedge[name] = np.concatenate([part.wedge.get(name, e) for part, e in zip(parts, empty, strict=True)])
+    for name, like in next((part.wedge for part in parts if part.wedge), {}).items():
+        zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
+        wedge[name] = np.concatenate([part.wedge.get(name, zero) for part, zero in zip(parts, zeros, strict=True)])
     return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)

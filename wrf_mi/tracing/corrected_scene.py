@@ -1,4 +1,4 @@
-"""A scene whose planes are where training has moved them, as a scene folder that plain Sionna RT opens."""
+"""Scene folder with planes as training has moved them, which Sionna RT opens."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
 
 SAME_CORNER_M = 1e-4
-"""Corners of faces that are so close are one, and move together: the gap between meshes that meet."""
+"""Distance within which corners of faces coincide and move together: the gap between meshes that meet."""
 FLAT = 0.1
-"""Share of the largest singular value below which planes at a corner count as parallel: those within 11 degrees have no
-edge that would say where along them the corner goes."""
+"""Share of the largest singular value below which planes at a corner count as parallel: those within 11 degrees do not
+determine the corner's position along them."""
 
 
 def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
     """Corners [f, 3, 3] of a scene's faces, in metres, after its planes have moved.
 
-    A corner goes the shortest way to all moved planes that meet there: off a wall alone along its normal, at an edge or
-    a corner of a room to the new intersection, so that what was closed stays closed. Where more planes meet than have a
-    point in common, least squares; a mesh that only touches another one (a partition that stands on the middle of a
-    floor) does not follow it.
+    A corner takes the shortest way to all moved planes that meet there: on a single wall along its normal, at an edge
+    or a corner of a room to the new intersection: closed surfaces stay closed. Planes without a common point are met in
+    the least-squares sense; a mesh that only touches another one (a partition on the middle of a floor) does not
+    follow it.
 
     Args:
-        surfaces: of the scene.
-        parameters: ``plane.shift`` [q] and ``plane.tilt`` [q, 2]; what is missing is zero.
+        surfaces: surfaces of the scene.
+        parameters: ``plane.shift`` [q] and ``plane.tilt`` [q, 2]; missing ones are zero.
 
     Raises:
         ValueError: parameters of a scene with another number of planes.
@@ -50,17 +50,17 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     normal, offset = moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
 
     corners = surfaces.triangles.reshape(-1, 3)
-    _, first, own = np.unique(np.round(corners / SAME_CORNER_M), axis=0, return_index=True, return_inverse=True)
-    own = own.reshape(-1)
-    pairs = np.unique(np.stack([own, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
+    _, first, same = np.unique(np.round(corners / SAME_CORNER_M), axis=0, return_index=True, return_inverse=True)
+    same = same.reshape(-1)
+    pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
     bounds = np.searchsorted(pairs[:, 0], np.arange(len(first) + 1))
     way = np.zeros((len(first), 3))
     for corner, (low, high) in enumerate(pairwise(bounds)):
         plane = pairs[low:high, 1]
-        # Not to the stated planes' own intersection: what faces are off their plane stays.
+        # Relative to the corner: the distance of faces from their planes within the tolerance stays.
         off = offset[plane] - surfaces.offset[plane] - (normal - surfaces.normal)[plane] @ corners[first[corner]]
         way[corner] = np.linalg.lstsq(normal[plane], off, rcond=FLAT)[0]
-    return (corners + way[own]).reshape(-1, 3, 3)
+    return (corners + way[same]).reshape(-1, 3, 3)
 
 
 def check_materials(scene: Any) -> None:
@@ -75,19 +75,18 @@ def check_materials(scene: Any) -> None:
 
 
 def write_corrected_scene(
-    folder: str | Path, scene: Any, parameters: Mapping[str, NDArray[Any]], description: str = "", replace: bool = False
+    folder: str | Path, scene: Any, parameters: Mapping[str, NDArray[Any]], replace: bool = False
 ) -> Path:
     """Write a scene with moved planes as a scene folder.
 
-    Materials are those of the scene by name, with their thickness; the folder's format has no place for the constants
-    that training gives them.
+    Materials are those of the scene by name, with their thickness; trained constants of materials are not written, as
+    the folder's format has none.
 
     Args:
-        folder: to make.
+        folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: see `moved_triangles`; others are ignored.
-        description: one line.
-        replace: let it take the place of an existing folder.
+        replace: replace an existing folder.
 
     Returns:
         The folder.
@@ -113,6 +112,6 @@ def write_corrected_scene(
         frame="that of the scene it was made from",
         source="a scene whose planes training has moved",
         materials=Materials(surfaces=kinds, thickness_m=thickness),
-        description=description or "A scene with corrected planes",
+        description="A scene with corrected planes",
         replace=replace,
     )

@@ -1,4 +1,4 @@
-"""Whether antennas stand where waves can reach them."""
+"""Checks of antenna positions: inside solids, near surfaces, behind outer walls."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .surfaces import Surfaces
 logger = logging.getLogger(__name__)
 
 SOLID_M = 0.5
-"""A closed body is an object, not a room, if it is thinner on average: 2 volume / area. Walls have their thickness, a
-cabinet 0.3 m, a room of 3 x 3 x 2.5 m 0.94 m."""
+"""Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
+room of 3 x 3 x 2.5 m 0.94 m."""
 NEAREST_M = 0.01
-"""Sionna RT drops paths with a shorter segment."""
+"""Shortest segment of a path that Sionna RT keeps."""
 INSIDE_M = 1e-4
-"""An antenna behind the wall that it is mounted on is traced from so far before it."""
+"""Distance before a wall from which an antenna is traced that lies behind the wall on which it is mounted."""
 ON_M = 1e-6
-"""So close to a plane float32 does not tell its sides apart; Sionna RT takes the antenna to be on the right one."""
+"""Distance from a plane within which float32 does not resolve its sides; Sionna RT then takes the right one."""
 PAIRS_PER_CHUNK = 1 << 20
 
 
@@ -34,19 +34,19 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     """Refuse antennas inside a solid object; warn of those so close to a surface that paths are lost.
 
     Args:
-        surfaces: of the scene.
-        positions_m: shape [n, 3].
-        names: what to call each, such as ``transmitter 3``.
+        surfaces: surfaces of the scene.
+        positions_m: positions [n, 3], metres.
+        names: names of the antennas in messages, such as ``transmitter 3``.
 
     Raises:
-        InputError: naming the first such antenna.
+        InputError: the first antenna inside a solid object.
     """
     thing = solid_around(surfaces, positions_m)
     if (thing >= 0).any():
         first = int(np.argmax(thing >= 0))
-        place = ", ".join(f"{x:.2f}" for x in positions_m[first])
+        at = ", ".join(f"{x:.2f}" for x in positions_m[first])
         what = surfaces.called(int(thing[first]))
-        raise InputError(f"{names[first]} at ({place}) m is inside the solid {what}; move one of them")
+        raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
     near = np.flatnonzero(_near(surfaces, positions_m))
     if len(near):
         text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
@@ -54,32 +54,34 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
 
 
 def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
-    """Positions [n, 3], where antennas that are mounted on the scene's outer walls are put before them.
+    """Move antennas that are mounted on the scene's outer walls, but lie behind them, before the walls.
 
-    Such an antenna lies behind its wall by as much as the mesh is wrong, a millimetre in one from a scan, and nothing
-    would reach it. Only walls count that have all of the scene on one side, so that which is the right one is certain.
+    Errors of a mesh, a millimetre in one from a scan, put such antennas behind their wall, where no path arrives. Only
+    walls with all of the scene on one side count.
 
     Args:
-        surfaces: of the scene.
-        positions_m: shape [n, 3].
+        surfaces: surfaces of the scene.
+        positions_m: positions [n, 3], metres.
+
+    Returns:
+        Corrected positions [n, 3].
     """
     moved = positions_m.copy()
     for point, plane in _pairs_near(surfaces, positions_m):
-        for one in np.unique(plane):
-            normal, offset = surfaces.normal[one], surfaces.offset[one]
+        for index in np.unique(plane):
+            normal, offset = surfaces.normal[index], surfaces.offset[index]
             scene = surfaces.triangles @ normal - offset
             side = 1.0 if scene.max() > -scene.min() else -1.0
             if (side * scene).min() < -NEAREST_M or (side * scene).max() < NEAREST_M:
-                continue  # no outer wall, or all that there is
-            own = point[plane == one]
-            behind = side * (moved[own] @ normal - offset) < -ON_M
-            away = moved[own[behind]] @ normal - offset
-            moved[own[behind]] += (side * INSIDE_M - away)[:, None] * normal
+                continue  # not an outer wall, or the only wall
+            near = point[plane == index]
+            behind = near[side * (moved[near] @ normal - offset) < -ON_M]
+            moved[behind] += (side * INSIDE_M - (moved[behind] @ normal - offset))[:, None] * normal
     return moved
 
 
-def tell_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str]) -> None:
-    """Warn of antennas that `before_walls` moved, from positions [n, 3] to others; ``names``: what to call each."""
+def warn_of_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str]) -> None:
+    """Warn of named antennas that `before_walls` moved from positions [n, 3] to others."""
     changed = np.flatnonzero((moved_m != positions_m).any(axis=1))
     if len(changed):
         text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
@@ -87,7 +89,7 @@ def tell_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str
 
 
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
-    """Object of the solid that each position [n, 3] is inside of, -1 for none; see `solids`."""
+    """Object of the solid around each position [n, 3], -1 for none; see `solids`."""
     thing = np.full(len(positions_m), -1)
     for face in solids(surfaces):
         thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
@@ -95,7 +97,7 @@ def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
 
 
 def solids(surfaces: Surfaces) -> list[IntArray]:
-    """Faces of each closed body that is an object rather than a room; sheets that are not turned alike are no body."""
+    """Faces of each closed, consistently oriented body that is an object rather than a room."""
     count = len(surfaces.triangles)
     if not count:
         return []
@@ -103,7 +105,7 @@ def solids(surfaces: Surfaces) -> list[IntArray]:
     corner = corner.reshape(-1, 3)
     ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
     _, edge, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    # Neighbours that are turned alike run along their common edge in opposite directions.
+    # Neighbours of the same orientation run along their common edge in opposite directions.
     turned = np.bincount(edge.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]))
     face = np.repeat(np.arange(count), 3)
     joint = coo_array((np.ones(3 * count), (face, count + edge.reshape(-1))), shape=(count + len(uses),) * 2)
@@ -120,7 +122,7 @@ def solids(surfaces: Surfaces) -> list[IntArray]:
 
 
 def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
-    """How often a closed surface winds round each point, without sign: 1 inside, 0 outside; shape [n].
+    """Absolute winding number of a closed surface about each point: 1 inside, 0 outside; shape [n].
 
     Source: van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), IEEE Trans. Biomed. Eng. 30(2).
     """
@@ -139,17 +141,17 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
-    """Which points have a surface within `NEAREST_M`."""
+    """Mask of points with a surface within `NEAREST_M`."""
     close = np.zeros(len(points), bool)
     for point, plane in _pairs_near(surfaces, points):
-        for one in np.unique(plane):
-            candidates = point[plane == one]
-            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == one], points[candidates])
+        for index in np.unique(plane):
+            candidates = point[plane == index]
+            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == index], points[candidates])
     return close
 
 
 def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Points and planes within `NEAREST_M` of each other, bounds of the plane's faces included, in parts."""
+    """Pairs of points and planes within `NEAREST_M`, inside the bounds of the plane's faces, in chunks."""
     step = max(1, PAIRS_PER_CHUNK // max(len(surfaces.normal), 1))
     for start in range(0, len(points), step):
         part = points[start : start + step]
@@ -160,7 +162,7 @@ def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArr
 
 
 def _touches(triangles: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """Which points have one of these triangles within `NEAREST_M`: a plane's bounds hold its doorways too."""
+    """Mask of points with a triangle within `NEAREST_M`; bounds of planes include doorways."""
     nearest = np.full(len(points), np.inf)
     step = max(1, PAIRS_PER_CHUNK // len(triangles))
     for start in range(0, len(points), step):

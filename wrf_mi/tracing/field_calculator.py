@@ -1,12 +1,11 @@
-"""Known chains of surfaces followed anew: unfolded length, directions and polarised gain, with derivatives.
+"""Differentiable field calculator: unfolded length, directions and polarised gain along known chains of surfaces.
 
-The image method and the field along each path as Sionna RT computes them, for paths that it found, in any float type.
-The transmitter's image after all reflections tells the length and the direction of arrival; going back through the
-chain, each direction before a reflection is the mirrored one after it. No point of interaction is needed, so nothing is
-divided by a distance to a wall.
+The image method and the field along each path as in Sionna RT, for paths that it found, in any float type. The
+transmitter's image after all reflections gives the length and the direction of arrival; backwards through the chain,
+each direction before a reflection is the mirror image of the one after it. No interaction points are needed, hence no
+division by the distance to a wall.
 
-Sionna RT's own stages have derivatives too (``loop_mode="evaluated"``), but in float32, at some two hundred kernels a
-step, with materials that live in the scene; `docs/joint.md` compares them.
+Vectors are lists of three Dr.Jit arrays, complex numbers pairs (re, im).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ..gaussians.footprint import Pose
 from .slab import slab
 
 ALONG = 1e-12
-"""Squared sine below which a direction lies along a wall's normal: any plane of incidence will do."""
+"""Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
@@ -33,23 +32,23 @@ Complex = tuple[Any, Any]
 
 @dataclass
 class Level:
-    """What q paths meet at one depth, arrays [q].
+    """Interactions of q paths at the same depth; place holders where a path has fewer.
 
     Attributes:
-        normal: of the plane, either sign, world; zeros where nothing is met.
-        offset_m: n . x of the plane.
-        reflects: the wave is mirrored there.
-        transmits: the wave passes through.
-        material: index into the materials' tables.
-        plane: index into the scene's planes.
+        normal: unit normals of the planes, either sign, world frame; zeros for place holders.
+        offset_m: offsets n . x of the planes, metres.
+        reflects: mask of reflections.
+        transmits: mask of transmissions.
+        material: indices into `Tables`.
+        plane: indices into the scene's planes.
     """
 
-    normal: Vector
-    offset_m: Any
-    reflects: Any
-    transmits: Any
-    material: Any
-    plane: Any
+    normal: Vector  # three float arrays [q]
+    offset_m: Any  # float [q]
+    reflects: Any  # mask [q]
+    transmits: Any  # mask [q]
+    material: Any  # unsigned integer [q]
+    plane: Any  # unsigned integer [q]
 
 
 @dataclass
@@ -57,25 +56,25 @@ class Chains:
     """Chains of q paths from transmitters to one receiver.
 
     Attributes:
-        source_m: transmitter of each path, world, three arrays [q].
-        heading: cosine and sine of its yaw, [q].
-        exists: 1, or 0 for a place holder, [q].
-        levels: from the transmitter on.
+        source_m: transmitter positions, world frame, metres.
+        heading: cosine and sine of the transmitters' yaw.
+        exists: 1 for a path, 0 for a place holder.
+        levels: interactions in the order from the transmitter.
     """
 
-    source_m: Vector
-    heading: Complex
-    exists: Any
-    levels: list[Level]
+    source_m: Vector  # three float arrays [q]
+    heading: Complex  # two float arrays [q]
+    exists: Any  # float [q]
+    levels: list[Level]  # [depth]
 
     def select(self, index: Any) -> Chains:
-        """The paths ``index``, an integer array."""
+        """Select the paths of an unsigned integer array of indices."""
         return dr.gather(Chains, self, index)
 
 
 @dataclass
 class Tables:
-    """The materials, arrays [n]: relative permittivity, conductivity (S/m), thickness (m), see `SlabMaterials`."""
+    """Tables [n] of materials: relative permittivity, conductivity (S/m), thickness (m), see `SlabMaterials`."""
 
     permittivity: Any
     conductivity: Any
@@ -88,17 +87,16 @@ class EvaluatedPaths:
     """Geometry and gain of q paths.
 
     Attributes:
-        gain: lambda / (4 pi length) times interactions and antennas' fields (re, im), [q]; without the travelling
-            phase.
-        length_m: unfolded, [q].
-        departure: unit vector leaving the transmitter, in its own frame (turned by its heading), [q] each.
-        arrival: unit vector from the receiver to where the wave comes from, in the receiver's frame, [q] each.
+        gain: lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length).
+        length_m: unfolded length, metres.
+        departure: unit vectors leaving the transmitter, in its frame (rotated by its heading).
+        arrival: unit vectors from the receiver towards the incoming wave, in the receiver's frame.
     """
 
-    gain: Complex
-    length_m: Any
-    departure: Vector
-    arrival: Vector
+    gain: Complex  # two float arrays [q]
+    length_m: Any  # float [q]
+    departure: Vector  # three float arrays [q]
+    arrival: Vector  # three float arrays [q]
 
 
 def evaluate_paths(
@@ -109,20 +107,20 @@ def evaluate_paths(
     rx_antenna: Antenna = ANTENNA,
     tx_antenna: Antenna = ANTENNA,
 ) -> EvaluatedPaths:
-    """Follow chains to a receiver. Differentiable in pose, sources, planes and materials.
+    """Evaluate paths to a receiver. Differentiable in pose, sources, planes and materials.
 
     Args:
         chains: q paths.
-        pose: of the receiver.
-        tables: of the materials.
-        frequency_hz: of the carrier.
+        pose: pose of the receiver, numbers or arrays [q].
+        tables: tables of the n materials.
+        frequency_hz: carrier frequency.
         rx_antenna: antenna of the receiver.
         tx_antenna: antenna of the transmitters.
 
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
     and 5.3; slabs as `wrf_mi.tracing.slab`.
     """
-    image = list(chains.source_m)
+    image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
         height = dr.select(level.reflects, _dot(image, level.normal) - level.offset_m, 0)
         image = [x - 2 * height * n for x, n in zip(image, level.normal, strict=True)]
@@ -130,7 +128,7 @@ def evaluate_paths(
     length = dr.sqrt(_dot(towards, towards))
     arrival = [x / length for x in towards]
 
-    directions = [[-x for x in arrival]]
+    directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
         back = dr.select(level.reflects, _dot(directions[0], level.normal), 0)
         directions.insert(0, [k - 2 * back * n for k, n in zip(directions[0], level.normal, strict=True)])
@@ -159,13 +157,13 @@ def evaluate_paths(
 def _interact(
     level: Level, before: Vector, after: Vector, field: tuple[Vector, Vector], tables: Tables, frequency_hz: float
 ) -> tuple[Vector, Vector]:
-    """The field (re, im) after a reflection, a transmission, or nothing."""
+    """Field (re, im), three arrays [q] each, after a reflection, a transmission, or a place holder."""
     met = level.reflects | level.transmits
 
     def of(table: Any) -> Any:
         return dr.gather(type(table), table, level.material)
 
-    # At a place holder the wave comes straight: no denominator vanishes in what is not used.
+    # At place holders the wave comes straight, so that no unused denominator vanishes.
     cosine = dr.select(met, dr.abs(_dot(before, level.normal)), 1)
     c = slab(cosine, of(tables.permittivity), of(tables.conductivity), of(tables.thickness_m), frequency_hz)
     share = of(tables.reflected)
@@ -173,10 +171,7 @@ def _interact(
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
     across = _unit_or(_cross(before, level.normal), _any_across(before))
     along_before, along_after = _cross(across, before), _cross(across, after)
-    parts = []
-    for part in field:
-        parts.append((_dot(part, across), _dot(part, along_before)))
-    (s_re, p_re), (s_im, p_im) = parts
+    (s_re, p_re), (s_im, p_im) = ((_dot(part, across), _dot(part, along_before)) for part in field)
     s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
     p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
     out = []
@@ -187,7 +182,7 @@ def _interact(
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
-    """Real field vectors of an antenna in some directions, with derivatives: `wrf_mi.core.Antenna.field`.
+    """Real field vectors of an antenna with derivatives, see `wrf_mi.core.Antenna.field`.
 
     Args:
         antenna: pattern and polarisation.
@@ -204,15 +199,15 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     cosine, sine = dr.select(pole, 1, x * inverse), dr.select(pole, 0, y * inverse)
     level = square * inverse
     if antenna.polarization == "V":
-        own = [z * cosine, z * sine, -level]
+        local = [z * cosine, z * sine, -level]
     else:
-        own = [-sine, cosine, dr.zeros(type(z), dr.width(z))]
-    own = [_amplitude(antenna.pattern, level, z, (cosine, sine), pole, inverse) * component for component in own]
-    return [sum(component * axis[k] for component, axis in zip(own, axes, strict=True)) for k in range(3)]
+        local = [-sine, cosine, dr.zeros(type(z), dr.width(z))]
+    amplitude = _amplitude(antenna.pattern, level, z, (cosine, sine), pole, inverse)
+    return [sum(amplitude * c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
 
 
 def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, inverse: Any) -> Any:
-    """Amplitude of a pattern; ``level`` and ``z``: sine and cosine of the zenith angle, ``inverse``: 1 / level."""
+    """Amplitude [q] of a pattern; ``level`` and ``z``: sine and cosine of the zenith angle, ``inverse``: 1 / level."""
     if pattern == "iso":
         return type(z)(1)
     if pattern == "dipole":
@@ -226,18 +221,18 @@ def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, in
 
 
 def _any_across(direction: Vector) -> Vector:
-    """A vector across a direction: x, or y where the direction is near x, less what lies along it (as Sionna RT)."""
-    one: Any = type(direction[0])(1)
+    """Unit vector across a direction: the part across it of x, or of y near x (as Sionna RT)."""
+    zero, one = (type(direction[0])(value) for value in (0, 1))
     steep = dr.abs(direction[0]) >= 0.9 * one
-    reference = [dr.select(steep, 0, one), dr.select(steep, one, 0), 0]
+    reference = [dr.select(steep, zero, one), dr.select(steep, one, zero), 0]
     along = _dot(direction, reference)
-    rest = [r - along * k for r, k in zip(reference, direction, strict=True)]
-    scale = dr.rsqrt(_dot(rest, rest))
-    return [scale * r for r in rest]
+    across = [r - along * k for r, k in zip(reference, direction, strict=True)]
+    scale = dr.rsqrt(_dot(across, across))
+    return [scale * r for r in across]
 
 
 def _unit_or(vector: Vector, other: Vector) -> Vector:
-    """The vector normalised, or another one where it vanishes."""
+    """Normalised vector, or ``other`` where it vanishes."""
     square = _dot(vector, vector)
     usable: Any = square > ALONG
     scale = dr.rsqrt(dr.select(usable, square, 1))

@@ -1,4 +1,4 @@
-"""Gains of known paths by Sionna RT's field calculator, with the materials that the scene has at this moment."""
+"""Gains of known paths by Sionna RT's field calculator, with the present materials of the scene."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from .options import TraceOptions
 from .surfaces import Surfaces
 
 PATHS_PER_CHUNK = 1 << 19
-"""Paths of one call of the field calculator, which takes some 300 bytes per path and interaction."""
+"""Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
 
 
 @dataclass(frozen=True)
 class Devices:
-    """Devices of one side of a trace, as Sionna RT's field calculator takes them.
+    """Sources or targets of a trace, for Sionna RT's field calculator.
 
     Attributes:
-        position_m: shape [n, 3], metres.
-        antennas: one for each, or one for all.
+        position_m: positions [n, 3], metres.
+        antennas: an antenna for each, or a common one.
     """
 
     position_m: FloatArray
@@ -38,7 +38,7 @@ class Devices:
     @property
     def angles(self) -> FloatArray:
         """Sionna RT's orientation of each device [n, 3] (alpha, beta, gamma; rad)."""
-        angles = np.array([sionna_orientation(one.to_world) for one in self.antennas])
+        angles = np.array([sionna_orientation(antenna.to_world) for antenna in self.antennas])
         return np.broadcast_to(angles, (len(self.position_m), 3))
 
 
@@ -54,14 +54,14 @@ def sionna_orientation(to_world: ArrayLike) -> tuple[float, float, float]:
             `wrf_mi.core.Antenna.to_world`.
     """
     with warnings.catch_warnings():
-        # Of a device that looks straight up or down many angles are right, and any of them will do.
+        # A device that looks straight up or down has many equivalent angles.
         warnings.filterwarnings("ignore", "Gimbal lock")
         alpha, beta, gamma = Rotation.from_matrix(to_world).as_euler("ZYX")
     return float(alpha), float(beta), float(gamma)
 
 
 def point_array(points: FloatArray) -> Any:
-    """Mitsuba's points of rows [n, 3]."""
+    """Points [n, 3] as Mitsuba's ``Point3f``."""
     import mitsuba as mi
 
     from ..backend.device import to_vectors
@@ -80,13 +80,13 @@ def field_of(
 
     Args:
         scene: ``sionna.rt.Scene``.
-        buffer: p paths from source to target, as `wrf_mi.tracing.buffer.to_buffer` makes it; may be used again.
+        buffer: p paths from source to target, from `wrf_mi.tracing.buffer.to_buffer`; may be used again.
         ends: sources and targets.
-        rays: that were shot per source, for diffuse reflections.
-        loop_mode: Dr.Jit's; the symbolic one is faster and has no derivatives.
+        rays: number of rays shot per source, for diffuse reflections.
+        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster and has no derivatives.
 
     Returns:
-        Real and imaginary part, ``mi.Float`` of p each, without the phase of travelling.
+        Real and imaginary part, ``mi.Float`` [p], without the phase exp(-j k length).
     """
     import drjit as dr
     import mitsuba as mi
@@ -121,12 +121,12 @@ def _pattern(devices: Devices, index: Any) -> Any:
 
     from ..backend.device import to_uint
 
-    own = [one.antenna for one in devices.antennas]
-    distinct = list(dict.fromkeys(own))
+    antennas = [mounted.antenna for mounted in devices.antennas]
+    distinct = list(dict.fromkeys(antennas))
     functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
     if len(distinct) == 1:
         return functions[0]
-    kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in own])), index)
+    kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in antennas])), index)
 
     def mixed(theta: Any, phi: Any) -> tuple[Any, Any]:
         first, second = functions[0](theta, phi)
@@ -139,7 +139,7 @@ def _pattern(devices: Devices, index: Any) -> Any:
 
 
 def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
-    """Complex gains [p] of paths, without the phase of travelling, in parts of bounded memory.
+    """Complex gains [p] of paths, without the phase exp(-j k length), in chunks.
 
     Raises:
         InputError: a gain that is not a number.
@@ -157,7 +157,7 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
 
 @contextmanager
 def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
-    """Let every material scatter as asked for while the block lasts."""
+    """Set the scattering coefficient of all materials while the block lasts, if scattering is on."""
     able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
     before = [material.scattering_coefficient for material in able]
     for material in able:

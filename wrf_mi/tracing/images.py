@@ -1,8 +1,9 @@
-"""Specular paths from one source to many targets: possible chains, tested by Sionna RT, made exact in float64."""
+"""Specular paths from a source to many targets: possible chains, tested by Sionna RT, made exact in float64."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,26 +14,31 @@ from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, join, specular_le
 from .fields import point_array
 from .image_method import meeting_point
 from .options import TraceOptions
-from .search import Chains, count_crossings, possible
+from .search import ReflectionChains, count_crossings, possible
 from .surfaces import Surfaces
 
 CANDIDATES_PER_CHUNK = 1 << 20
-"""Candidates in one call of Sionna RT's image method, which takes some 100 bytes per candidate and interaction."""
+"""Candidates in a chunk; Sionna RT's image method takes some 100 bytes per candidate and interaction."""
 PARALLEL = 1e-9
-"""A ray that runs along a plane keeps the point where Sionna RT saw it cross."""
+"""Difference of heights in metres below which a ray runs along a plane and keeps Sionna RT's point of crossing."""
 
 
 def specular_paths(
-    scene: Any, surfaces: Surfaces, chains: Chains, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions
+    scene: Any,
+    surfaces: Surfaces,
+    chains: ReflectionChains,
+    source_m: FloatArray,
+    targets_m: FloatArray,
+    options: TraceOptions,
 ) -> Legs:
     """Every unobstructed path from a source to each target by the reflections of ``chains``.
 
     Args:
         scene: ``sionna.rt.Scene``.
-        surfaces: of that scene.
-        chains: from this source, see `wrf_mi.tracing.search.shoot`.
-        source_m: shape [3].
-        targets_m: shape [n, 3].
+        surfaces: surfaces of the scene.
+        chains: chains from this source, see `wrf_mi.tracing.search.shoot`.
+        source_m: position [3], metres.
+        targets_m: positions [n, 3], metres.
         options: kinds of interaction and depth.
 
     Returns:
@@ -49,20 +55,19 @@ def specular_paths(
             chain, target, through = chain[short], target[short], through[short]
         legs, plane = _candidates(surfaces, chains, chain, target, through, depth)
         kept, found = exact_paths(scene, surfaces, to_buffer(legs, surfaces, valid=False), *ends)
-        # Sionna RT takes a face for the expected one if it mirrors the source within 1 cm: then its own chain has it.
-        own = np.ones(len(kept), bool)
-        row, level = np.nonzero(plane[kept] >= 0)
-        own[row[surfaces.plane[found.face[row, level]] != plane[kept][row, level]]] = False
-        parts.append(_exact(surfaces, chains, chain[kept[own]], found.select(own), source_m, targets_m))
+        # Sionna RT accepts a face that mirrors the source within 1 cm of the expected one; another chain has that path.
+        expected = plane[kept]
+        same = ((expected < 0) | (np.append(surfaces.plane, -1)[found.face] == expected)).all(axis=1)
+        parts.append(_exact(surfaces, chains, chain[kept[same]], found.select(same), source_m, targets_m))
     return join(parts, depth)
 
 
 def _in_parts(
-    surfaces: Surfaces, chains: Chains, targets_m: FloatArray, options: TraceOptions
+    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray, options: TraceOptions
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Chains (-1: none) and targets to be tested, in parts of bounded size."""
-    everyone = np.arange(len(targets_m)) if options.line_of_sight else np.zeros(0, np.int64)
-    waiting = [(np.full(len(everyone), -1), everyone)]
+    """Chains (-1: none) and targets to test, in chunks."""
+    direct = np.arange(len(targets_m) if options.line_of_sight else 0)
+    waiting = [(np.full(len(direct), -1), direct)]
     for pairs in possible(surfaces, chains, targets_m):
         waiting.append(pairs)
         if sum(len(chain) for chain, _ in waiting) >= CANDIDATES_PER_CHUNK:
@@ -79,7 +84,7 @@ def _split(pairs: list[tuple[IntArray, IntArray]]) -> Iterator[tuple[IntArray, I
         yield chain[start : start + CANDIDATES_PER_CHUNK], target[start : start + CANDIDATES_PER_CHUNK]
 
 
-def _lengths(chains: Chains, chain: IntArray) -> IntArray:
+def _lengths(chains: ReflectionChains, chain: IntArray) -> IntArray:
     """Reflections of each chain, 0 for none."""
     return np.append(chains.length, 0)[chain]
 
@@ -87,14 +92,14 @@ def _lengths(chains: Chains, chain: IntArray) -> IntArray:
 def _transmissions(
     scene: Any,
     surfaces: Surfaces,
-    chains: Chains,
+    chains: ReflectionChains,
     chain: IntArray,
     target: IntArray,
     source_m: FloatArray,
     targets_m: FloatArray,
     depth: int,
 ) -> IntArray:
-    """Surfaces that a path goes through before its first reflection, after it, and so on: [n, reflections + 1]."""
+    """Number of surfaces that a path passes before its first reflection, after it, and so on: [n, reflections + 1]."""
     length = _lengths(chains, chain)
     through = np.zeros((len(chain), chains.plane.shape[1] + 1), np.int64)
     there = targets_m[target].copy()
@@ -109,7 +114,7 @@ def _transmissions(
 
 
 def _candidates(
-    surfaces: Surfaces, chains: Chains, chain: IntArray, target: IntArray, through: IntArray, depth: int
+    surfaces: Surfaces, chains: ReflectionChains, chain: IntArray, target: IntArray, through: IntArray, depth: int
 ) -> tuple[Legs, IntArray]:
     """Candidates for the image method, and the plane of each reflection [n, depth], -1 elsewhere."""
     length = _lengths(chains, chain)
@@ -119,16 +124,21 @@ def _candidates(
     corner = np.full((len(chain), depth, 3), np.nan)
     for level in range(chains.plane.shape[1]):
         row = np.flatnonzero(length > level)
-        place = level + through[row, : level + 1].sum(axis=1)
-        types[row, place] = SPECULAR
-        plane[row, place] = chains.plane[chain[row], level]
-        face[row, place] = surfaces.face[plane[row, place]]
-        corner[row, place] = surfaces.triangles[face[row, place], 0]
+        at = row, level + through[row, : level + 1].sum(axis=1)
+        types[at] = SPECULAR
+        plane[at] = chains.plane[chain[row], level]
+        face[at] = surfaces.face[plane[at]]
+        corner[at] = surfaces.triangles[face[at], 0]
     return specular_legs(np.zeros_like(target), target, types, face, corner), plane
 
 
 def _exact(
-    surfaces: Surfaces, chains: Chains, chain: IntArray, found: Legs, source_m: FloatArray, targets_m: FloatArray
+    surfaces: Surfaces,
+    chains: ReflectionChains,
+    chain: IntArray,
+    found: Legs,
+    source_m: FloatArray,
+    targets_m: FloatArray,
 ) -> Legs:
     """Vertices in float64, from the target back to the images of the source: single precision loses the phase."""
     here, vertices = targets_m[found.target], found.vertices_m.copy()
@@ -142,4 +152,4 @@ def _exact(
         met, near, far = meeting_point(here[row], image, surfaces.normal[plane], surfaces.offset[plane])
         crosses = np.abs(near - far) > PARALLEL
         here[row] = vertices[row, level] = np.where(crosses[:, None], met, vertices[row, level])
-    return Legs(found.source, found.target, found.interactions, found.face, vertices, found.probability, found.wedge)
+    return replace(found, vertices_m=vertices)

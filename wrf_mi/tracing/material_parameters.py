@@ -1,10 +1,10 @@
 """Radio materials as parameters without bounds.
 
-Relative permittivity 1 + exp(x) and conductivity exp(y) in S/m: an optimiser may move x and y freely, a step changes
-both by a factor, and the bounds (permittivity > 1, conductivity > 0) hold by construction.
+Relative permittivity 1 + exp(x) and conductivity exp(y) in S/m: a step of an optimiser in x or y changes both by a
+factor, and permittivity > 1, conductivity > 0 hold by construction.
 
-A scene has these two for each of its named materials or, started from those, for each of its surfaces: the faces of one
-object in one plane.
+A scene has both for each of its named materials or, started from those, for each of its surfaces, the faces of an
+object in a plane.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from ..core.types import IntArray
 from .surfaces import Surfaces
 
 LEAST_SUSCEPTIBILITY = 1e-3
-"""A material of permittivity 1 (a metal, air) starts this much above it: the logarithm of 0 has no slope."""
+"""Start of permittivity - 1 for materials of permittivity 1 (metal, air), whose logarithm has no derivative."""
 LEAST_CONDUCTIVITY = 1e-6
-"""S/m; the same for a lossless material."""
+"""Start of the conductivity of lossless materials, S/m."""
 
 PREFIX = "material."
 SURFACE = "surface"
 """In place of a material's name: parameters [n] of all surfaces."""
-Materials = Literal["named", "surface"]
-"""What has a permittivity and a conductivity of its own: each named material, or each surface."""
+MaterialGrouping = Literal["named", "surface"]
+"""Whether each named material, or each surface, has a permittivity and a conductivity."""
 
 
 def name_of(material: str, quantity: str) -> str:
-    """A material's parameter: ``material.<name>.permittivity`` or ``.conductivity``; `SURFACE` for all surfaces'."""
+    """A material's parameter: ``material.<name>.permittivity`` or ``.conductivity``; `SURFACE` for all surfaces."""
     return f"{PREFIX}{material}.{quantity}"
 
 
 @dataclass(frozen=True)
 class SlabMaterials:
-    """The materials of a scene when it was read, and what of them is not a parameter; n in all.
+    """The n stated materials of a scene, with the constants that are not parameters.
 
     Attributes:
-        names: in the scene; of surfaces ``<object>/<plane>``, the plane's number in `Surfaces`.
+        names: names in the scene; of surfaces ``<object>/<plane>``, the plane's number in `Surfaces`.
         permittivity: relative, shape [n].
         conductivity: S/m, shape [n].
-        thickness_m: of the slab that each surface stands for, shape [n].
+        thickness_m: thickness of the slab that stands for a surface, shape [n].
         reflected: share of the reflected amplitude that is not scattered, shape [n].
-        of: what these are: parameters are [1] for each named material, or [n] for all surfaces.
+        grouping: parameters are [1] for each named material, or [n] for all surfaces.
     """
 
     names: tuple[str, ...]
@@ -57,13 +57,13 @@ class SlabMaterials:
     conductivity: FloatArray
     thickness_m: FloatArray
     reflected: FloatArray
-    of: Materials = "named"
+    grouping: MaterialGrouping = "named"
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Parameters x and y: of each material [1], or of all surfaces [n]."""
+        """Parameters x and y of each material [1], or of all surfaces [n]."""
         x = np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)).astype(np.float32)
         y = np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)).astype(np.float32)
-        if self.of == "surface":
+        if self.grouping == "surface":
             names = name_of(SURFACE, "permittivity"), name_of(SURFACE, "conductivity")
             return dict(zip(names, (x, y), strict=True)) if len(x) else {}
         values = {}
@@ -73,12 +73,13 @@ class SlabMaterials:
         return values
 
     def constants(self, float_type: Any) -> list[Any]:
-        """Permittivity, conductivity, thickness and reflected share as they were read, [n] each, on the device."""
-        read = self.permittivity, self.conductivity, self.thickness_m, self.reflected
-        return [on_device(c, float_type) for c in read]
+        """Stated permittivity, conductivity, thickness and reflected share, [n] each, on the device."""
+        return [
+            on_device(c, float_type) for c in (self.permittivity, self.conductivity, self.thickness_m, self.reflected)
+        ]
 
     def tables(self, parameters: Mapping[str, Any], stated: Sequence[Any]) -> tuple[Any, Any]:
-        """Relative permittivity and conductivity [n], each from its parameter where there is one. Differentiable.
+        """Relative permittivity and conductivity [n], from parameters where there are any. Differentiable.
 
         Args:
             parameters: Dr.Jit tensors by the names of `parameters`.
@@ -87,7 +88,7 @@ class SlabMaterials:
 
         def table(quantity: str, constant: FloatArray, given: Any, least: float) -> Any:
             float_type: Any = type(given)
-            if self.of == "surface":
+            if self.grouping == "surface":
                 whole = parameters.get(name_of(SURFACE, quantity))
                 return given if whole is None else least + dr.exp(float_type(whole.array))
             entries = []
@@ -111,54 +112,43 @@ def read_materials(scene: Any) -> SlabMaterials:
     def column(quantity: str) -> FloatArray:
         return np.array([float(np.ravel(getattr(m, quantity))[0]) for m in known.values()])
 
-    return SlabMaterials(
-        tuple(known),
-        column("relative_permittivity"),
-        column("conductivity"),
-        column("thickness"),
-        np.sqrt(1 - column("scattering_coefficient") ** 2),
-    )
+    reflected = np.sqrt(1 - column("scattering_coefficient") ** 2)
+    constants = column("relative_permittivity"), column("conductivity"), column("thickness")
+    return SlabMaterials(tuple(known), *constants, reflected)
 
 
-def slabs_of_faces(scene: Any, surfaces: Surfaces, of: Materials) -> tuple[SlabMaterials, IntArray]:
-    """The slabs of a scene, and which of them each face is made of.
+def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
+    """The slabs of a scene, and the slab of each face.
 
     Args:
         scene: a ``sionna.rt.Scene``.
         surfaces: its faces [f].
-        of: `Materials`.
+        grouping: slabs of named materials or of surfaces.
 
     Returns:
-        The slabs, and for each face [f] a number among them; -1 where its material is no slab.
+        The slabs, and the index of each face's slab [f]; -1 where its material is not a slab.
     """
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]
     number = np.array([named.names.index(kind) if kind in named.names else -1 for kind in kinds], np.int64)
     thing = surfaces.object_of(np.arange(len(surfaces.plane)))
-    own = number[thing] if len(thing) else np.zeros(0, np.int64)
-    if of == "named":
-        return named, own
-    met = own >= 0
-    pairs, inverse = np.unique(np.stack([thing[met], surfaces.plane[met]], axis=1), axis=0, return_inverse=True)
-    which = number[pairs[:, 0]]
+    slab_of_face = number[thing] if len(thing) else np.zeros(0, np.int64)
+    if grouping == "named":
+        return named, slab_of_face
+    is_slab = slab_of_face >= 0
+    pairs, surface = np.unique(np.stack([thing, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
+    slab_of_face[is_slab] = surface.reshape(-1)
     names = tuple(f"{surfaces.names[index]}/{plane}" for index, plane in pairs)
-    face = np.full(len(own), -1, np.int64)
-    face[met] = inverse.reshape(-1)
-    slabs = SlabMaterials(
-        names,
-        named.permittivity[which],
-        named.conductivity[which],
-        named.thickness_m[which],
-        named.reflected[which],
-        of="surface",
-    )
-    return slabs, face
+    which = number[pairs[:, 0]]
+    permittivity, conductivity = named.permittivity[which], named.conductivity[which]
+    constants = permittivity, conductivity, named.thickness_m[which], named.reflected[which]
+    return SlabMaterials(names, *constants, grouping), slab_of_face
 
 
 def physical(parameters: Mapping[str, NDArray[Any]]) -> dict[str, float]:
     """Relative permittivities and conductivities (S/m) of ``material.*`` parameters, by the same names.
 
-    Those of surfaces by name and number: ``material.surface.permittivity[3]``.
+    Names of surfaces end with their number: ``material.surface.permittivity[3]``.
     """
     values = {}
     for name, value in parameters.items():

@@ -1,8 +1,8 @@
-"""Radio materials at a frequency, where Sionna RT's own table ends too.
+"""Radio materials at a frequency, also below the range of Sionna RT's table.
 
 ITU-R P.2040 gives relative permittivity a f^b and conductivity c f^d (f in GHz) within a frequency range per
-material, and Sionna RT raises an error outside it. Most building materials begin at 1 GHz, just above the
-868 and 915 MHz bands of RFID and IoT.
+material, outside of which Sionna RT raises an error. Most building materials begin at 1 GHz, just above the 868 and
+915 MHz bands of RFID and IoT.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ CONSTANTS_XML = (
 """A material of Sionna RT with constants; its name must not begin with itu."""
 
 CONSTANTS_FROM_HZ = 0.3e9
-"""Where the constants end: below, the conductivity would be off by more than a factor of three."""
+"""Lower end of the constants: below, the conductivity would be off by more than a factor of three."""
 
 
 def perfect_reflector() -> Any:
-    """A radio material of so high a conductivity that its reflection coefficients are -1 and +1 to single precision."""
+    """Radio material with reflection coefficients of -1 and +1 to single precision, by a high conductivity."""
     from sionna import rt
 
     return rt.RadioMaterial(
@@ -57,12 +57,13 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
 
     Args:
         scene: a ``sionna.rt.Scene``.
-        frequency_hz: of the carrier.
-        thickness_m: slab thickness in metres of materials by their name in the scene (``itu_*``); others keep theirs.
+        frequency_hz: carrier frequency.
+        thickness_m: new slab thickness of materials by name in the scene (``itu_*``), metres.
 
     Raises:
         InputError: a material has neither a range of ITU-R P.2040 nor a constant at this frequency.
     """
+    import mitsuba as mi
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
     constant = []
@@ -78,10 +79,10 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
         if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
             where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in sorted(ranges_ghz))
             text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
-            own = f"mat-my_{itu_type}"
-            way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {CONSTANTS_XML.format(own)}"
+            bsdf = CONSTANTS_XML.format(f"mat-my_{itu_type}")
+            way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {bsdf}"
             raise InputError(f"{text}; choose another material, or {way}")
-        material.frequency_update_callback = _constants(*BELOW_1_GHZ[itu_type])
+        material.frequency_update_callback = lambda _, values=BELOW_1_GHZ[itu_type]: tuple(map(mi.Float, values))
         constant.append(itu_type)
     if constant:
         logger.info(
@@ -92,18 +93,9 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
     scene.frequency = frequency_hz
 
 
-def _constants(permittivity: float, conductivity: float) -> Any:
-    import mitsuba as mi
-
-    def constants(_: Any) -> tuple[Any, Any]:
-        return mi.Float(permittivity), mi.Float(conductivity)
-
-    return constants
-
-
 @contextmanager
 def with_materials(scene: Any, materials: Mapping[str, tuple[Any, Any]]) -> Iterator[None]:
-    """Give materials of a ``sionna.rt.Scene`` other constants while the block lasts.
+    """Set other constants of materials of a ``sionna.rt.Scene`` while the block lasts.
 
     Args:
         scene: ``sionna.rt.Scene``.

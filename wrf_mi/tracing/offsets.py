@@ -1,4 +1,4 @@
-"""The one thing that ray tracing cannot know of an uncalibrated receiver: what its decibels count from."""
+"""Offsets of uncalibrated receivers: traced signal strengths on the scales of the receivers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from ..core.angles import FloatArray
 
 @dataclass(frozen=True)
 class Offsets:
-    """What is added to traced signal strengths.
+    """Offsets of traced signal strengths.
 
     Attributes:
-        offset_db: of each receiver, shape [n_rx].
-        floor_dbm: weakest signal that each receiver is known to report, shape [n_rx]; it stands in for positions
-            where no path arrives.
+        offset_db: offset of each receiver, shape [n_rx].
+        floor_dbm: weakest measured signal of each receiver, shape [n_rx], the report where no path arrives.
     """
 
     offset_db: FloatArray
@@ -31,11 +30,11 @@ class Offsets:
 
 
 def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
-    """One offset per receiver, the median of measured minus traced, which makes the absolute error least.
+    """Fit an offset to each receiver: the median of measured minus traced, which minimises the absolute error.
 
     Args:
         traced_dbm: shape [n_rx, n], NaN where no path arrives.
-        measured_dbm: training rows of the same shape, NaN where nothing was received.
+        measured_dbm: measured training rows [n_rx, n], NaN where nothing was received.
 
     Raises:
         InputError: a receiver without any row that was both traced and received.

@@ -1,4 +1,4 @@
-"""What is traced: kinds of interaction, depth, rays."""
+"""Options of a trace: kinds of path, depth, rays."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from ..core import InputError
 MAX_DEPTH = 12
 MAX_RAYS = 1 << 24
 MAX_DEGREE = 8
-"""Of trainable antenna patterns: a single antenna's asks for no more, and Dr.Jit's `sh_eval` has few more."""
+"""Largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`."""
 
 
 @dataclass(frozen=True)
 class TraceOptions:
-    """Settings of `wrf_mi.tracing.trace_paths`; nothing that is off costs time.
+    """Settings of `wrf_mi.tracing.trace_paths`; kinds of path that are off cost no time.
 
     Attributes:
         line_of_sight: the direct path.
         reflection: specular reflections.
-        transmission: straight through surfaces (slabs of the material's thickness).
+        transmission: transmissions straight through surfaces (slabs of the material's thickness).
         diffraction: one diffraction at an edge.
         scattering: diffuse reflection with ``scattering_coefficient`` at every surface.
-        max_depth: interactions per path at most, transmissions included.
-        max_reflections: of these, at most so many reflections; None: all may be. Does not bind paths with scattering or
-            diffraction.
-        rays: that search from each source (a power of two is best), or ``"auto"``: doubled until the paths of a sample
-            of positions grow no more, see `wrf_mi.tracing.solve.converged_rays`.
-        seed: of the directions of the rays.
-        scattering_coefficient: share of the reflected amplitude that is scattered, 0..1; for ``scattering`` alone.
+        max_depth: largest number of interactions per path, transmissions included.
+        max_reflections: largest number of reflections among them, except in paths with scattering or diffraction;
+            None: ``max_depth``.
+        rays: number of rays from each source (best a power of two), or ``"auto"``: doubled until the paths of a sample
+            of positions converge, see `wrf_mi.tracing.solve.converged_rays`.
+        seed: seed of the rays' directions.
+        scattering_coefficient: share of the reflected amplitude that is scattered, 0..1, if ``scattering`` is on.
     """
 
     line_of_sight: bool = True
@@ -44,10 +44,10 @@ class TraceOptions:
     scattering_coefficient: float = 0.3
 
     def __post_init__(self) -> None:
-        """Reject what cannot be traced.
+        """Check the settings.
 
         Raises:
-            InputError: naming the setting.
+            InputError: a setting that is out of range.
         """
         if not 0 <= self.max_depth <= MAX_DEPTH:
             raise InputError(f"max_depth {self.max_depth}: give 0 to {MAX_DEPTH}")
@@ -62,20 +62,20 @@ class TraceOptions:
 
     @property
     def reflections(self) -> int:
-        """Reflections of a specular path at most."""
+        """Largest number of reflections of a specular path."""
         most = self.max_depth if self.max_reflections is None else min(self.max_reflections, self.max_depth)
         return most if self.reflection else 0
 
     @property
     def sampled(self) -> bool:
-        """Whether paths are drawn at random (scattering) or along edges, so that Sionna RT's own search finds them."""
+        """Whether paths are drawn at random (scattering) or along edges, by Sionna RT's search."""
         return (self.diffraction or self.scattering) and self.max_depth > 0
 
 
 DEFAULTS = TraceOptions()
 
 KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
-"""Kinds of path by the names that the command takes."""
+"""Kinds of path in the command's terms."""
 
 
 def with_kinds(
@@ -87,15 +87,15 @@ def with_kinds(
     rays: int | str | None = None,
     seed: int | None = None,
 ) -> TraceOptions:
-    """Options as the command states them; None keeps what ``options`` has.
+    """Options with the command's changes; None keeps the value of ``options``.
 
     Args:
-        options: to begin with.
-        kinds: the kinds of path to trace, separated by commas, from `KINDS`; all others are off.
-        max_depth: interactions per path at most.
-        max_reflections: of these at most.
+        options: options to change.
+        kinds: kinds of path to trace, of `KINDS`, separated by commas; all others are off.
+        max_depth: largest number of interactions per path.
+        max_reflections: largest number of reflections per path.
         rays: a number, as text or not, or ``"auto"``.
-        seed: of the rays.
+        seed: seed of the rays.
 
     Raises:
         InputError: an unknown kind, or a number out of range.

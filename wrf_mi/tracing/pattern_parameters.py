@@ -1,10 +1,9 @@
-"""A trainable antenna pattern: a smooth complex factor of direction.
+"""Trainable antenna pattern: a smooth complex factor of direction.
 
     F(u) = exp(sum_{l=1..L} sum_m (a_lm + j b_lm) Y_lm(u))
 
-with real spherical harmonics Y_lm of degree 1 and up. It multiplies one of Sionna RT's patterns (isotropic by default)
-in both polarisations; degree 0, which has no shape, is the instrument's gain. All coefficients zero is F = 1; the
-amplitude is positive by construction.
+with real spherical harmonics Y_lm of degree 1 and up. It multiplies a pattern of Sionna RT (isotropic by default) in
+both polarisations; degree 0, a constant, is the instrument's gain. Zero coefficients give F = 1.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +19,7 @@ from .options import MAX_DEGREE
 
 
 def pattern_coefficients(degree: int) -> NDArray[np.float32]:
-    """Coefficients of F = 1: zeros [2, (degree + 1)^2 - 1], real parts, then imaginary ones, by degree and order.
+    """Coefficients of F = 1: zeros [2, (degree + 1)^2 - 1], real and imaginary parts, by degree and order.
 
     Raises:
         ValueError: a degree outside 1..8.
@@ -30,11 +30,11 @@ def pattern_coefficients(degree: int) -> NDArray[np.float32]:
 
 
 def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
-    """The complex factor F(u) for directions in the antenna's own frame. Differentiable in both arguments.
+    """Complex factor F(u) of directions in the antenna's frame. Differentiable in both arguments.
 
     Args:
         coefficients: tensor [2, (L + 1)^2 - 1] from `pattern_coefficients`.
-        direction: unit vectors, three arrays [p] of any float type, which is that of the result.
+        direction: unit vectors u, three arrays [p] of any float type, which is that of the result.
 
     Returns:
         Real and imaginary part, arrays [p].
@@ -43,9 +43,10 @@ def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
     """
     float_type = type(direction[0])
     count, paths = coefficients.shape[1], dr.width(direction[0])
-    harmonics = dr.sh_eval(_vector_type(float_type)(*direction), int(np.sqrt(count + 1)) - 1)[1:]
+    vector_type: Any = dr.float64_array_t(mi.Vector3f) if float_type == dr.float64_array_t(mi.Float) else mi.Vector3f
+    harmonics = dr.sh_eval(vector_type(*direction), int(np.sqrt(count + 1)) - 1)[1:]
     tensor_type: Any = dr.tensor_t(float_type)
-    # One matrix product: a sum over paths for each coefficient would be a kernel each in the reverse pass.
+    # A matrix product: the reverse pass of a sum would have a kernel for each coefficient.
     table = tensor_type(dr.concat(harmonics), (count, paths))
     series = (tensor_type(coefficients) @ table).array
     index = dr.arange(dr.uint32_array_t(float_type), paths)
@@ -53,9 +54,3 @@ def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
     sine, cosine = dr.sincos(phase)
     amplitude = dr.exp(amplitude)
     return amplitude * cosine, amplitude * sine
-
-
-def _vector_type(float_type: Any) -> Any:
-    import mitsuba as mi
-
-    return dr.float64_array_t(mi.Vector3f) if float_type == dr.float64_array_t(mi.Float) else mi.Vector3f

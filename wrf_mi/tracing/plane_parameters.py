@@ -1,17 +1,16 @@
-"""Planes of a scene as parameters: each may be shifted along its normal and tilted about its centre.
+"""Planes of a scene as parameters: shifts along their normals and tilts about their centres.
 
 A plane n . x = d with unit vectors a, b in it and the centroid c of its faces becomes
 
     n' = (n + t_a a + t_b b) / abs(n + t_a a + t_b b),   d' = n' . c + s
 
-with the shift s in metres and the tilts t_a, t_b in rad: of small tilts, turns about b and -a through c.
-`wrf_mi.tracing.walls.Walls.moved` is the same in NumPy.
+with the shift s in metres and the tilts t_a, t_b in rad: small tilts are rotations about b and -a through c.
+`wrf_mi.tracing.walls.Walls.moved` is the NumPy version.
 
-Which surfaces a path meets, and between which outlines, is searched for on the mesh as its files state it, and is kept
-when planes move: a moved mesh has gaps at its corners, through which rays leave. A path follows its planes
-continuously. What is missed are paths that meet a plane within about the shift from an edge of its outline and would
-appear or vanish, a share of shift / size of the plane: 1 % for 3 cm of a wall of 3 m. So, unlike a receiver's position,
-a shift calls for no new search at a quarter of a wavelength; that far all interference is followed exactly.
+The chains of surfaces are searched for on the mesh as stated and kept when planes move, as a moved mesh has gaps at its
+corners through which rays leave. Paths follow their planes continuously. Not modelled are paths that appear or vanish
+within about the shift from an edge of a plane's outline, a share of shift / size of the plane: 1 % for 3 cm of a wall
+of 3 m. So, unlike a receiver's position, a shift of a quarter of a wavelength needs no new search.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from .walls import plane_centres
 
 Float64: Any = dr.float64_array_t(mi.Float)
 SHIFT, TILT = "plane.shift", "plane.tilt"
-"""Parameters [q] in metres and [q, 2] in rad of the q planes of `Surfaces`; all receivers of a scene share them."""
+"""Names of the parameters [q] in metres and [q, 2] in rad of the q planes of `Surfaces`, shared by all receivers."""
 
 
 @dataclass
 class PlaneTables:
-    """The q planes of a scene as stated, float64 arrays [q] on the device.
+    """Stated planes of a scene, float64 arrays [q] on the device.
 
     Attributes:
-        normal: unit normal.
-        offset_m: n . x.
-        centre_m: point of the plane about which it tilts.
-        axes: two unit vectors in the plane.
+        normal: unit normals, three arrays [q].
+        offset_m: n . x, metres, [q].
+        centre_m: centres of the tilts, metres, three arrays [q].
+        axes: two unit vectors in each plane, three arrays [q] each.
     """
 
     normal: Vector
@@ -63,12 +62,12 @@ class PlaneTables:
         return cls(columns(surfaces.normal), offset, columns(plane_centres(surfaces)[0]), axes)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Planes as stated: zeros [q] and [q, 2]; nothing for a scene without planes."""
+        """Parameters of the stated planes: zeros [q] and [q, 2]; none for a scene without planes."""
         count = dr.width(self.offset_m)
         return {SHIFT: np.zeros(count, np.float32), TILT: np.zeros((count, 2), np.float32)} if count else {}
 
     def moved(self, parameters: Mapping[str, Any]) -> tuple[Vector, Any]:
-        """Normals and offsets with the shifts and tilts that ``parameters`` hold. Differentiable."""
+        """Normals (three arrays [q]) and offsets [q] with the shifts and tilts of ``parameters``. Differentiable."""
         normal, offset = self.normal, self.offset_m
         if TILT in parameters:
             flat = parameters[TILT].array
@@ -83,7 +82,7 @@ class PlaneTables:
         return normal, offset
 
     def move(self, levels: list[Level], parameters: Mapping[str, Any]) -> list[Level]:
-        """Interactions at the moved planes; where neither parameter is there, ``levels`` as they are."""
+        """Interactions at the moved planes; ``levels`` themselves without a parameter of planes."""
         if SHIFT not in parameters and TILT not in parameters:
             return levels
         normal, offset = self.moved(parameters)
@@ -94,6 +93,6 @@ class PlaneTables:
             def of(table: Any, level: Level = level, met: Any = met) -> Any:
                 return dr.gather(Float64, table, level.plane, met)
 
-            own = [of(c) for c in normal] if TILT in parameters else level.normal
-            result.append(replace(level, normal=own, offset_m=of(offset)))
+            tilted = [of(c) for c in normal] if TILT in parameters else level.normal
+            result.append(replace(level, normal=tilted, offset_m=of(offset)))
         return result

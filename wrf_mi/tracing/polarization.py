@@ -1,4 +1,4 @@
-"""Whether receive antennas are polarised as what arrives: cross-polarised links are rarely meant."""
+"""Detection of cross-polarised links, which are rarely meant."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import numpy as np
 
 from ..core import Antenna, Receiver
 from ..core.angles import FloatArray
+from ..receivers import received_power
 from .options import TraceOptions
 from .result import TraceResult, recompute
-from .solve import trace_paths
+from .solve import spread, trace_paths
 
 logger = logging.getLogger(__name__)
 
 GAIN_DB = 10.0
-"""So much more median power with the other polarisation is taken for a mistake. Reflections at walls turn the
-polarisation of some paths, but of a link that is polarised as meant most power keeps it."""
+"""Gain in median power by the other polarisation above which a link counts as cross-polarised. Reflections turn the
+polarisation of some paths, but a co-polarised link keeps most of its power."""
 SAMPLE = 256
-"""Transmitters on which it is judged."""
+"""Transmitters on which the gain is judged."""
 TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections=1, rays=1 << 12)
-"""Transmitters, and what is traced, where a model does not trace all of them at once."""
+"""Transmitters and options of the trace for models that do not trace all transmitters at once."""
 
 
 def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
@@ -30,21 +31,19 @@ def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
 
     Args:
         traced: paths; those of `SAMPLE` transmitters, evenly spaced, are evaluated.
-        scene: that they were traced in.
+        scene: the scene in which they were traced.
 
     Returns:
         The gain in dB by the receivers' names.
     """
-    count = len(traced.tx_pos_m)
-    chosen = np.unique(np.linspace(0, count - 1, min(SAMPLE, count)).round().astype(int))
-    sample = traced.select(np.isin(traced.paths.tx, chosen))
+    sample = traced.select(np.isin(traced.paths.tx, spread(len(traced.tx_pos_m), SAMPLE)))
     if sample.carriers_hz is not None:  # both at the scene's carrier
         sample = recompute(sample, scene)
     stated = _median_power(sample)
-    turned = _median_power(recompute(sample, scene, rx_antennas=[one.antenna.turned for one in traced.receivers]))
+    turned = _median_power(recompute(sample, scene, rx_antennas=[rx.antenna.turned for rx in traced.receivers]))
     tiny = np.finfo(np.float32).tiny
     gain_db = 10 * np.log10(np.maximum(turned, tiny) / np.maximum(stated, tiny))
-    return {one.name: float(g) for one, g in zip(traced.receivers, gain_db, strict=True) if g >= GAIN_DB}
+    return {rx.name: float(g) for rx, g in zip(traced.receivers, gain_db, strict=True) if g >= GAIN_DB}
 
 
 def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
@@ -53,7 +52,7 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
     if not found:
         return
     first, count = next(iter(found)), len(traced.receivers)
-    now = next(one.antenna for one in traced.receivers if one.name == first)
+    now = next(rx.antenna for rx in traced.receivers if rx.name == first)
     who = f"receiver {first}" if count == 1 else f"{len(found)} of {count} receivers (first: {first})"
     options = f"--rx-polarization {now.turned.polarization}" + (" or --rx-frame world" if now.frame == "array" else "")
     logger.warning(
@@ -68,23 +67,22 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
 
 
 def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
-    """Trace a few transmitters and warn of cross-polarised receivers, for models that trace by themselves.
+    """Trace a few transmitters and warn of cross-polarised receivers.
 
     Args:
         scene: ``sionna.rt.Scene``.
         tx_pos_m: transmitters [n, 3], metres.
-        receivers: with their antennas.
+        receivers: receivers with their antennas.
         tx_antenna: antenna of the transmitters.
     """
-    few = np.unique(np.linspace(0, len(tx_pos_m) - 1, min(TRACED, len(tx_pos_m))).round().astype(int))
-    traced = trace_paths(scene, tx_pos_m[few], receivers, ROUGH, tx_antenna=tx_antenna, check=False)
+    few = tx_pos_m[spread(len(tx_pos_m), TRACED)]
+    traced = trace_paths(scene, few, receivers, ROUGH, tx_antenna=tx_antenna, check=False)
     warn_of_cross_polarization(traced, scene)
 
 
 def _median_power(traced: TraceResult) -> FloatArray:
     """Median over the transmitters with a path of the power at each receiver [n_rx]; 0 without any path."""
-    paths, power = traced.paths, np.zeros((len(traced.receivers), len(traced.tx_pos_m)))
+    power = received_power(traced.paths)
     reached = np.zeros(power.shape, bool)
-    reached[paths.rx, paths.tx] = True
-    np.add.at(power, (paths.rx, paths.tx), np.abs(paths.gain) ** 2)
-    return np.array([np.median(own[there]) if there.any() else 0.0 for own, there in zip(power, reached, strict=True)])
+    reached[traced.paths.rx, traced.paths.tx] = True
+    return np.array([np.median(row[some]) if some.any() else 0.0 for row, some in zip(power, reached, strict=True)])

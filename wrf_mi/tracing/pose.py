@@ -1,7 +1,7 @@
-"""A receiver's pose as parameters of both sides: the traced one and the learned one see the same receiver.
+"""Receiver pose as parameters, for traced paths and Gaussians alike.
 
-Position and orientation are corrections to the stated pose, which stays in float64: the position p = p0 + t in the
-world's frame, the orientation R = R0 E(r) with a turn E about the receiver's own axes. E is the Cayley transform, the
+Parameters are corrections to the stated pose, which stays in float64: the position p = p0 + t in the world's frame,
+the orientation R = R0 E(r) with a rotation E about the receiver's axes. E is the Cayley transform, the
 unit quaternion in the direction of (r / 2, 1), a turn by 2 atan(abs(r) / 2): for small r the rotation vector, and
 smooth at zero. Source: Shuster, "A survey of attitude representations" (1993).
 """
@@ -21,27 +21,27 @@ from ..gaussians.footprint import Pose, own_axes
 
 
 def position_name(receiver: Receiver) -> str:
-    """Parameter [3] in metres."""
+    """Name of the position parameter [3], metres."""
     return f"receiver.{receiver.name}.position"
 
 
 def turn_name(receiver: Receiver) -> str:
-    """Parameter [3] in radians."""
+    """Name of the rotation parameter [3], rad."""
     return f"receiver.{receiver.name}.turn"
 
 
 def pose_parameters(receiver: Receiver) -> dict[str, NDArray[np.float32]]:
-    """No correction: zeros [3] for the position and the turn."""
+    """Parameters of the stated pose: zeros [3] for position and rotation."""
     return {name: np.zeros(3, np.float32) for name in (position_name(receiver), turn_name(receiver))}
 
 
 def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type: Any) -> Pose:
-    """The corrected pose. Differentiable in both parameters.
+    """Corrected pose of a receiver. Differentiable in both parameters.
 
     Args:
         receiver: stated pose.
-        parameters: may hold the receiver's position and turn, tensors [3].
-        float_type: of the result; the sum with the stated position is done in it.
+        parameters: the receiver's position and rotation, tensors [3]; missing ones are zero.
+        float_type: float type of the result and of the sum with the stated position.
     """
 
     def correction(name: str) -> list[Any]:
@@ -58,13 +58,13 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
 
 
 def moved_m(receiver: Receiver, parameters: Mapping[str, Any]) -> FloatArray:
-    """Where the receiver is now, [3], metres, on the host."""
+    """Corrected position of the receiver on the host, [3], metres."""
     name = position_name(receiver)
     shift = dr.detach(parameters[name]).numpy() if name in parameters else np.zeros(3)
     return receiver.position_m + np.asarray(shift, float).reshape(3)
 
 
 def component(tensor: Any, i: int) -> Any:
-    """One number of a tensor's values in a row, as an array of width 1. Differentiable."""
+    """Entry ``i`` of a flattened tensor as an array of width 1. Differentiable."""
     flat = tensor.array
     return dr.gather(type(flat), flat, dr.uint32_array_t(type(flat))(i))

@@ -1,9 +1,9 @@
-"""A trace: paths with all that gains for other materials or antennas need, and the file that keeps them."""
+"""A trace: paths with the data that gains for other materials or antennas need, and its file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +15,7 @@ from ..core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.paths import read_paths_file, save_paths
-from .buffer import Legs, join
+from .buffer import Legs
 from .fields import Devices, Ends, path_gains, scattering_materials
 from .options import TraceOptions
 from .surfaces import Surfaces, scene_surfaces
@@ -23,21 +23,21 @@ from .surfaces import Surfaces, scene_surfaces
 
 @dataclass(frozen=True)
 class TraceResult:
-    """Paths and how they were found.
+    """Paths with the settings and devices of their trace.
 
     Attributes:
-        paths: the paths, p of them.
+        paths: the p paths.
         tx_pos_m: transmitters [n_tx, 3], metres.
         receivers: the ``n_rx`` receivers.
         primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
-        probability: see `wrf_mi.tracing.buffer.Legs`.
-        wedge: see `wrf_mi.tracing.buffer.Legs`; empty without diffraction.
-        options: as asked for.
-        rays: that searched from each source; differs from ``options.rays`` where that is ``"auto"``.
-        from_receivers: the search went from receivers to transmitters.
-        frequency_hz: of the carrier at which they were searched for.
+        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.buffer.Legs`.
+        wedge: edges of diffraction, see `wrf_mi.tracing.buffer.Legs`; empty without diffraction.
+        options: the options of the trace.
+        rays: number of rays from each source; differs from ``options.rays`` where that is ``"auto"``.
+        from_receivers: whether the search went from receivers to transmitters.
+        frequency_hz: carrier frequency of the search.
         tx_antenna: antenna of the transmitters.
-        carriers_hz: carrier of each transmitter [n_tx], of which the gains are; None: ``frequency_hz``.
+        carriers_hz: carrier frequency of the gains for each transmitter [n_tx]; None: ``frequency_hz``.
     """
 
     paths: Paths
@@ -60,11 +60,11 @@ class TraceResult:
         return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
 
     def without_faint(self, share: float) -> TraceResult:
-        """The paths without the weakest of each transmitter at each receiver.
+        """Drop the weakest paths of each transmitter at each receiver.
 
         Args:
-            share: amplitudes of those that are left out add up to less than this share of the amplitudes of all,
-                which bounds the error of a sum of the paths, whatever their phases.
+            share: amplitudes of the dropped paths add up to less than this share of the amplitudes of all, which
+                bounds the error of a sum of the paths, whatever their phases.
         """
         pair, amplitude = self.paths.tx + self.paths.n_tx * self.paths.rx, np.abs(self.paths.gain)
         order = np.lexsort((amplitude, pair))
@@ -81,16 +81,16 @@ class TraceResult:
         Raises:
             InputError: the scene lacks an object, or has another one by that name.
         """
-        paths, first = self.paths, np.zeros(len(self.paths.object_names), np.int64)
+        paths, first = self.paths, np.zeros(len(self.paths.object_names) + 1, np.int64)
         for index, name in enumerate(paths.object_names):
-            own = paths.objects == index
-            if not own.any():
+            met = paths.objects == index
+            if not met.any():
                 continue
             if name not in surfaces.names:
                 raise InputError(f"scene: no object {name!r}, which the saved paths meet; open the scene they are of")
-            place = surfaces.names.index(name)
-            first[index] = surfaces.first_face[place]
-            if self.primitives[own].max() >= surfaces.first_face[place + 1] - first[index]:
+            number = surfaces.names.index(name)
+            first[index] = surfaces.first_face[number]
+            if self.primitives[met].max() >= surfaces.first_face[number + 1] - first[index]:
                 raise InputError(f"scene: object {name!r} is not the one that the saved paths meet; trace them anew")
         face = np.where(paths.objects >= 0, first[paths.objects] + self.primitives, -1)
         legs = Legs(paths.tx, paths.rx, paths.interactions, face, paths.vertices_m, self.probability, self.wedge)
@@ -104,7 +104,7 @@ class TraceResult:
 
 def device_ends(tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], tx_antenna: Antenna) -> Ends:
     """Transmitters and receivers as Sionna RT's devices."""
-    antennas = tuple(one.antenna.mounted(one.orientation_xyzw) for one in receivers)
+    antennas = tuple(receiver.antenna.mounted(receiver.orientation_xyzw) for receiver in receivers)
     rx = np.stack([receiver.position_m for receiver in receivers])
     return Devices(tx_pos_m, (tx_antenna.mounted(),)), Devices(rx, antennas)
 
@@ -116,23 +116,23 @@ def recompute(
     rx_antennas: Sequence[Antenna] | None = None,
     tx_antenna: Antenna | None = None,
 ) -> TraceResult:
-    """Gains of the same paths with the scene's present materials (and frequency), without tracing again.
+    """Recompute the gains of paths with the scene's present materials and frequency, without tracing again.
 
     Args:
         traced: from `wrf_mi.tracing.trace_paths` or `load_trace`.
         scene: a ``sionna.rt.Scene`` of the same geometry.
-        rx_antennas: other antennas of the receivers, one for each; None: those that were traced with.
-        tx_antenna: another antenna of the transmitters; None: the one that was traced with.
+        rx_antennas: new antennas of the receivers; None: the traced ones.
+        tx_antenna: new antenna of the transmitters; None: the traced one.
 
     Returns:
-        The same paths with other gains.
+        The paths with the new gains.
 
     Raises:
         InputError: the scene lacks an object that a path meets.
     """
     if rx_antennas is not None:
-        own = (replace(one, antenna=a) for one, a in zip(traced.receivers, rx_antennas, strict=True))
-        traced = replace(traced, receivers=tuple(own))
+        pairs = zip(traced.receivers, rx_antennas, strict=True)
+        traced = replace(traced, receivers=tuple(replace(receiver, antenna=antenna) for receiver, antenna in pairs))
     if tx_antenna is not None:
         traced = replace(traced, tx_antenna=tx_antenna)
     surfaces = scene_surfaces(scene)
@@ -143,44 +143,32 @@ def recompute(
 
 
 def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
-    """The trace of all transmitters from traces of consecutive ones, with the same receivers, scene and options."""
+    """Join traces of consecutive transmitters with the same receivers, scene and options."""
     first = parts[0]
     starts = np.cumsum([0, *(part.paths.n_tx for part in parts)])
     tx = np.concatenate([part.paths.tx + start for part, start in zip(parts, starts[:-1], strict=True)])
     # Stable: the paths of a pair of devices all come from one part and keep their order.
     order = np.lexsort((tx, np.concatenate([part.paths.rx for part in parts])))
-    legs = [
-        Legs(
-            p.paths.tx,
-            p.paths.rx,
-            p.paths.interactions,
-            p.primitives.astype(np.int64),
-            p.paths.vertices_m,
-            p.probability,
-            p.wedge,
-        )
-        for p in parts
-    ]
-    joined = join(legs, first.primitives.shape[1]).select(order)
-    carriers = None if first.carriers_hz is None else np.concatenate([cast(FloatArray, p.carriers_hz) for p in parts])
+
+    def joined(part_arrays: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate(list(part_arrays))[order]
+
     names = ("rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part.paths, name) for part in parts])[order] for name in names
-    }
-    paths = replace(first.paths, tx=tx[order], n_tx=int(starts[-1]), **arrays)
+    arrays: dict[str, Any] = {name: joined(getattr(part.paths, name) for part in parts) for name in names}
+    carriers = None if first.carriers_hz is None else np.concatenate([cast(FloatArray, p.carriers_hz) for p in parts])
     return replace(
         first,
-        paths=paths,
+        paths=replace(first.paths, tx=tx[order], n_tx=int(starts[-1]), **arrays),
         tx_pos_m=np.concatenate([part.tx_pos_m for part in parts]),
-        primitives=joined.face.astype(np.int32),
-        probability=joined.probability,
-        wedge=joined.wedge,
+        primitives=joined(part.primitives for part in parts),
+        probability=joined(part.probability for part in parts),
+        wedge={name: joined(part.wedge[name] for part in parts) for name in first.wedge},
         carriers_hz=carriers,
     )
 
 
 def save_trace(file: str | Path, traced: TraceResult) -> Path:
-    """Write to an ``.npz`` of plain arrays that `wrf_mi.core.load_paths` reads too."""
+    """Write a trace to an ``.npz`` of plain arrays that `wrf_mi.core.load_paths` reads too."""
     extra = {
         "tx_pos_m": traced.tx_pos_m,
         **receiver_arrays(traced.receivers),
@@ -197,10 +185,10 @@ def save_trace(file: str | Path, traced: TraceResult) -> Path:
 
 
 def load_trace(file: str | Path) -> TraceResult:
-    """Read what `save_trace` wrote.
+    """Read a file of `save_trace`.
 
     Raises:
-        InputError: missing, damaged, or without what tells how the paths were traced.
+        InputError: a file that is missing or damaged, or holds paths without their trace.
     """
     paths, extra = read_paths_file(file)
     try:

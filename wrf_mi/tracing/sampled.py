@@ -1,4 +1,4 @@
-"""Paths with scattering or diffraction: Sionna RT's own search, which draws them at random."""
+"""Paths with scattering or diffraction by Sionna RT's search, which draws them at random."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from .options import TraceOptions
 from .surfaces import Surfaces
 
 SLOTS_PER_CHUNK = 1 << 22
-"""Rays x targets x interactions of one search. Sionna RT keeps 8 bytes for each to find doubles and we give it a buffer
-with room for every one (some 70 bytes and interaction), so that no path is dropped: about 1 GB at a depth of 3."""
+"""Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
+for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
 
 
 def sampled_paths(
@@ -23,11 +23,11 @@ def sampled_paths(
 
     Args:
         scene: ``sionna.rt.Scene``.
-        surfaces: of that scene.
-        source_m: shape [3].
-        targets_m: shape [n, 3].
+        surfaces: surfaces of the scene.
+        source_m: position [3], metres.
+        targets_m: positions [n, 3], metres.
         options: kinds of interaction and depth.
-        rays: from the source.
+        rays: number of rays from the source.
 
     Returns:
         Paths with source 0 and target 0..n-1; vertices in single precision.

@@ -1,4 +1,4 @@
-"""Any description of a room as a Sionna RT scene: a name, a scene folder, a Mitsuba XML or a bare mesh."""
+"""Opening of Sionna RT scenes from a name, a scene folder, a Mitsuba XML or a bare mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
 HIGHEST_M = 500.0
-"""A scene higher than that is taken for one in millimetres."""
+"""Height above which a scene counts as one in millimetres."""
 
 
 def open_scene(
@@ -35,25 +35,25 @@ def open_scene(
     Args:
         source: name of a scene that comes with the package, a scene folder, a Mitsuba XML whose BSDFs are radio
             materials (``mat-itu_*``), or a mesh (``.stl``, ``.ply``, ``.obj``, ``.glb``).
-        frequency_hz: of the carrier; below a material's range see `set_frequency`.
-        thickness_m: slab thickness of materials by name, metres, before what the scene itself states.
-        material: of a mesh: a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect`` (a conductor).
+        frequency_hz: carrier frequency; below a material's range see `set_frequency`.
+        thickness_m: slab thickness of materials by name, metres, in place of the scene's.
+        material: radio material of a mesh, a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect``.
 
     Returns:
         A ``sionna.rt.Scene``.
 
     Raises:
-        InputError: nothing of that name, a file that cannot be opened, no surface, coordinates in millimetres, or a
+        InputError: an unknown name, a file that cannot be opened, no surface, coordinates in millimetres, or a
             material that is missing, unknown or superfluous.
     """
     backend.init()
     path = Path(source)
     if not path.exists() and (known := scenes().get(str(source))):
-        path, own = known.xml, known.thickness_m
+        path, stated_m = known.xml, known.thickness_m
     elif path.is_dir():
-        path, own = _folder(path)
+        path, stated_m = _folder(path)
     else:
-        own = {}
+        stated_m = {}
     if not path.is_file():
         ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
         raise InputError(f"{source}: no such scene file; give {ways}")
@@ -64,7 +64,7 @@ def open_scene(
         raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
     scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
     _check_size(scene, source)
-    set_frequency(scene, frequency_hz, {**own, **(thickness_m or {})})
+    set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})})
     return scene
 
 
@@ -86,15 +86,15 @@ def _from_xml(path: Path) -> Any:
     from sionna import rt
 
     try:
-        # Merged shapes come in another order each time, and with them the paths.
+        # Merged shapes, and with them the paths, have a random order.
         return rt.load_scene(str(path), merge_shapes=False)
     except (RuntimeError, ValueError, SyntaxError, TypeError) as error:
-        # Mitsuba puts the traceback of what Sionna RT raises into its own message; its last line says what is wrong.
-        said = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        # Mitsuba's message holds the traceback of Sionna RT's error; its last line is the reason.
+        lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         if "ITU material" in str(error):
             known = ", ".join(THICKNESS_M)
-            raise InputError(f"{path}: {one_line(said[-1])}; known are {known}, and constants of your own") from None
-        raise InputError(f"{path}: cannot be opened ({one_line(said[-1])}); correct the scene") from None
+            raise InputError(f"{path}: {one_line(lines[-1])}; known are {known}, and constants of your own") from None
+        raise InputError(f"{path}: cannot be opened ({one_line(lines[-1])}); correct the scene") from None
 
 
 def _from_mesh(path: Path, material: str) -> Any:
@@ -105,20 +105,20 @@ def _from_mesh(path: Path, material: str) -> Any:
     else:
         name = f"itu_{material.removeprefix('itu_')}"
         if name not in THICKNESS_M:
-            known = ", ".join(one.removeprefix("itu_") for one in THICKNESS_M)
+            known = ", ".join(itu.removeprefix("itu_") for itu in THICKNESS_M)
             raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {known}")
         kind = name.removeprefix("itu_")
         radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
     try:
         loaded: list[Any] = trimesh.load_scene(str(path)).dump()
         parts = [part for part in loaded if len(getattr(part, "faces", ()))]
-    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
+    except Exception as error:  # trimesh's readers raise a dozen types on damaged files
         raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
     scene = rt.load_scene()
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
-            # Corners and faces alone: Mitsuba warns of attributes that it does not know.
+            # Vertices and faces only: Mitsuba warns of unknown attributes.
             name = path.stem if len(parts) == 1 else f"{path.stem}_{index}"
             file = Path(folder) / f"{name}.ply"
             trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)

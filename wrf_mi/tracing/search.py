@@ -1,4 +1,4 @@
-"""Which surfaces a wave may be reflected at, one after the other: chains of planes, found by rays."""
+"""Search by rays for the chains of planes at which a wave may be reflected."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ..core.types import IntArray
 from .surfaces import Surfaces
 
 PAIRS_PER_CHUNK = 1 << 24
-"""Pairs of chain and position tested at once: 64 MiB of single-precision numbers for each of a few."""
+"""Pairs of chain and position in a chunk: 64 MiB for each single-precision array."""
 RAYS_PER_CHUNK = 1 << 20
-"""Rays in flight at once."""
+"""Rays in a chunk."""
 END_M = 1e-4
-"""What lies so close to the end of a segment is the surface that reflects there."""
+"""Distance from the end of a segment within which a hit is the surface that reflects there."""
 
 
 @dataclass(frozen=True)
-class Chains:
+class ReflectionChains:
     """Sequences of reflecting planes seen from one source; c chains.
 
     Attributes:
-        plane: from the source on, shape [c, depth], -1 beyond the last.
-        image: of the source after each reflection, shape [c, depth, 3], metres, float64.
+        plane: planes in their order from the source, shape [c, depth], -1 beyond the last.
+        image: images of the source after each reflection, shape [c, depth, 3], metres, float64.
     """
 
     plane: IntArray
@@ -40,26 +40,26 @@ class Chains:
 
     @property
     def length(self) -> IntArray:
-        """Reflections of each chain, shape [c]."""
+        """Number of reflections of each chain, shape [c]."""
         return np.count_nonzero(self.plane >= 0, axis=1)
 
 
 def shoot(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, depth: int, reflections: int, seed: int
 ) -> IntArray:
-    """Planes at which rays from a point are reflected, each sequence once and with all its beginnings.
+    """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
-    Rays leave on a Fibonacci lattice turned at random. Where waves also go straight on (``depth`` is more than
+    Rays leave on a randomly rotated Fibonacci lattice. Where waves are also transmitted (``depth`` is more than
     ``reflections``), the rays are shot once for each choice of the hits that reflect.
 
     Args:
         scene: ``sionna.rt.Scene``.
-        surfaces: of that scene.
-        source_m: shape [3].
+        surfaces: surfaces of the scene.
+        source_m: position [3], metres.
         rays: number of rays.
-        depth: surfaces met at most.
-        reflections: at most.
-        seed: of the turn.
+        depth: largest number of surfaces met.
+        reflections: largest number of reflections.
+        seed: seed of the lattice's random rotation.
 
     Returns:
         Shape [c, reflections], -1 beyond the last; in lexical order.
@@ -80,7 +80,7 @@ def shoot(
 
 
 def _patterns(depth: int, reflections: int) -> list[tuple[int, ...]]:
-    """Which hits reflect: all choices that are not the beginning of another one."""
+    """Indices of the hits that reflect: all choices that are not a prefix of another one."""
     full = list(combinations(range(depth), reflections))
     fewer = [pattern for r in range(1, reflections) for pattern in combinations(range(depth), r)]
     return full + [pattern for pattern in fewer if depth - 1 - pattern[-1] < reflections - len(pattern)]
@@ -107,7 +107,7 @@ def _shoot(
     depth: int,
     reflecting: tuple[int, ...],
 ) -> IntArray:
-    """Plane of each hit [depth, rays], -1 once a ray has left the scene; the hits ``reflecting`` turn the ray."""
+    """Plane of each hit [depth, rays], -1 once a ray has left the scene; ``reflecting``: hits that reflect the ray."""
     import drjit as dr
     import mitsuba as mi
 
@@ -117,7 +117,7 @@ def _shoot(
     lookup = np.zeros(int(surfaces.shape_ids.max()) + 1, np.uint32)
     lookup[surfaces.shape_ids] = surfaces.first_face[:-1]
     first, plane = to_uint(lookup), on_device(surfaces.plane, mi.Int32)
-    # As data, not as code: one kernel serves every pattern.
+    # As data, not as code: the same kernel serves every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
     planes: list[Any] = []
@@ -134,18 +134,15 @@ def _shoot(
 
 
 def unique_chains(sequence: IntArray) -> IntArray:
-    """Each sequence of planes [n, depth] once, with all its beginnings, in lexical order; empty ones left out."""
+    """Distinct sequences of planes [n, depth] with all their prefixes, without empty ones, in lexical order."""
     once = _unique_rows(sequence)
-    beginnings = [once]
-    for level in range(1, sequence.shape[1]):
-        beginnings.append(once.copy())
-        beginnings[-1][:, level:] = -1
-    together = _unique_rows(np.concatenate(beginnings))
+    level = np.arange(sequence.shape[1])
+    together = _unique_rows(np.concatenate([np.where(level < length, once, -1) for length in level + 1]))
     return together[(together >= 0).any(axis=1)]
 
 
 def _unique_rows(rows: IntArray) -> IntArray:
-    """Each row once, in lexical order. Rows are sorted as numbers, ten times faster than by `numpy.unique(axis=0)`."""
+    """Distinct rows in lexical order, coded as numbers: ten times faster than `numpy.unique(axis=0)`."""
     code, width = np.zeros(len(rows), np.int64), int(rows.max(initial=-1)) + 2
     for level in range(rows.shape[1]):
         if int(code.max(initial=0)) >= np.iinfo(np.int64).max // width - 1:
@@ -155,20 +152,20 @@ def _unique_rows(rows: IntArray) -> IntArray:
 
 
 def possible(
-    surfaces: Surfaces, chains: Chains, targets_m: FloatArray, margin_m: float = 1e-3
+    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray, margin_m: float = 1e-3
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
 
-    Pure arithmetic, no ray is traced: it leaves a few in a thousand for that.
+    A test without rays, which a few in a thousand pairs pass.
 
     Args:
-        surfaces: of the scene.
-        chains: from one source.
-        targets_m: shape [n, 3].
+        surfaces: surfaces of the scene.
+        chains: chains from one source.
+        targets_m: positions [n, 3], metres.
         margin_m: slack of the bounds.
 
     Yields:
-        Indices of chains and of targets, in parts.
+        Indices of chains and of targets, in chunks.
     """
     import drjit as dr
     import mitsuba as mi
@@ -192,29 +189,29 @@ def possible(
             part = members[start : start + step]
             lane = dr.arange(mi.UInt32, len(part) * count)
             row: Any = lane // count
-            place: Any = dr.gather(mi.Point3f, targets, lane - row * count)
+            point: Any = dr.gather(mi.Point3f, targets, lane - row * count)
             valid: Any = dr.full(mi.Bool, True, len(part) * count)
             for level in reversed(range(reflections)):
                 plane = dr.gather(mi.UInt32, to_uint(chains.plane[part, level]), row)
                 image: Any = dr.gather(mi.Point3f, to_vectors(chains.image[part, level], mi.Point3f), row)
                 n, d, u, v, low, high = (dr.gather(type(values), values, plane) for values in planes)
-                here, there = dr.dot(n, place) - d, dr.dot(n, image) - d
+                here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
                 valid &= here * there < 0
-                place += (image - place) * (here / (here - there))
-                along = mi.Point2f(dr.dot(u, place), dr.dot(v, place))
+                point += (image - point) * (here / (here - there))
+                along = mi.Point2f(dr.dot(u, point), dr.dot(v, point))
                 valid &= dr.all(along >= low) & dr.all(along <= high)
             kept = np.asarray(dr.compress(valid), np.int64)
             yield part[kept // count], kept % count
 
 
 def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
-    """How many surfaces lie between two points of each row, ends left out; ``most + 1`` stands for more.
+    """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
 
     Args:
         scene: ``sionna.rt.Scene``.
-        start_m: shape [n, 3].
-        end_m: shape [n, 3].
-        most: crossings of interest.
+        start_m: first points [n, 3], metres.
+        end_m: second points [n, 3], metres.
+        most: largest number that is counted.
     """
     import drjit as dr
     import mitsuba as mi
@@ -232,7 +229,7 @@ def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: in
     crossings: Any = dr.zeros(mi.UInt32, len(start_m))
     for _ in range(most + 1):
         hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
-        # From the start, not from the ray's own origin, which is moved off the last surface by up to a millimetre.
+        # From the start: the ray's origin is moved off the last surface by up to a millimetre.
         active &= hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
         crossings += dr.select(active, mi.UInt32(1), mi.UInt32(0))
         ray = hit.spawn_ray(direction)

@@ -1,4 +1,4 @@
-"""What a slab of a radio material does to a wave: reflection and transmission, ITU-R P.2040."""
+"""Reflection at and transmission through a slab of a radio material, ITU-R P.2040."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.constants import epsilon_0, speed_of_light
 
 @dataclass
 class SlabCoefficients:
-    """Complex coefficients of p passages: reflection and transmission, TE and TM."""
+    """Complex reflection and transmission coefficients of p passages, TE and TM."""
 
     reflected_te: Any
     reflected_tm: Any
@@ -24,15 +24,26 @@ class SlabCoefficients:
 def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, frequency_hz: Any) -> SlabCoefficients:
     """Reflection at and transmission through a homogeneous slab in air.
 
-    The same equations as Sionna RT's ``itu_coefficients_single_layer_slab``, which computes in float32 whatever it is
-    given; here in the type of ``cosine``. Differentiable in all of Dr.Jit's arrays.
+    With the complex relative permittivity eta = eps_r - j sigma / (2 pi f eps_0), for the time factor exp(+j omega t),
+    and s = sqrt(eta - sin^2 theta), the Fresnel coefficients of one face are
+
+        r_TE = (cos theta - s) / (cos theta + s),   r_TM = (eta cos theta - s) / (eta cos theta + s)
+
+    and those of a slab of thickness d, with q = 2 pi d s / lambda,
+
+        R = r (1 - exp(-2 j q)) / (1 - r^2 exp(-2 j q)),   T = (1 - r^2) exp(-j q) / (1 - r^2 exp(-2 j q)).
+
+    R refers to the front face. T includes the phase of the way through the slab; that of the same way through air is
+    not subtracted. A perfect conductor has r_TE = -1 and r_TM = +1. Sionna RT's ``itu_coefficients_single_layer_slab``
+    has the same equations, in float32 for any input; here in the type of ``cosine``. Differentiable in all Dr.Jit
+    arguments.
 
     Args:
-        cosine: of the angle of incidence, NumPy's or Dr.Jit's array of any float type, [p].
-        permittivity: relative, [p].
-        conductivity: S/m, [p].
-        thickness_m: metres, [p].
-        frequency_hz: of the carrier, a number or an array of the same type.
+        cosine: cosine of the angle of incidence theta, NumPy's or Dr.Jit's array of any float type, [p].
+        permittivity: relative permittivity eps_r, [p].
+        conductivity: sigma, S/m, [p].
+        thickness_m: d, metres, [p].
+        frequency_hz: carrier frequency f, a number or an array of the same type.
 
     Source: ITU-R P.2040-3, equations 37, 43 and 44.
     """

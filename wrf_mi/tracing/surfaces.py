@@ -1,4 +1,4 @@
-"""The triangles of a Sionna RT scene in float64, and the planes they lie in."""
+"""Triangles of a Sionna RT scene in float64, and their planes."""
 
 from __future__ import annotations
 
@@ -14,33 +14,34 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 
 COPLANAR_M = 2e-5
-"""A face belongs to a plane when its three corners are this close: 30 times the rounding of float32 at 10 m."""
+"""Largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m."""
 COPLANAR_COS = 0.99
-"""... and its normal within 8 degrees, which a sliver's rounded normal needs and a thin object's rim has not."""
+"""Smallest cosine between normals of a face and its plane, 8 degrees: more than a sliver's rounding, less than a thin
+object's rim."""
 MERGED_M2 = 0.01
-"""Planes of less area are not looked for among rounded normals."""
+"""Smallest area of a plane that takes in other faces."""
 MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)
-"""Where Mitsuba's description of a mesh states its file: no attribute has it."""
+"""Mesh file in Mitsuba's description of a shape; there is no attribute."""
 MERGED_COUNT = 1000
-"""Largest planes that take in others' faces: bounds the time for meshes without planes."""
+"""Number of planes, largest first, that take in other faces: bounds the time for meshes without planes."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Faces of all objects in a row, and their planes; f faces, q planes, b objects.
+    """Faces of all objects, and their planes; f faces, q planes, b objects.
 
     Attributes:
-        names: of the objects.
+        names: names of the objects.
         shape_ids: Mitsuba's registry index of each object's mesh, shape [b].
-        first_face: where each object's faces begin, shape [b + 1]; face = first_face[object] + primitive.
-        triangles: corners [f, 3, 3], metres.
+        first_face: index of each object's first face, shape [b + 1]; face = first_face[object] + primitive.
+        triangles: corners of the faces [f, 3, 3], metres.
         plane: plane of each face, shape [f].
         normal: unit normals [q, 3].
         offset: n . x of each plane, shape [q], metres.
         face: largest face of each plane, shape [q].
         axes: two unit vectors in each plane [q, 2, 3].
         low, high: bounds of the plane's faces along ``axes``, shape [q, 2], metres.
-        files: name of each object's mesh file, empty where it has none; none at all where objects are not of a file.
+        files: name of each object's mesh file, "" for none; empty without files.
     """
 
     names: tuple[str, ...]
@@ -57,7 +58,7 @@ class Surfaces:
     files: tuple[str, ...] = ()
 
     def called(self, thing: int) -> str:
-        """What errors call an object: its name, and its mesh file where that is called otherwise."""
+        """Name of an object in error messages, with its mesh file if that has another name."""
         name, file = self.names[thing], self.files[thing] if self.files else ""
         return repr(name) if Path(file).stem in ("", name) else f"{name!r} ({file})"
 
@@ -80,19 +81,19 @@ def scene_surfaces(scene: Any) -> Surfaces:
         triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
         pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mesh))
         ids.append(int(pointer[0]))
-        stated = MESH_FILE.search(str(mesh))
-        files.append(stated[1] if stated else "")
+        found = MESH_FILE.search(str(mesh))
+        files.append(found[1] if found else "")
     first = np.cumsum([len(part) for part in triangles])
-    found = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
-    return replace(found, files=tuple(files))
+    surfaces = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
+    return replace(surfaces, files=tuple(files))
 
 
 def find_planes(
     names: tuple[str, ...], shape_ids: NDArray[np.uint32], first_face: IntArray, triangles: FloatArray
 ) -> Surfaces:
-    """Group faces into planes: first by rounded normal and offset, then the largest take in all that lie in them.
+    """Group faces into planes by rounded normal and offset; the largest planes then take in all faces within them.
 
-    The second step makes one plane of a wall whose slivers have rounded normals of their own.
+    The second step joins a wall with its slivers, whose normals are inexact.
     """
     corner, centre = triangles[:, 0], triangles.mean(axis=1)
     cross = np.cross(triangles[:, 1] - corner, triangles[:, 2] - corner)
@@ -124,10 +125,15 @@ def find_planes(
         free[candidates[near]] = False
     labels, plane = np.unique(plane, return_inverse=True)
     plane = plane.reshape(-1)
-    # The plane is that of the face which took the others in: theirs may be tilted, though within the tolerance.
+    # The plane is that of the face which took in the others: theirs may be tilted within the tolerance.
     kept = plane[biggest[labels]] == np.arange(len(labels))
     face = np.where(kept, biggest[labels], _largest_face(plane, area))
-    return _bounded(names, shape_ids, first_face, triangles, plane, normal[face], offset[face], face)
+    normal, offset = normal[face], offset[face]
+    edge = triangles[face][:, 1] - triangles[face][:, 0]
+    edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
+    axes = np.stack([edge, np.cross(normal, edge)], axis=1)
+    low, high = plane_bounds(plane, np.einsum("fcx,fax->fca", triangles, axes[plane]), len(face))
+    return Surfaces(names, shape_ids, first_face, triangles, plane, normal, offset, face, axes, low, high)
 
 
 def _largest_face(plane: IntArray, area: FloatArray) -> IntArray:
@@ -136,21 +142,9 @@ def _largest_face(plane: IntArray, area: FloatArray) -> IntArray:
     return order[np.searchsorted(plane[order], np.arange(plane.max(initial=-1) + 1))]
 
 
-def _bounded(
-    names: tuple[str, ...],
-    shape_ids: NDArray[np.uint32],
-    first_face: IntArray,
-    triangles: FloatArray,
-    plane: IntArray,
-    normal: FloatArray,
-    offset: FloatArray,
-    face: IntArray,
-) -> Surfaces:
-    edge = triangles[face][:, 1] - triangles[face][:, 0]
-    edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
-    axes = np.stack([edge, np.cross(normal, edge)], axis=1)
-    along = np.einsum("fcx,fax->fca", triangles, axes[plane])
-    low, high = np.full((len(face), 2), np.inf), np.full((len(face), 2), -np.inf)
-    np.minimum.at(low, plane, along.min(axis=1))
-    np.maximum.at(high, plane, along.max(axis=1))
-    return Surfaces(names, shape_ids, first_face, triangles, plane, normal, offset, face, axes, low, high)
+def plane_bounds(plane: IntArray, flat_m: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Bounds [count, 2] of the corners [f, 3, 2] of faces in the coordinates of their planes [f]."""
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, plane, flat_m.min(axis=1))
+    np.maximum.at(high, plane, flat_m.max(axis=1))
+    return low, high

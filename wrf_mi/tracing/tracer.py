@@ -1,4 +1,4 @@
-"""Ray tracing as a model of a data set: from transmitter positions to what its receivers report."""
+"""Ray tracing as a model of a data set: observations at transmitter positions."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
+from ..receivers import bartlett_spectrum, element_signals, minmax_scale
 from ..receivers.instruments import Instrument
 from .options import DEFAULTS, TraceOptions
 from .result import TraceResult, recompute
 from .scenes import open_scene
-from .solve import Prepared, keeps_direction, trace_paths
+from .solve import Prepared, trace_paths
 
 
 class RayTracer:
-    """Traces a scene and reports as an instrument would.
+    """Traces a scene and reports as an instrument does.
+
+    Args:
+        scene: see `wrf_mi.tracing.open_scene`.
+        instrument: receivers and their reports, see `wrf_mi.tasks.Task.instrument`.
+        options: kinds of path, depth, rays.
+        material: radio material of a bare mesh.
 
     Attributes:
         scene: the ``sionna.rt.Scene``, at the instrument's carrier.
-        instrument: what is reported.
-        options: what is traced.
+        instrument: receivers and their reports.
+        options: kinds of path, depth, rays.
+
+    Raises:
+        InputError: a scene that cannot be opened.
     """
 
     def __init__(
         self, scene: str | Path, instrument: Instrument, options: TraceOptions = DEFAULTS, material: str | None = None
     ) -> None:
-        """Open a scene.
-
-        Args:
-            scene: see `wrf_mi.tracing.open_scene`.
-            instrument: what is reported, see `wrf_mi.tasks.Task.instrument`.
-            options: what is traced.
-            material: of a bare mesh.
-
-        Raises:
-            InputError: a scene that cannot be opened.
-        """
         self.instrument = instrument
         self.options = options
         self._at = cache(partial(open_scene, scene, material=material))
@@ -61,15 +61,24 @@ class RayTracer:
         Args:
             tx_pos_m: positions [n, 3], metres.
             progress: show a bar on standard error.
-            first_row: what errors call the first position.
-            carriers_hz: carrier of each position [n], Hz, at which the scene's materials and the paths' gains are
-                taken; the paths are searched for once. None: the instrument's for all.
+            first_row: number of the first position in error messages, from 0.
+            carriers_hz: carrier of each position [n], Hz, of the scene's materials and the paths' gains; paths are
+                searched for once. None: the instrument's carrier for all.
 
         Raises:
             InputError: a position inside a solid object, or a material that is not known at one of the carriers.
         """
-        ends = self.instrument.receivers, self.options, progress, self._prepared, first_row
-        traced = trace_paths(self.scene, tx_pos_m, *ends, self.instrument.tx_antenna)
+        instrument = self.instrument
+        traced = trace_paths(
+            self.scene,
+            tx_pos_m,
+            instrument.receivers,
+            self.options,
+            progress,
+            self._prepared,
+            first_row,
+            instrument.tx_antenna,
+        )
         if carriers_hz is None:
             return traced
 
@@ -82,15 +91,55 @@ class RayTracer:
         return replace(traced, paths=paths, carriers_hz=carriers_hz)
 
     def observe(self, traced: TraceResult) -> NDArray[Any]:
-        """What every receiver reports of traced paths, [n_rx, n, ...], each row at its carrier."""
+        """Observations of all receivers [n_rx, n, ...] for traced paths, each row at its carrier."""
         return self.instrument.observe_rows(traced.paths, traced.carriers_hz)
 
     def rays(self, tx_pos_m: ArrayLike) -> int:
-        """How many rays search if these positions [n, 3] (metres) are the first: ``"auto"`` is settled on them."""
+        """Number of rays per search for positions [n, 3] (metres); with ``"auto"`` that which converges for them."""
         positions, receivers = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
         ends = positions, np.stack([receiver.position_m for receiver in receivers])
-        return self._prepared.rays(*(ends if keeps_direction(self.options) else ends[::-1]), self.options)
+        return self._prepared.rays(*(ends if self.options.diffraction else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
-        """What every receiver reports for transmitter positions [n, 3] (metres), [n_rx, n, ...]."""
+        """Observations of all receivers [n_rx, n, ...] for transmitter positions [n, 3] (metres)."""
         return self.observe(self.trace(tx_pos_m))
+
+
+def trace_spectra(
+    scene: Any,
+    tx_pos_m: ArrayLike,
+    receiver: Receiver,
+    array_m: ArrayLike,
+    frequency_hz: float,
+    *,
+    height: int = 90,
+    width: int = 360,
+    options: TraceOptions = DEFAULTS,
+    progress: bool = False,
+) -> NDArray[np.float32]:
+    """Ray-traced spatial spectra as the instrument reports them.
+
+    Args:
+        scene: from `wrf_mi.tracing.open_scene`, opened at ``frequency_hz``.
+        tx_pos_m: transmitter positions [n, 3], world frame, metres.
+        receiver: pose of the array.
+        array_m: its elements [m, 3] in the array's frame, metres.
+        frequency_hz: carrier frequency.
+        height: elevations of the spectrum.
+        width: azimuths of the spectrum.
+        options: kinds of path, depth, rays.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        Bartlett spectra [n, height, width], each scaled by its minimum and maximum to 0..1; all 0 where no path
+        arrives.
+
+    Raises:
+        ValueError: the scene is set to another frequency.
+    """
+    scene_hz = float(scene.frequency[0])
+    if not np.isclose(scene_hz, frequency_hz, rtol=1e-6):  # the scene keeps it in float32
+        raise ValueError(f"trace_spectra: the scene is at {scene_hz:g} Hz, not {frequency_hz:g}; open it at that")
+    paths = trace_paths(scene, tx_pos_m, receiver, options, progress).paths
+    signals = element_signals(paths, receiver, array_m, frequency_hz)[0]
+    return minmax_scale(bartlett_spectrum(signals, array_m, frequency_hz, height, width)).astype(np.float32)

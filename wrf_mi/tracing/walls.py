@@ -1,4 +1,4 @@
-"""The planes of a scene as mirrors and screens with outlines, in float64; offsets and tilts may be corrected."""
+"""Planes of a scene as mirrors and screens with outlines, in float64; they may be shifted and tilted."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .surfaces import Surfaces
+from .surfaces import Surfaces, plane_bounds
 
 ON_LINE_M = 1e-4
-"""Edges whose ends are so close to one line lie on it: a triangulation's inner edges cancel along it."""
+"""Distance within which edges lie on one line, along which a triangulation's inner edges cancel."""
 PAIRS_PER_CHUNK = 1 << 22
-"""Pairs of point and edge that are worked on at once."""
+"""Pairs of point and edge in a chunk."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,13 @@ class Walls:
     Attributes:
         normal: unit normals [q, 3].
         offset_m: d [q].
-        centre_m: point of each plane about which it is turned, the centroid of its faces [q, 3].
+        centre_m: centroid of each plane's faces, about which it is tilted [q, 3].
         axes: two unit vectors in each plane [q, 2, 3].
-        area_m2: of its faces [q].
-        low_m, high_m: bounds of its faces along ``axes`` from ``centre_m`` [q, 2].
-        edge_m: both ends of each edge of the outlines, the same coordinates [e, 2, 2]; sorted by plane.
-        first_edge: where each plane's edges begin [q + 1].
+        area_m2: area of each plane's faces [q].
+        low_m, high_m: bounds of the faces along ``axes`` from ``centre_m`` [q, 2].
+        edge_m: ends of each edge of the outlines, coordinates along ``axes`` from ``centre_m`` [e, 2, 2]; sorted by
+            plane.
+        first_edge: index of each plane's first edge [q + 1].
     """
 
     normal: FloatArray
@@ -50,18 +51,18 @@ class Walls:
         return np.einsum("nad,nd->na", self.axes[plane], points_m - self.centre_m[plane])
 
     def moved(self, change: FloatArray) -> Walls:
-        """The planes shifted along their normals and turned about their centres.
+        """Shift the planes along their normals and tilt them about their centres.
 
         Args:
-            change: shift in metres, and tilts in rad towards either axis [q, 3].
+            change: shift in metres, and tilts in rad towards both axes [q, 3].
         """
         normal, offset = moved_planes(self.normal, self.axes, self.centre_m, change)
         return replace(self, normal=normal, offset_m=offset)
 
     def inside_m(self, plane: IntArray, flat_m: FloatArray) -> tuple[FloatArray, IntArray]:
-        """How far points [n, 2] of planes [n] lie inside the outlines, and the nearest edge of each.
+        """Distance in metres of points [n, 2] of planes [n] from the outlines, negative outside, and the nearest edges.
 
-        Metres, negative outside; -inf and edge -1 for a plane without outline.
+        -inf and edge -1 for a plane without outline.
         """
         result, nearest = np.full(len(plane), -np.inf), np.full(len(plane), -1)
         order = np.argsort(plane, kind="stable")
@@ -78,7 +79,7 @@ class Walls:
 
 
 def no_walls() -> Walls:
-    """Empty space."""
+    """Walls of empty space."""
     none, flat = np.zeros((0, 3)), np.zeros((0, 2))
     axes, edges = np.zeros((0, 2, 3)), np.zeros((0, 2, 2))
     return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
@@ -87,7 +88,7 @@ def no_walls() -> Walls:
 def moved_planes(
     normal: FloatArray, axes: FloatArray, centre_m: FloatArray, change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Normals [q, 3] and offsets [q] of planes after a change, see `Walls.moved`."""
+    """Normals [q, 3] and offsets [q] of shifted and tilted planes, see `Walls.moved`."""
     result = normal + np.einsum("qa,qad->qd", change[:, 1:], axes)
     result /= np.linalg.norm(result, axis=1, keepdims=True)
     return result, (result * centre_m).sum(axis=1) + change[:, 0]
@@ -104,20 +105,18 @@ def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
         np.stack([np.bincount(plane, area * c, minlength=count) for c in triangles.mean(axis=1).T], axis=1)
         / np.maximum(total, 1e-30)[:, None]
     )
-    # On the plane itself: the centroid of faces that lie in it within rounding.
+    # Faces lie in their plane within a tolerance only; so does their centroid.
     centre -= surfaces.normal * ((centre * surfaces.normal).sum(axis=1) - surfaces.offset)[:, None]
     return centre, total
 
 
 def walls_of(surfaces: Surfaces) -> Walls:
-    """The planes of a scene's surfaces."""
+    """Walls of a scene's surfaces."""
     triangles, plane = surfaces.triangles, surfaces.plane
     count = len(surfaces.normal)
     centre, total = plane_centres(surfaces)
     flat = np.einsum("fad,fcd->fca", surfaces.axes[plane], triangles - centre[plane, None])
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, plane, flat.min(axis=1))
-    np.maximum.at(high, plane, flat.max(axis=1))
+    low, high = plane_bounds(plane, flat, count)
     edges = [outline_edges(flat[plane == q]) for q in range(count)]
     first = np.cumsum([0, *(len(part) for part in edges)])
     return Walls(
@@ -134,9 +133,9 @@ def walls_of(surfaces: Surfaces) -> Walls:
 
 
 def outline_edges(triangles_m: FloatArray) -> FloatArray:
-    """Edges [e, 2, 2] of the area that triangles [f, 3, 2] cover, whose inner edges need not meet corner to corner.
+    """Outline edges [e, 2, 2] of the area that triangles [f, 3, 2] cover; inner edges need not meet at corners.
 
-    Along each line, edges of triangles on its two sides cancel; what is left over is outline.
+    Along each line, edges of triangles on its two sides cancel; the others are outline.
     """
     first, second = triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0]
     twice = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]

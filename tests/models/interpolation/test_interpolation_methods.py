@@ -1,4 +1,4 @@
-"""The methods among the baselines: registry, settings, and what they predict."""
+"""Registry of models, settings, and predictions of interpolation methods."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ROUNDING = 1e-4
 """Powers of tens of dBm are stored in single precision."""
 
 
-def test_registry_lists_what_is_there_and_each_entry_is_what_it_says() -> None:
+def test_entries_of_the_registry_are_consistent() -> None:
     assert {"wrf-gs", "wrf-gs+", "factorised", "physics", "ray-tracing", "idw", "kriging"} <= set(MODELS)
     for name, model in MODELS.items():
         assert model.name == name
@@ -46,7 +46,7 @@ def test_registry_lists_what_is_there_and_each_entry_is_what_it_says() -> None:
         known_model("no-such")
 
 
-def test_settings_are_listed_and_null_is_a_value(flat_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_are_listed_and_accept_null(flat_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = call(["train", "--help-settings"], capsys)
     assert status == 0
     for line in ("idw:", "neighbours=null", "kriging:", "length_m=null", "mri:", "shared=False"):
@@ -59,7 +59,7 @@ def test_settings_are_listed_and_null_is_a_value(flat_folder: Path, capsys: pyte
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_settings_survive_the_configuration_and_the_list(name: str) -> None:
+def test_settings_round_trip_through_the_configuration_and_the_list(name: str) -> None:
     """As ``config.yaml`` keeps them and as ``--help-settings`` shows them, lists, choices and null included."""
     settings = SETTINGS[name]()
     kept = yaml.safe_load(yaml.safe_dump(_plain(asdict(settings))))
@@ -91,7 +91,7 @@ def test_settings_of_every_type() -> None:
             wrf_mi.with_settings(Several(), [wrong])
 
 
-def test_mri_finds_the_law_that_strengths_were_made_by(flat_folder: Path, tmp_path: Path) -> None:
+def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) -> None:
     """T = -45 dBm and gamma = 2 at both anchors, without noise; a receiver missed some rows."""
     record = load(flat_folder)
     distance = np.stack([np.linalg.norm(record.tx_pos_m - r.position_m, axis=1) for r in record.receivers])
@@ -106,7 +106,7 @@ def test_mri_finds_the_law_that_strengths_were_made_by(flat_folder: Path, tmp_pa
         np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
 
 
-def test_kriging_of_every_task_is_that_of_the_library(folder: Path, tmp_path: Path) -> None:
+def test_kriging_runs_equal_the_library_for_every_task(folder: Path, tmp_path: Path) -> None:
     """Given lengths and noise: the adapter's constant trend and, for channels, complex numbers and all antennas."""
     from wrf_mi.models.interpolation.kriging import Kriging
 
@@ -118,7 +118,7 @@ def test_kriging_of_every_task_is_that_of_the_library(folder: Path, tmp_path: Pa
         np.testing.assert_array_equal(arrays["prediction"], model.predict(record.tx_pos_m[split.test]))
 
 
-def test_strengths_are_predicted_with_headings(flat_folder: Path, tmp_path: Path) -> None:
+def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path) -> None:
     """Kriging about each receiver's log-distance law, and trees, as the library alone has them."""
     from wrf_mi.models.interpolation.kriging import Kriging, log_distance
     from wrf_mi.models.interpolation.trees import Trees
@@ -140,7 +140,7 @@ def test_strengths_are_predicted_with_headings(flat_folder: Path, tmp_path: Path
             np.testing.assert_allclose(found[r], expected.predict(place[split.test], turned[split.test]), atol=ROUNDING)
 
 
-def test_grown_trees_are_the_librarys(flat_folder: Path) -> None:
+def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
     from wrf_mi.models.interpolation.trees import GrownTrees, Trees
 
     record = load(flat_folder)
@@ -165,8 +165,8 @@ def test_published_figure_of_mri(tmp_path: Path) -> None:
     assert score["abs_error_db"]["p90"] == pytest.approx(10.2, abs=0.05)
 
 
-def test_one_training_row_is_copied_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
-    """Spectra of two receivers, and the least that a blend needs."""
+def test_idw_of_one_training_row_copies_it_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
+    """Spectra of two receivers."""
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
     out = train(data, tmp_path / "run", "idw", n_train=1).folder
     arrays = stored(out)

@@ -1,4 +1,4 @@
-"""Kriging and trees against dense linear algebra, made fields and the published figures of the data."""
+"""Kriging and trees against dense linear algebra, random fields and published figures."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_regression_kriging_adds_the_residuals_of_least_squares():
     np.testing.assert_allclose(model.predict(at), expected, atol=EXACT)
 
 
-def test_complex_rows_are_two_real_components():
+def test_complex_observations_are_two_real_components():
     positions, _, rng = made(15, 2)
     values, at = rng.normal(size=(15, 3)) + 1j * rng.normal(size=(15, 3)), rng.uniform(0, 4, (4, 3))
     found = Kriging(1.0, 0.1).fit(positions, values).estimate(at)
@@ -98,7 +98,7 @@ def test_complex_rows_are_two_real_components():
     np.testing.assert_allclose(found.std, np.hypot(parts[0].std, parts[1].std), atol=EXACT)
 
 
-def test_rows_that_were_not_received_are_left_out_and_types_stay():
+def test_rows_with_nan_are_ignored_and_types_are_kept():
     positions, _, rng = made(12, 3)
     values = rng.random((12, 4, 5)).astype(np.float32)
     values[3, 2, 2] = np.nan
@@ -111,7 +111,7 @@ def test_rows_that_were_not_received_are_left_out_and_types_stay():
     np.testing.assert_allclose(again, values[keep], atol=1e-6)  # no noise: it passes through the rows, in float32
 
 
-def test_likelihood_finds_the_covariance_it_was_drawn_from():
+def test_likelihood_recovers_the_covariance_of_random_fields():
     """300 rows, 400 draws, each with a mean of its own: all three to 6 %, twice what 400 draws scatter by.
 
     The plain likelihood, which takes no account of the 400 means, is off by 7 to 14 %.
@@ -128,7 +128,7 @@ def test_likelihood_finds_the_covariance_it_was_drawn_from():
     assert held["noise"] == 0.5
 
 
-def test_likelihood_of_more_components_than_rows():
+def test_likelihood_depends_on_the_gram_matrix_of_components():
     """An image's pixels enter by their Gram matrix: the same likelihood as that of repeated components."""
     positions, _, rng = made(10, 5)
     values = rng.normal(size=(10, 3))
@@ -136,7 +136,7 @@ def test_likelihood_of_more_components_than_rows():
     assert Kriging().fit(positions, wide).chosen == pytest.approx(Kriging().fit(positions, values).chosen, rel=1e-3)
 
 
-def test_deviation_covers_what_was_left_out():
+def test_standard_deviation_is_calibrated_on_held_out_rows():
     """Rows drawn from the model itself: the standardised error has variance one; 400 rows tell it to 10 %."""
     positions, heading, rng = made(500, 6)
     k = covariance(positions, heading, positions, heading) + 0.2 * np.eye(500)
@@ -172,7 +172,7 @@ def test_bad_arguments_are_refused():
     assert constant(positions).shape == (6, 1)
 
 
-def test_trees_see_the_heading_and_know_their_noise():
+def test_trees_use_the_heading_and_estimate_the_noise():
     """A step over the heading and noise of 2 dB: leaves average it out to 1 dB at most, and report it."""
     rng = np.random.default_rng(0)
     positions, heading = rng.uniform(0, 1, (2000, 3)), rng.uniform(-np.pi, np.pi, 2000)

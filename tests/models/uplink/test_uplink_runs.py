@@ -100,8 +100,8 @@ def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folde
         assert [row["model"] for row in csv.DictReader(file)] == ["idw", "uplink", "idw4"]
 
 
-def test_predictions_are_held_against_the_truth_and_fitted_to_what_was_measured(turned: None, tmp_path: Path) -> None:
-    """The measured downlink is off by another tenth of a radian, which is what a fit learns."""
+def test_methods_are_fitted_to_measurements_and_scored_by_the_truth(turned: None, tmp_path: Path) -> None:
+    """The measured downlink is turned by another tenth of a radian, which the fit learns."""
     record = channels()
     measured = (record.observation * np.exp(0.1j)).astype(np.complex64)
     data = write_nerf2_csi(tmp_path / "noisy", replace(record, observation=measured, truth=record.observation))
@@ -111,7 +111,7 @@ def test_predictions_are_held_against_the_truth_and_fitted_to_what_was_measured(
     assert metrics["reference"]["uplink"]["median"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_several_receivers_of_arrays_are_told_from_antennas(tmp_path: Path) -> None:
+def test_receivers_and_antennas_are_distinguished(tmp_path: Path) -> None:
     """[receivers, rows, antennas, subcarriers] and [receivers, rows, subcarriers] of as many axes."""
     one = channels()
     two = replace(
@@ -124,7 +124,7 @@ def test_several_receivers_of_arrays_are_told_from_antennas(tmp_path: Path) -> N
         assert read_run(out).score.shape == shape[:2]
 
 
-def test_uplink_predicts_where_no_position_is_known(
+def test_uplink_predicts_without_positions(
     turned: None, unplaced_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = train(unplaced_folder, tmp_path / "run", "turned").folder
@@ -149,7 +149,7 @@ def test_uplink_predicts_where_no_position_is_known(
     refused(["predict", tmp_path, "--input", tmp_path / "none.npz", *call_out], "no such file", capsys)
 
 
-def test_inputs_of_uplinks_that_are_refused(
+def test_invalid_uplinks_of_predictions_are_refused(
     run: Path, csi_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good = np.ones((2, ANTENNAS, SUBCARRIERS), np.complex64)
@@ -161,7 +161,7 @@ def test_inputs_of_uplinks_that_are_refused(
         ({"uplink": broken}, "row 2: uplink is not finite; correct or remove the row"),
         ({"uplink": good, "tx_pos": np.zeros((3, 3))}, "2 rows of uplink and 3 positions"),
         ({"uplink": good[:0]}, "no positions"),
-        ({"uplink": good, "tx_pos": np.zeros((2, 3))}, "which has no uplink; leave uplink away"),
+        ({"uplink": good, "tx_pos": np.zeros((2, 3))}, "which has no uplink; omit uplink"),
     ):
         np.savez(tmp_path / "in.npz", **arrays)
         refused(["predict", run, "--input", tmp_path / "in.npz", "--out", tmp_path / "out.npz"], message, capsys)
@@ -189,7 +189,7 @@ BAD_DATA = {
 
 
 @pytest.mark.parametrize("what", BAD_DATA)
-def test_data_that_are_refused(what: str, turned: None, flat_folder: Path, tmp_path: Path) -> None:
+def test_invalid_data_are_refused(what: str, turned: None, flat_folder: Path, tmp_path: Path) -> None:
     message, task = BAD_DATA[what]
     record = load(flat_folder) if task == "rssi" else channels()
     observation = record.observation.copy()
@@ -229,7 +229,7 @@ PLACED = {
 
 
 @pytest.mark.parametrize("what", PLACED)
-def test_data_that_were_read_are_named_by_their_place(
+def test_errors_name_the_file_of_the_data(
     what: str, turned: None, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, method, message = PLACED[what]

@@ -1,7 +1,7 @@
 """The models of 3D Gaussians: ``wrf-gs``, ``wrf-gs+`` and ``factorised``, trained step by step for every task.
 
-With a scene its paths are trained in the same graph (`wrf_mi.graph.graph`); without Gaussians they are so alone, which
-is how `wrf_mi.models.ray_tracing` is calibrated.
+With a scene its paths are trained in the same graph (`wrf_mi.graph.graph`); the graph of paths without Gaussians
+calibrates `wrf_mi.models.ray_tracing`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ...training.reach import Reach
 from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
-from ..method import Inputs
+from ..method import Inputs, keyed, under
 from ..model import Arrays, Fitted, Model, Problem, Session
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
@@ -45,16 +45,15 @@ class FittedField(Fitted):
     """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
 
     Args:
-        arrays: from `arrays`.
+        arrays: arrays of a run file.
         config: settings of the training.
         problem: data and scene.
         store: folder in which operators are kept (`wrf_mi.training.static_operator`).
 
     Attributes:
-        config: settings of the training.
         params: parameters by name.
-        form: what observations are made of.
-        field: the model, see `wrf_mi.gaussians`; None: paths alone.
+        form: form of the observations.
+        field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
     """
 
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
@@ -62,8 +61,7 @@ class FittedField(Fitted):
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
         alone = config.model == PATHS_ALONE
         self.field = None if alone else make_field(config, self.form.components, self.form.features)
-        own = {key.removeprefix(PARAM): values for key, values in arrays.items() if key.startswith(PARAM)}
-        self.params: Params = own or unpack_params(arrays)
+        self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
         self.uses_heading = self.form.headings
 
     @cached_property
@@ -73,17 +71,17 @@ class FittedField(Fitted):
         assert self.receivers is not None
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
-        ends = self.field, self.params, self.receivers, *form.size, config.skip
+        common = self.field, self.params, self.receivers, *form.size, config.skip
         reach = _reach(self._arrays)
-        return Predictor(*ends, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
+        return Predictor(*common, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """See `Fitted`."""
+        """Observations of the receiver of that index, [m, ...]."""
         heading = inputs.tx_heading_rad if self.uses_heading else None
         return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading))
 
     def arrays(self) -> Arrays:
-        """See `Fitted`."""
+        """Parameters, form of the observations, antennas, receivers and reach."""
         return self._arrays
 
     def facts(self) -> dict[str, Any]:
@@ -93,8 +91,8 @@ class FittedField(Fitted):
 
     def packed(self, params: Params, precision: str) -> Arrays:
         """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
-        ends = {key: v for key, v in self._arrays.items() if not key.startswith((PARAM, "packed_"))}
-        return ends | pack_params(params, precision)
+        kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, "packed_"))}
+        return kept | pack_params(params, precision)
 
 
 def _reach_arrays(reach: Reach | None) -> Arrays:
@@ -107,12 +105,12 @@ def _reach_arrays(reach: Reach | None) -> Arrays:
 def _reach(arrays: Arrays) -> Reach | None:
     if "reach_m" not in arrays:
         return None
-    ends = np.cumsum(arrays["known_counts"])[:-1]
-    return Reach(tuple(np.split(arrays["known_m"], ends)), float(arrays["reach_m"]))
+    known = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
+    return Reach(tuple(known), float(arrays["reach_m"]))
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
-    """What `FittedField.arrays` described; operators are stored in the folder (`wrf_mi.training.static_operator`)."""
+    """The field that `FittedField.arrays` described; operators are stored in the folder."""
     return FittedField(arrays, problem.settings, problem, folder)
 
 
@@ -130,14 +128,14 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
     cut_log(folder, trainer.state.step)
 
-    def heard(progress: Progress) -> None:
+    def on_progress(progress: Progress) -> None:
         append_log(folder, progress)
         session.on_progress(session.fold or "training", progress.step / config.steps, progress)
 
-    if not trainer.run(heard, lambda: write_checkpoint(folder, trainer), session.stop):
+    if not trainer.run(on_progress, lambda: write_checkpoint(folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
     arrays: Arrays = {
-        **{f"{PARAM}{name}": values for name, values in trainer.state.mean_params().items()},
+        **keyed(PARAM, trainer.state.mean_params()),
         **trainer.graph.form.arrays(),
         "tx_antenna": np.asarray(astuple(record.tx_antenna)),
         **receiver_arrays(trainer.graph.receivers),
@@ -173,7 +171,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
 
 @cache
 def _by_data(name: str, task: str, with_scene: bool) -> Model:
-    """The entry for a task: its settings begin with others, and spectra are complete."""
+    """The entry for a task, with its default settings; spectra must be complete."""
     image = TASKS[task].image
     return replace(_entry(name), defaults=task_settings(task, image, with_scene), complete=image, by_data=None)
 

@@ -1,24 +1,23 @@
-"""Baselines that know positions and headings, and fit each receiver by itself."""
+"""Methods that fit each receiver by itself from positions and headings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
-from ...training.session import OnProgress
-from ..method import Inputs
+from ...training.session import FitSession
+from ..method import Inputs, Method, keyed, known_positions, under
 
-HEADING = "heading"
-"""Key of the arrays that says whether headings were used."""
-CARRIERS = "carriers_hz"
-"""Key of the carriers where there are several."""
+HEADING, CARRIERS = "heading", "carriers_hz"
+"""Keys of the arrays: whether headings are used, and the carriers where there are several."""
 
 
 class Single(Protocol):
@@ -26,38 +25,55 @@ class Single(Protocol):
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Observations [m, ...] at positions [m, 3]."""
-        ...
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that is needed to predict again."""
-        ...
+        """Arrays of a run file."""
 
 
 FitSingle = Callable[[Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
 """From a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to its model."""
 
 
-class ByReceiver:
-    """One model for each receiver, and for each carrier where the rows have several.
+def observed_rows(
+    tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None
+) -> tuple[FloatArray, NDArray[Any], FloatArray | None]:
+    """Positions [n, 3], observations [n, ...] and headings [n] of the rows without NaN.
 
-    Args:
-        name: of the method, for errors.
-        models: of the receivers in turn, and so for each carrier.
-        heading: whether they were given headings.
-        carriers_hz: of the training rows, ascending; None: one that is not told.
+    Raises:
+        InputError: no rows, none that was received, or different numbers of them.
+    """
+    positions, values = np.atleast_2d(np.asarray(tx_pos, float)), np.asarray(observation)
+    heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
+    if not (0 < len(positions) == len(values)) or (heading is not None and heading.shape != (len(values),)):
+        counts = f"{len(positions)} positions and {len(values)} observations"
+        raise InputError(f"{counts}: give one (and one heading, if any) per row, at least one")
+    received = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
+    if not received.any():
+        raise InputError(f"{len(values)} training rows: none of them was received; use another split")
+    return positions[received], values[received], None if heading is None else heading[received]
+
+
+@dataclass(frozen=True)
+class ByReceiver:
+    """A model for each receiver, and for each carrier where the rows have several.
+
+    Attributes:
+        name: name of the method, for errors.
+        models: models of the receivers in turn, and so for each carrier.
+        heading: whether the models use headings.
+        carriers_hz: carriers of the training rows, ascending; None: a single carrier.
     """
 
-    def __init__(
-        self, name: str, models: Sequence[Single], heading: bool, carriers_hz: FloatArray | None = None
-    ) -> None:
-        self.name, self.models, self.heading, self.carriers_hz = name, tuple(models), heading, carriers_hz
+    name: str
+    models: list[Single]
+    heading: bool
+    carriers_hz: FloatArray | None = None
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """What a receiver observes, [m, ...].
+        """Observations of a receiver, [m, ...].
 
         Raises:
-            InputError: positions that are not known, no headings for a model that was given some, or a carrier without
-                training rows.
+            InputError: positions or headings that are not known, or a carrier without training rows.
         """
         if not np.isfinite(inputs.tx_pos_m).all():
             raise InputError(f"{self.name}: predicts from positions; give finite x, y, z in metres for every row")
@@ -68,74 +84,75 @@ class ByReceiver:
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
             return self.models[receiver].predict(inputs.tx_pos_m, heading)
+        known, receivers = carriers_text(self.carriers_hz), len(self.models) // len(self.carriers_hz)
         if inputs.carriers_hz is None:
-            known = carriers_text(np.asarray(self.carriers_hz))
             raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
-        each = len(self.models) // len(self.carriers_hz)
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
-            place = np.flatnonzero(self.carriers_hz == carrier_hz)
-            if not len(place):
-                row, known = inputs.first_row + rows[0] + 1, carriers_text(np.asarray(self.carriers_hz))
+            number = np.flatnonzero(self.carriers_hz == carrier_hz)
+            if not len(number):
+                row = inputs.first_row + rows[0] + 1
                 raise InputError(f"{self.name}: row {row}: no training row at {carrier_hz:.10g} Hz; trained on {known}")
-            turned = None if heading is None else heading[rows]
-            return self.models[place[0] * each + receiver].predict(inputs.tx_pos_m[rows], turned)
+            model = self.models[number[0] * receivers + receiver]
+            return model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows])
 
         return by_carrier(inputs.carriers_hz, of_carrier)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that is needed to predict again."""
-        arrays = {f"{r}/{key}": value for r, one in enumerate(self.models) for key, value in one.arrays().items()}
-        carriers = {} if self.carriers_hz is None else {CARRIERS: self.carriers_hz}
-        return {HEADING: np.asarray(self.heading), **carriers, **arrays}
+        """Arrays of all models, use of headings, and carriers."""
+        arrays = {HEADING: np.asarray(self.heading)}
+        if self.carriers_hz is not None:
+            arrays[CARRIERS] = self.carriers_hz
+        for number, model in enumerate(self.models):
+            arrays |= keyed(f"{number}/", model.arrays())
+        return arrays
 
 
-def fit_each(
-    name: str, record: Record, split: Split, on_progress: OnProgress, fit: FitSingle, heading: bool = False
-) -> ByReceiver:
-    """Fit every receiver to all training rows, those of each carrier by themselves.
+def method_by_receiver(
+    name: str,
+    tasks: tuple[str, ...] | None,
+    settings: type,
+    fitter: Callable[[Record, Split, Any, int], FitSingle],
+    load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
+    source: str,
+    heading: Callable[[Record, Any], bool] = lambda record, settings: False,
+) -> Method:
+    """Entry of the registry for a method that fits every receiver to all training rows, those of each carrier alone.
 
     Args:
-        name: of the method.
-        record: its rows' positions must be known.
-        split: rows.
-        on_progress: hears of each receiver.
-        fit: of one receiver.
-        heading: use headings where the record has them.
-
-    Raises:
-        InputError: positions that are not known, or what ``fit`` raises, with the receiver's name.
+        name: name of the method.
+        tasks: tasks that it serves; None: all.
+        settings: class of its settings.
+        fitter: ``fitter(record, split, settings, seed)``: fit of one receiver.
+        load_single: the model of a receiver from its arrays.
+        source: publication.
+        heading: ``heading(record, settings)``: whether headings count where the record has them.
     """
-    rows = split.all_train
-    if not np.isfinite(record.tx_pos_m[rows]).all():
-        raise InputError(f"{record.name}: positions are not known, from which {name} predicts; choose another model")
-    turned, stated = record.tx_heading_rad if heading else None, record.carriers_hz
-    carriers = None if stated is None else np.unique(stated[rows])
-    parts = [rows] if stated is None or carriers is None else [rows[stated[rows] == one] for one in carriers]
-    models: list[Single] = []
-    for own in parts:
-        for receiver, observed in zip(record.receivers, record.observation, strict=True):
-            try:
-                models.append(
-                    fit(receiver, record.tx_pos_m[own], observed[own], None if turned is None else turned[own])
-                )
-            except InputError as error:
-                raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-            # Only now: what is refused at once is refused without a word of progress.
-            on_progress(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
-    return ByReceiver(name, models, turned is not None, carriers)
 
+    def fit(record: Record, split: Split, settings: Any, seed: int, session: FitSession) -> ByReceiver:
+        rows, stated = split.all_train, record.carriers_hz
+        known_positions(record, rows, name)
+        fit_single = fitter(record, split, settings, seed)
+        headings = record.tx_heading_rad if heading(record, settings) else None
+        carriers = None if stated is None else np.unique(stated[rows])
+        parts = (
+            [rows] if stated is None or carriers is None else [rows[stated[rows] == carrier] for carrier in carriers]
+        )
+        models: list[Single] = []
+        for part in parts:
+            turned = None if headings is None else headings[part]
+            for receiver, observed in zip(record.receivers, record.observation, strict=True):
+                try:
+                    models.append(fit_single(receiver, record.tx_pos_m[part], observed[part], turned))
+                except InputError as error:
+                    raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
+                session.report(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
+        return ByReceiver(name, models, headings is not None, carriers)
 
-def load_each(
-    name: str,
-    arrays: dict[str, NDArray[Any]],
-    record: Record,
-    load: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
-) -> ByReceiver:
-    """What `ByReceiver.arrays` returned; ``load`` makes one receiver's model."""
-    models, carriers = [], arrays.get(CARRIERS)
-    for index, receiver in enumerate(record.receivers * (1 if carriers is None else len(carriers))):
-        own = f"{index}/"
-        kept = {key.removeprefix(own): value for key, value in arrays.items() if key.startswith(own)}
-        models.append(load(receiver, kept))
-    return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
+    def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
+        carriers = arrays.get(CARRIERS)
+        receivers = record.receivers * (1 if carriers is None else len(carriers))
+        models = [load_single(receiver, under(f"{number}/", arrays)) for number, receiver in enumerate(receivers)]
+        return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
+
+    return Method(name, tasks, settings, fit, load, source, several_carriers=True)

@@ -1,4 +1,4 @@
-"""The nearest-neighbour blend: what plain interpolation of the measurements gives."""
+"""Inverse-distance weighting of the nearest measurements."""
 
 from __future__ import annotations
 
@@ -10,22 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from wrf_mi.core import InputError, Receiver, Record, Split
-from wrf_mi.core.angles import FloatArray
-
+from ...core import InputError, Receiver, Record, Split
+from ...core.angles import FloatArray
 from ...tasks import task_of
-from ...training.session import FitSession
-from ..method import Method
-from .by_receiver import ByReceiver, fit_each, load_each
-
-NAME = "idw"
+from .by_receiver import FitSingle, method_by_receiver, observed_rows
 
 
 class InverseDistance:
     """Inverse-distance weighting of the nearest training rows.
 
     A prediction is sum_i w_i y_i / sum_i w_i over the ``k`` nearest training positions with w_i = (d_i + s)^-power;
-    where training positions coincide with the one asked for and s = 0, their mean.
+    where training positions coincide with the requested position and s = 0, their mean.
 
     Args:
         k: number of neighbours, at least 1; all rows where there are fewer.
@@ -40,9 +35,7 @@ class InverseDistance:
             raise InputError(f"k = {k}: the blend needs at least one neighbour")
         if not softening_m >= 0:
             raise InputError(f"softening {softening_m} m: choose 0 or more")
-        self.k = k
-        self.power = power
-        self.softening_m = softening_m
+        self.k, self.power, self.softening_m = k, power, softening_m
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike) -> InverseDistance:
         """Keep the training rows that were observed.
@@ -54,15 +47,8 @@ class InverseDistance:
         Raises:
             InputError: no rows, none that was observed, or two different numbers of them.
         """
-        positions, values = np.asarray(tx_pos, float), np.asarray(observation)
-        if len(positions) == 0 or len(positions) != len(values):
-            raise InputError(
-                f"{len(positions)} positions and {len(values)} observations: give one per row, at least one"
-            )
-        observed = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
-        if not observed.any():
-            raise InputError(f"{len(values)} training rows: none of them was received; use another split")
-        self._tree, self._values = KDTree(positions[observed]), values[observed]
+        positions, self._values, _ = observed_rows(tx_pos, observation)
+        self._tree = KDTree(positions)
         return self
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -72,26 +58,18 @@ class InverseDistance:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> InverseDistance:
-        """What `arrays` returned."""
+        """The model that `arrays` described."""
         k, power, softening_m = map(float, arrays["settings"])
         return cls(int(k), power, softening_m).fit(arrays["tx_pos_m"], arrays["value"])
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
-        """Blend the neighbours of each position.
-
-        Args:
-            tx_pos: shape [m, 3], metres.
-            tx_heading_rad: changes nothing.
-
-        Returns:
-            Shape [m, ...], in the observations' unit and type.
-        """
+        """Observations [m, ...] at positions [m, 3] in metres; headings are not used."""
         positions = np.asarray(tx_pos, float)
         k = min(self.k, len(self._values))
         distance, neighbour = self._tree.query(positions, k=list(range(1, k + 1)))
         distance += self.softening_m
         nearest = distance[:, :1]
-        # Relative to the nearest, so that tiny distances do not overflow; coincident rows alone count.
+        # Relative to the nearest, so that tiny distances do not overflow; where rows coincide, they alone count.
         with np.errstate(divide="ignore", invalid="ignore"):
             weight = np.where(nearest > 0, (nearest / distance) ** self.power, distance == 0)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -103,7 +81,7 @@ class InverseDistance:
 
 @dataclass(frozen=True)
 class IdwSettings:
-    """Settings of the blend.
+    """Settings of inverse-distance weighting.
 
     Attributes:
         neighbours: number of training rows that are blended; null: the task's, as in the reference of every run.
@@ -116,33 +94,22 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def fit(record: Record, split: Split, settings: IdwSettings, seed: int, session: FitSession) -> ByReceiver:
-    """Keep the training rows that each receiver received.
-
-    Raises:
-        InputError: settings out of range, positions that are not known, or no row that was received.
-    """
+def _fitter(record: Record, split: Split, settings: IdwSettings, seed: int) -> FitSingle:
     task = task_of(record)
     k = task.neighbours if settings.neighbours is None else settings.neighbours
     softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
 
-    def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
+    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
         return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
 
-    return fit_each(NAME, record, split, session.report, one)
+    return single
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
-    """What `ByReceiver.arrays` returned."""
-    return load_each(NAME, arrays, record, lambda receiver, kept: InverseDistance.from_arrays(kept))
-
-
-METHOD = Method(
-    NAME,
+METHOD = method_by_receiver(
+    "idw",
     None,
     IdwSettings,
-    fit,
-    load,
+    _fitter,
+    lambda receiver, arrays: InverseDistance.from_arrays(arrays),
     "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
-    several_carriers=True,
 )

@@ -2,69 +2,84 @@
 
 An observation is a trend, a smooth field of zero mean and noise: y(x) = b(x) . beta + z(x) + e with
 Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared by all components of an observation
-(pixels, subcarriers), so that one Cholesky factor serves all of them; the variance s^2 and the trend are each
-component's own. Written over `wrf_mi.models.interpolation.kriging_equations` and not over scikit-learn's
-`GaussianProcessRegressor`, which has no trend, and whose likelihood stores a matrix of rows x rows for each component
-(6 GiB for 160 spectra).
+(pixels, subcarriers), so that one Cholesky factor serves all of them; each component has its variance s^2 and trend.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from wrf_mi.core import InputError, Prediction
-from wrf_mi.core.angles import FloatArray
-from wrf_mi.models.interpolation.kriging_equations import KERNELS, KrigingSystem, component_root, correlation
+from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core.angles import FloatArray
+from ...tasks import task_of
+from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from .kriging_equations import KERNELS, KrigingSystem, component_root, correlation
 
-Trend = Callable[[FloatArray], FloatArray]
-"""From positions [n, 3] to the columns [n, p] that the trend is a sum of."""
-
+CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)
 HEADING_LENGTH = (0.1, 100.0)
 NOISE = (1e-4, 10.0)
-"""Where the likelihood looks: metres, chords of the unit circle (2 is the opposite heading), shares of the variance."""
+"""Limits of the likelihood's maximum: metres, chords of the unit circle (2 is the opposite heading), shares of the
+variance."""
 LIKELIHOOD_EVALUATIONS = 200
 """Nelder-Mead on three logarithms settles to 0.01 in 60 to 150."""
 
 
-def constant(positions_m: FloatArray) -> FloatArray:
-    """Trend of one unknown mean."""
-    return np.ones((len(positions_m), 1))
+@dataclass(frozen=True)
+class Trend:
+    """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
 
-
-def log_distance(receiver_m: ArrayLike) -> Trend:
-    """Trend of the log-distance law a + b 10 log10(d), d the distance in metres from a receiver at [3].
+    Attributes:
+        name: ``constant`` or ``log-distance``.
+        receiver_m: position [3] from which d is the distance, metres.
 
     Source: Rappaport, "Wireless Communications" (2002), section 4.9.
     """
-    origin = np.asarray(receiver_m, float)
 
-    def columns(positions_m: FloatArray) -> FloatArray:
+    name: str
+    receiver_m: FloatArray | None = None
+
+    def __call__(self, positions_m: FloatArray) -> FloatArray:
+        """Columns [n, p] at positions [n, 3]."""
+        mean = np.ones(len(positions_m))
+        if self.receiver_m is None:
+            return mean[:, None]
         # Below 1 cm no antenna is a point; the logarithm must not diverge on a transmitter at the receiver.
-        distance = np.maximum(np.linalg.norm(positions_m - origin, axis=1), 0.01)
-        return np.stack([np.ones(len(distance)), 10 * np.log10(distance)], axis=1)
+        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), 0.01)
+        return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
-    return columns
+
+constant = Trend(CONSTANT)
+"""Trend of one unknown mean."""
+
+
+def log_distance(receiver_m: ArrayLike) -> Trend:
+    """Trend of the log-distance law at a receiver's position [3], metres."""
+    return Trend(LOG_DISTANCE, np.asarray(receiver_m, float))
+
+
+KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
+"""Attributes of `KrigedMean` that are stored as they are."""
 
 
 @dataclass(frozen=True)
 class KrigedMean:
-    """What a fitted kriging predicts: a trend and weights of the training rows' correlations.
+    """Predictions of a fitted kriging: a trend, and weights of the training rows' correlations.
 
     Attributes:
         kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
         lengths: correlation length in metres, and over headings where there are any.
-        positions_m: of the rows [n, 3].
+        positions_m: positions of the rows [n, 3].
         circle: cosine and sine of their headings [n, 2], or None.
-        coefficients: of the trend's columns for each component [p, q].
-        weights: of the rows for each component [n, q].
+        coefficients: coefficients of the trend's columns for each component [p, q].
+        weights: weights of the rows for each component [n, q].
         like: empty array of the shape and type of observations, [0, ...].
         trend: columns of the trend.
     """
@@ -88,36 +103,35 @@ class KrigedMean:
             had = "no headings" if self.circle is None else "headings"
             raise InputError(f"kriging: fitted with {had}; predict with the same")
         turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
-        asked = _coordinates(positions_m, turned, self.lengths)
-        return correlation(asked, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
+        requested = _coordinates(positions_m, turned, self.lengths)
+        return correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """As `Kriging.predict`."""
+        """Observations [m, ...], see `Kriging.predict`."""
         positions = np.atleast_2d(np.asarray(tx_pos, float))
         cross = self.correlations(positions, tx_heading_rad)
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All but the trend."""
+        """Arrays of a run file."""
         circle = np.zeros((0, 2)) if self.circle is None else self.circle
-        names = ("lengths", "positions_m", "coefficients", "weights", "like")
-        return {"kernel": np.asarray(self.kernel), "circle": circle} | {name: getattr(self, name) for name in names}
+        names = {"trend": np.asarray(self.trend.name), "kernel": np.asarray(self.kernel)}
+        return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], trend: Trend) -> KrigedMean:
-        """What `arrays` returned, with the trend."""
-        names = ("lengths", "positions_m", "coefficients", "weights", "like")
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedMean:
+        """The predictions that `arrays` described."""
         circle = arrays["circle"] if len(arrays["circle"]) else None
-        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **{name: arrays[name] for name in names})
+        trend, kept = _trend(str(arrays["trend"]), receiver), {name: arrays[name] for name in KEPT}
+        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **kept)
 
 
 class Kriging:
     """Kriging of real or complex observations over positions and, if given, headings.
 
-    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). What is None is
-    chosen by the likelihood of the training rows, in which the variance takes its best value; it is the restricted one,
-    of what the joint trend leaves free: else a trend for each component would shorten the lengths.
+    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). Arguments that are
+    None are chosen by the restricted likelihood of the training rows, with the variance at its best value.
 
     Args:
         length_m: correlation length in metres, or None.
@@ -126,9 +140,9 @@ class Kriging:
         kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
         trend: columns of the trend; one unknown mean by default.
         trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
-            kriging), which a crowd of rows in one place pulls to itself.
+            kriging), in which every row weighs the same.
         likelihood_rows: at most so many rows, drawn with ``seed``, enter the likelihood; all of them the prediction.
-        seed: of that draw.
+        seed: seed of that draw.
     """
 
     def __init__(
@@ -156,7 +170,7 @@ class Kriging:
         self.likelihood_rows, self.seed = likelihood_rows, seed
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
-        """Choose what is to be chosen and factor the covariance of the rows that were observed.
+        """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
 
         Args:
             tx_pos: shape [n, 3], metres.
@@ -167,48 +181,30 @@ class Kriging:
             InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
                 or rows that coincide while the noise is zero.
         """
-        positions, values = np.asarray(tx_pos, float), np.asarray(observation)
-        heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
-        if not (0 < len(positions) == len(values)) or (heading is not None and len(heading) != len(values)):
-            counts = f"{len(positions)} positions and {len(values)} observations"
-            raise InputError(f"{counts}: give one (and one heading, if any) per row, at least one")
-        observed = ~np.isnan(values).reshape(len(values), -1).any(axis=1)
-        if not observed.any():
-            raise InputError(f"{len(values)} training rows: none of them was received; use another split")
+        self._positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
         like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
-        wide = complex if np.iscomplexobj(values) else float
-        y = values[observed].reshape(int(observed.sum()), -1).astype(wide)
-        self._positions = positions[observed]
-        self._circle = None if heading is None else _circle(heading[observed])
+        y = values.reshape(len(values), -1).astype(complex if np.iscomplexobj(values) else float)
+        self._circle = None if heading is None else _circle(heading)
         columns = self.trend(self._positions)
         if len(y) < columns.shape[1]:
             raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
-        start = 0
+        field, ordinary = y, None
         if self.trend_fit == "ols":
-            # The field is what the least-squares trend leaves; taken as known from here on.
-            coefficients = np.linalg.lstsq(columns, y, rcond=None)[0]
-            start = columns @ coefficients
-            columns = columns[:, :0]
-        self._lengths, self.chosen_noise = self._choose(y - start, columns)
+            # The field is the residual of the least-squares trend, which is taken as known from here on.
+            ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
+            field, columns = y - columns @ ordinary, columns[:, :0]
+        self._lengths, self.chosen_noise = self._choose(field, columns)
         try:
             self._system = self._factored(slice(None), columns, self._lengths, self.chosen_noise)
         except LinAlgError:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
-        field = y - start
         beta = self._system.coefficients(field)
         weights = self._system.weights(field, beta)
-        self.mean = KrigedMean(
-            self.kernel,
-            self._lengths,
-            self._positions,
-            self._circle,
-            beta if self.trend_fit == "gls" else coefficients,
-            weights,
-            like,
-            self.trend,
-        )
+        coefficients = beta if ordinary is None else ordinary
+        rows = self._lengths, self._positions, self._circle
+        self.mean = KrigedMean(self.kernel, *rows, coefficients, weights, like, self.trend)
         quadratic = (field.conj() * weights).real.sum(axis=0)
-        # The trend's own degrees of freedom leave the residual too small by their share.
+        # The trend's degrees of freedom make the residual too small by their share.
         self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
         return self
 
@@ -219,14 +215,11 @@ class Kriging:
         return dict(zip(names, map(float, self._lengths), strict=False)) | {"noise": float(self.chosen_noise)}
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Interpolate.
+        """Interpolate: [m, ...], in the observations' unit and type.
 
         Args:
             tx_pos: shape [m, 3], metres.
             tx_heading_rad: shape [m], if and only if the fit had headings.
-
-        Returns:
-            Shape [m, ...], in the observations' unit and type.
 
         Raises:
             InputError: headings that the fit did not have, or the other way round.
@@ -255,15 +248,21 @@ class Kriging:
 
     def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
         """Lengths and noise: as given, or of the greatest likelihood."""
-        given = [self.length_m, *([] if self._circle is None else [self.heading_length]), self.noise]
-        limits = np.log([LENGTH_M, *([] if self._circle is None else [HEADING_LENGTH]), NOISE])
+        rows = np.arange(len(field))
+        if len(rows) > self.likelihood_rows:
+            rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
+        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
+        # Given value or None, limits, and first value of the search.
+        table = [
+            (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
+            (self.heading_length, HEADING_LENGTH, 1.0),
+            (self.noise, NOISE, 0.1),
+        ]
+        given, limits, first = zip(*(table if self._circle is not None else [table[0], table[2]]), strict=True)
         free = np.array([value is None for value in given])
         value = np.array([0.0 if v is None else v for v in given])
         if not free.any():
             return value[:-1], float(value[-1])
-        rows = np.arange(len(field))
-        if len(rows) > self.likelihood_rows:
-            rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
         root = component_root(field[rows])
         if not root.any():
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
@@ -277,23 +276,17 @@ class Kriging:
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
 
-        start = self._start(rows)[free]
+        start = np.log(first)[free]
         simplex = np.concatenate([start[None], start + np.eye(len(start))])
         best = minimize(
             objective,
             start,
             method="Nelder-Mead",
-            bounds=limits[free],
+            bounds=np.log(limits)[free],
             options={"initial_simplex": simplex, "maxfev": LIKELIHOOD_EVALUATIONS, "xatol": 0.01, "fatol": 0.01},
         )
         value[free] = np.exp(best.x)
         return value[:-1], float(value[-1])
-
-    def _start(self, rows: NDArray[np.intp]) -> FloatArray:
-        """Logarithms to begin from: a tenth of the extent, a chord of one, a tenth of the variance."""
-        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
-        length = np.clip(extent / 10, *LENGTH_M)
-        return np.log([length, *([] if self._circle is None else [1.0]), 0.1])
 
 
 def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: FloatArray) -> FloatArray:
@@ -305,3 +298,59 @@ def _coordinates(positions_m: FloatArray, circle: FloatArray | None, lengths: Fl
 def _circle(heading_rad: ArrayLike) -> FloatArray:
     heading = np.asarray(heading_rad, float)
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+@dataclass(frozen=True)
+class KrigingSettings:
+    """Settings of kriging. Lengths and noise that are null are those of the greatest likelihood of the training rows.
+
+    Attributes:
+        length_m: correlation length, metres, or null.
+        noise: variance of the noise as a share of the field's, or null.
+        heading_length: correlation length over headings, in chords of the unit circle, or null.
+        kernel: exponential, matern32 or gaussian.
+        trend: constant, log-distance, or null: log-distance for signal strengths, else constant.
+        trend_fit: gls (jointly with the field) or ols (before it), or null: ols for log-distance, else gls.
+        heading: whether headings count, where the data have them and hold signal strengths.
+        likelihood_rows: most rows of the likelihood.
+    """
+
+    length_m: float | None = None
+    noise: float | None = None
+    heading_length: float | None = None
+    kernel: str = "exponential"
+    trend: str | None = None
+    trend_fit: str | None = None
+    heading: bool = True
+    likelihood_rows: int = 1000
+
+
+def _trend(name: str, receiver: Receiver) -> Trend:
+    return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
+
+
+def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitSingle:
+    if s.heading_length is not None and record.tx_heading_rad is None:
+        raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
+    name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
+    how = cast(Literal["gls", "ols"], s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls"))
+    if name not in (CONSTANT, LOG_DISTANCE):
+        raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
+    given = s.length_m, s.noise, s.heading_length, s.kernel
+
+    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> KrigedMean:
+        model = Kriging(*given, _trend(name, receiver), how, s.likelihood_rows, seed)
+        return model.fit(tx_pos, observed, heading).mean
+
+    return single
+
+
+METHOD = method_by_receiver(
+    "kriging",
+    None,
+    KrigingSettings,
+    _fitter,
+    lambda receiver, arrays: KrigedMean.from_arrays(arrays, receiver),
+    "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
+    lambda record, settings: settings.heading and task_of(record).in_decibel,
+)

@@ -45,7 +45,7 @@ class KrigingSystem:
     """Covariance of n rows, factored, with the columns of a trend.
 
     Args:
-        covariance: of the field at the rows, [n, n], real or complex; overwritten.
+        covariance: covariance of the field at the rows, [n, n], real or complex; overwritten.
         noise: variance added to the diagonal, of all rows or of each [n].
         trend: columns B [n, p], or None: zero mean.
 
@@ -75,7 +75,7 @@ class KrigingSystem:
 
     @property
     def information(self) -> FloatArray:
-        """B^T K^-1 B [p, p]: inverse covariance of the trend's coefficients where nothing was known of them before."""
+        """B^T K^-1 B [p, p]: inverse covariance of the trend's coefficients without a prior."""
         return np.asarray(self._trend.conj().T @ self._trend)
 
     def projected(self, values: Values) -> Values:
@@ -93,13 +93,13 @@ class KrigingSystem:
     def variance(
         self, prior: float, cross: FloatArray, trend: FloatArray | None = None, information: FloatArray | None = None
     ) -> FloatArray:
-        """Variance of trend and field, without noise, about their prediction at m places, [m].
+        """Variance of trend and field, without noise, about their prediction at m positions, [m].
 
         Args:
-            prior: variance of the field before anything is observed.
+            prior: variance of the field without observations.
             cross: covariances with the rows [m, n], real.
-            trend: columns there [m, p]; None: zero mean.
-            information: of the trend's coefficients [p, p], where more is known of them than these rows say.
+            trend: columns at the positions [m, p]; None: zero mean.
+            information: inverse covariance of the trend's coefficients [p, p] from more than these rows.
         """
         half = self.whiten(cross.T)
         left = np.maximum(prior - np.square(half).sum(axis=0), 0)
@@ -111,7 +111,7 @@ class KrigingSystem:
 
     @property
     def precision(self) -> Values:
-        """K^-1 - K^-1 B (B^T K^-1 B)^-1 B^T K^-1, [n, n]: inverse covariance of what the trend leaves free."""
+        """K^-1 - K^-1 B (B^T K^-1 B)^-1 B^T K^-1, [n, n]: inverse covariance of contrasts free of the trend."""
         inverse = self.solve(np.eye(len(self._lower), dtype=self._lower.dtype))
         if not self.trend.shape[1]:
             return inverse
@@ -123,7 +123,7 @@ class KrigingSystem:
 
         Args:
             root: `component_root` of the observations.
-            least: sum of squares that is taken where nothing, or less, is left of the observations.
+            least: lower limit of the residual sum of squares.
         """
         half = self.whiten(root)
         basis, triangle = np.linalg.qr(self._trend)
@@ -146,15 +146,10 @@ def component_root(values: Values) -> FloatArray:
 
 
 def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, float]:
-    """Prediction of one row from all rows but a block that it belongs to.
+    """Prediction of a row of a block of rows [k], k < n, from all rows outside the block.
 
-    Args:
-        precision: of `KrigingSystem`, [n, n].
-        block: rows that are left out, [k], k < n.
-        row: one of them.
-
-    Returns:
-        Weights of the rows [n], zero in the block, and the variance of an observation about the prediction.
+    ``precision`` [n, n] is that of `KrigingSystem`. Returns the weights of the rows [n], zero in the block, and the
+    variance of an observation about the prediction.
     """
     unit = (block == row).astype(float)
     column = np.linalg.solve(precision[np.ix_(block, block)], unit)
@@ -164,11 +159,9 @@ def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, floa
 
 
 def simple_weights(covariance: FloatArray, cross: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Simple kriging of m places, each from k rows of its own: weights [m, k], and what they lower the variance by [m].
+    """Simple kriging of m positions from k rows each: weights [m, k], and the reduction of the variance [m].
 
-    Args:
-        covariance: of each place's rows, noise included, [m, k, k].
-        cross: covariances of the place with them [m, k].
+    ``covariance`` of each position's rows includes noise [m, k, k]; ``cross`` is that of the position with them [m, k].
     """
     weights = np.asarray(np.linalg.solve(covariance, cross[..., None])[..., 0], float)
     return weights, np.asarray((weights * cross).sum(axis=-1))

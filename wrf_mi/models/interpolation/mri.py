@@ -1,10 +1,8 @@
 """MRI: signal strengths by the log-distance path-loss law.
 
 P(d) = T - 10 gamma log10(d), with the power T at one metre and the exponent gamma fitted by least squares to the rows
-that were received; d is the distance between transmitter and receiver. That is what of Shin et al.'s system for
-smartphones (which also tracks the user and finds the access points) is compared with in NeRF2 and WRF-GS+. The code of
-NeRF2's authors fits one T and gamma for all receivers together; here each receiver has its own, as Shin et al. fit each
-access point, and ``shared=true`` fits one.
+that were received; d is the distance between transmitter and receiver. Each receiver has its T and gamma, as in Shin et
+al.; ``shared=true`` fits both for all receivers together, as the code of NeRF2's authors does.
 
 Source: Shin, Chon, Kim and Cha, "MRI: Model-based radio interpolation for indoor war-walking", IEEE Transactions on
 Mobile Computing 14, 1231 (2015); Rappaport, "Wireless Communications" (2002), section 4.9.
@@ -20,12 +18,8 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
-from ...training.session import FitSession
-from ..method import Method
-from .by_receiver import ByReceiver, fit_each, load_each
+from .by_receiver import FitSingle, method_by_receiver
 from .kriging import log_distance
-
-NAME = "mri"
 
 
 @dataclass(frozen=True)
@@ -33,7 +27,7 @@ class MriSettings:
     """Settings of MRI.
 
     Attributes:
-        shared: one power at a metre and one exponent for all receivers.
+        shared: whether all receivers share a power at one metre and an exponent.
     """
 
     shared: bool = False
@@ -44,7 +38,7 @@ class PathLoss:
     """The fitted law of one receiver.
 
     Attributes:
-        receiver_m: its position [3], metres.
+        receiver_m: position of the receiver [3], metres.
         law: power at one metre in dBm, and minus the exponent, [2].
     """
 
@@ -60,49 +54,32 @@ class PathLoss:
         return {"law": self.law}
 
 
-def fit(record: Record, split: Split, settings: MriSettings, seed: int, session: FitSession) -> ByReceiver:
-    """Fit the law to the training rows that were received.
-
-    Raises:
-        InputError: rows at a single distance, or none that was received.
-    """
+def _fitter(record: Record, split: Split, settings: MriSettings, seed: int) -> FitSingle:
     rows = split.all_train
-    everyone = _law(*_pairs(record, rows)) if settings.shared else None
-
-    def one(receiver: Receiver, tx_pos: FloatArray, observed: NDArray[Any], heading: FloatArray | None) -> PathLoss:
-        if everyone is not None:
-            return PathLoss(receiver.position_m, everyone)
-        known = ~np.isnan(observed)
-        return PathLoss(receiver.position_m, _law(log_distance(receiver.position_m)(tx_pos[known]), observed[known]))
-
-    return fit_each(NAME, record, split, session.report, one)
-
-
-def _pairs(record: Record, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     columns = np.stack([log_distance(receiver.position_m)(record.tx_pos_m[rows]) for receiver in record.receivers])
-    observed = np.asarray(record.observation[:, rows], float)
-    known = ~np.isnan(observed)
-    return columns[known], observed[known]
+    shared = _law(columns, record.observation[:, rows]) if settings.shared else None
+
+    def single(receiver: Receiver, tx_pos: FloatArray, observed: NDArray[Any], heading: FloatArray | None) -> PathLoss:
+        law = _law(log_distance(receiver.position_m)(tx_pos), observed) if shared is None else shared
+        return PathLoss(receiver.position_m, law)
+
+    return single
 
 
 def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
+    received = ~np.isnan(observed)
+    columns, observed = columns[received], observed[received].astype(float)
     if len(observed) < 2 or not np.ptp(columns[:, 1]) > 0:
         raise InputError(f"mri: {len(observed)} rows at one distance; an exponent shows at two or more")
-    law: FloatArray = np.linalg.lstsq(columns, np.asarray(observed, float), rcond=None)[0]
+    law: FloatArray = np.linalg.lstsq(columns, observed, rcond=None)[0]
     return law
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
-    """What `ByReceiver.arrays` returned, at the record's receivers."""
-    return load_each(NAME, arrays, record, lambda receiver, kept: PathLoss(receiver.position_m, kept["law"]))
-
-
-METHOD = Method(
-    NAME,
+METHOD = method_by_receiver(
+    "mri",
     ("rssi",),
     MriSettings,
-    fit,
-    load,
+    _fitter,
+    lambda receiver, arrays: PathLoss(receiver.position_m, arrays["law"]),
     "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss",
-    several_carriers=True,
 )

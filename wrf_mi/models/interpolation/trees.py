@@ -1,4 +1,4 @@
-"""Extremely randomised trees over position and heading: what signal strengths tell a learner without physics."""
+"""Extremely randomised trees over position and heading."""
 
 from __future__ import annotations
 
@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wrf_mi.core import InputError, Prediction, Receiver, Record, Split
-from wrf_mi.core.angles import FloatArray
-
-from ...training.session import FitSession
-from ..method import Method
-from .by_receiver import ByReceiver, fit_each, load_each
-
-NAME = "trees"
+from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core.angles import FloatArray
+from .by_receiver import FitSingle, method_by_receiver, observed_rows
 
 
 class Trees:
@@ -24,8 +19,8 @@ class Trees:
 
     Args:
         trees: number of trees.
-        leaf_rows: least number of training rows in a leaf: what averages the noise out.
-        seed: of the random cuts.
+        leaf_rows: least number of training rows in a leaf, which averages noise out.
+        seed: seed of the random cuts.
 
     Source: Geurts, Ernst and Wehenkel, "Extremely randomized trees" (2006); scikit-learn's `ExtraTreesRegressor`.
     """
@@ -44,7 +39,7 @@ class Trees:
             tx_heading_rad: shape [n], or None to leave headings out.
 
         Raises:
-            InputError: no rows, none that was observed, different numbers of them, or observations that are no numbers.
+            InputError: no rows, none that was observed, different numbers of them, or complex observations.
         """
         # It takes a second to import, and only this class needs it.
         from sklearn.ensemble import ExtraTreesRegressor
@@ -52,79 +47,57 @@ class Trees:
         values = np.asarray(observation)
         if values.ndim != 1 or np.iscomplexobj(values):
             raise InputError(f"trees: observations {values.shape} of type {values.dtype}; give one real number per row")
-        features = _features(tx_pos, tx_heading_rad)
-        if len(features) == 0 or len(features) != len(values):
-            raise InputError(
-                f"{len(features)} positions and {len(values)} observations: give one per row, at least one"
-            )
-        observed = ~np.isnan(values)
-        if not observed.any():
-            raise InputError(f"{len(values)} training rows: none of them was received; use another split")
-        self._type, self._width = np.result_type(values, np.float32), features.shape[1]
+        positions, values, heading = observed_rows(tx_pos, values, tx_heading_rad)
+        self._like = np.empty((0, 3 if heading is None else 5), np.result_type(values, np.float32))
         model = ExtraTreesRegressor(self.trees, min_samples_leaf=self.leaf_rows, random_state=self.seed)
-        self._model = model.fit(features[observed], values[observed].astype(float))
+        self.model = model.fit(_features(positions, heading, self._like), values.astype(float))
         return self
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
-        """Average of the trees.
-
-        Args:
-            tx_pos: shape [m, 3], metres.
-            tx_heading_rad: shape [m], if and only if the fit had headings.
-
-        Returns:
-            Shape [m], in the observations' unit and type.
+        """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].
 
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
-        return self._model.predict(self._asked(tx_pos, tx_heading_rad)).astype(self._type)
+        return self.model.predict(_features(tx_pos, tx_heading_rad, self._like)).astype(self._like.dtype)
 
     def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
 
         The variance within leaves and that between trees add up (law of total variance).
         """
-        features = self._asked(tx_pos, tx_heading_rad)
+        features = _features(tx_pos, tx_heading_rad, self._like)
         mean, square = np.zeros(len(features)), np.zeros(len(features))
-        for tree in self._model.estimators_:
+        for tree in self.model.estimators_:
             leaf = tree.apply(features)
             value = tree.tree_.value[leaf, 0, 0]
             mean += value / self.trees
             square += (tree.tree_.impurity[leaf] + value**2) / self.trees
-        return Prediction(mean.astype(self._type), np.sqrt(np.maximum(square - mean**2, 0)))
+        return Prediction(mean.astype(self._like.dtype), np.sqrt(np.maximum(square - mean**2, 0)))
 
     def grown(self) -> GrownTrees:
-        """The trees without what grew them."""
-        parts = [tree.tree_ for tree in self._model.estimators_]
+        """The trees as plain arrays."""
+        parts = [tree.tree_ for tree in self.model.estimators_]
         first = np.concatenate([[0], np.cumsum([part.node_count for part in parts])])
-        leaf = [part.children_left < 0 for part in parts]
+        of_tree = np.repeat(first[:-1], np.diff(first))
+        nodes = np.arange(first[-1])
+
+        def joined(name: str) -> NDArray[Any]:
+            return np.concatenate([getattr(part, name) for part in parts])
+
         # A leaf leads to itself, so that all trees can be followed for the same number of steps.
-        own = [start + np.arange(part.node_count) for start, part in zip(first, parts, strict=False)]
-        ways = [
-            np.concatenate(
-                [
-                    np.where(end, at, start + child)
-                    for start, at, end, child in zip(first, own, leaf, side, strict=False)
-                ]
-            )
-            for side in ([part.children_left for part in parts], [part.children_right for part in parts])
-        ]
+        leaf = joined("children_left") < 0
+        left, right = (np.where(leaf, nodes, of_tree + joined(f"children_{side}")) for side in ("left", "right"))
         return GrownTrees(
             root=first[:-1].astype(np.int32),
-            left=ways[0].astype(np.int32),
-            right=ways[1].astype(np.int32),
-            feature=np.concatenate([np.maximum(part.feature, 0) for part in parts]).astype(np.int8),
-            threshold=np.concatenate([part.threshold for part in parts]),
-            value=np.concatenate([part.value[:, 0, 0] for part in parts]),
+            left=left.astype(np.int32),
+            right=right.astype(np.int32),
+            feature=np.maximum(joined("feature"), 0).astype(np.int8),
+            threshold=joined("threshold"),
+            value=joined("value")[:, 0, 0],
             depth=np.asarray(max(part.max_depth for part in parts)),
-            like=np.empty((0, self._width), self._type),
+            like=self._like,
         )
-
-    def _asked(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None) -> FloatArray:
-        features = _features(tx_pos, tx_heading_rad)
-        _same_width(features, self._width)
-        return features
 
 
 @dataclass(frozen=True)
@@ -133,12 +106,12 @@ class GrownTrees:
 
     Attributes:
         root: first node of each tree.
-        left: node where a feature is at most the threshold; of a leaf itself.
-        right: node where it is more.
-        feature: that decides.
-        threshold: of it.
+        left: next node where the feature is at most the threshold; of a leaf, itself.
+        right: next node where it is more.
+        feature: number of the feature that decides.
+        threshold: threshold of the feature.
         value: mean of the training rows in the node.
-        depth: longest way from a root to a leaf.
+        depth: longest path from a root to a leaf.
         like: empty array [0, features] of the observations' type.
     """
 
@@ -152,35 +125,31 @@ class GrownTrees:
     like: NDArray[Any]
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
-        """As `Trees.predict`."""
-        features = _features(tx_pos, tx_heading_rad)
-        _same_width(features, self.like.shape[1])
+        """Average of the trees [m], as by `Trees.predict`."""
         # scikit-learn cuts features in single precision.
-        single = features.astype(np.float32)
-        rows = np.arange(len(features))
-        node = np.broadcast_to(self.root[:, None], (len(self.root), len(features)))
+        single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
+        rows = np.arange(len(single))
+        node = np.broadcast_to(self.root[:, None], (len(self.root), len(single)))
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
         return self.value[node].mean(axis=0).astype(self.like.dtype)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All of them."""
+        """Arrays of a run file."""
         return dict(vars(self))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GrownTrees:
-        """What `arrays` returned."""
+        """The trees that `arrays` described."""
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
 
 
-def _same_width(features: FloatArray, width: int) -> None:
-    if features.shape[1] != width:
-        raise InputError(f"trees: fitted {'with' if width > 3 else 'without'} headings; predict with the same")
-
-
-def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None) -> FloatArray:
+def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray[Any]) -> FloatArray:
     positions = np.atleast_2d(np.asarray(tx_pos, float))
+    if (tx_heading_rad is not None) != (like.shape[1] > 3):
+        had = "with" if like.shape[1] > 3 else "without"
+        raise InputError(f"trees: fitted {had} headings; predict with the same")
     if tx_heading_rad is None:
         return positions
     heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
@@ -204,23 +173,19 @@ class TreesSettings:
     heading: bool = True
 
 
-def fit(record: Record, split: Split, settings: TreesSettings, seed: int, session: FitSession) -> ByReceiver:
-    """Grow trees on what each receiver received.
-
-    Raises:
-        InputError: settings out of range, positions that are not known, or no row that was received.
-    """
-
-    def one(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> GrownTrees:
+def _fitter(record: Record, split: Split, settings: TreesSettings, seed: int) -> FitSingle:
+    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> GrownTrees:
         return Trees(settings.trees, settings.leaf_rows, seed).fit(tx_pos, observed, heading).grown()
 
-    return fit_each(NAME, record, split, session.report, one, settings.heading)
+    return single
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
-    """What `ByReceiver.arrays` returned."""
-    return load_each(NAME, arrays, record, lambda receiver, kept: GrownTrees.from_arrays(kept))
-
-
-SOURCE = "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'"
-METHOD = Method(NAME, ("rssi",), TreesSettings, fit, load, SOURCE, several_carriers=True)
+METHOD = method_by_receiver(
+    "trees",
+    ("rssi",),
+    TreesSettings,
+    _fitter,
+    lambda receiver, arrays: GrownTrees.from_arrays(arrays),
+    "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
+    lambda record, settings: settings.heading,
+)

@@ -1,21 +1,26 @@
 """Convolutions over images whose columns wrap around, on Dr.Jit tensors.
 
-An image batch is a tensor [channels, batch * height * width], image by image, row by row: columns are samples, as in
-`wrf_mi.gaussians.network`. A convolution gathers each pixel's neighbours (im2col) and is then one matrix product.
-Columns are azimuths and wrap; beyond the first and last row there are zeros.
+An image batch is a tensor [channels, batch * height * width], image by image, row by row. A convolution gathers each
+pixel's neighbours (im2col) and is then one matrix product. Columns are azimuths and wrap; beyond the first and last row
+there are zeros.
 
 A transposed convolution of stride two is a convolution of stride one to four times the channels, whose four parts are
-the four positions of a finer pixel (Shi et al., "Is the deconvolution layer the same as a convolutional layer?", 2016);
-a convolution of stride two is the reverse. That is how `finer` and `coarser` serve here.
+the four positions of a finer pixel (Shi et al., "Is the deconvolution layer the same as a convolutional layer?", 2016):
+`finer`. A convolution of stride two is the reverse: `coarser`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
+
+from .layers import GAIN, Linear, Module
+
+NORM_FLOOR = 1e-5
+"""Added to variances: an image may be flat."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +28,9 @@ class Grid:
     """Sizes of an image batch.
 
     Attributes:
-        batch: images.
-        height: rows.
-        width: columns.
+        batch: number of images.
+        height: rows of an image.
+        width: columns of an image.
     """
 
     batch: int
@@ -34,13 +39,27 @@ class Grid:
 
     @property
     def pixels(self) -> int:
-        """Of one image."""
+        """Pixels of one image."""
         return self.height * self.width
 
     @property
     def columns(self) -> int:
-        """Of the batch's tensor."""
+        """Columns of the batch's tensor."""
         return self.batch * self.pixels
+
+    def at(self, slot: Any) -> tuple[Any, Any, Any]:
+        """Number of the image (counting channels), row and column of flat indices."""
+        line = slot // self.width
+        image = line // self.height
+        return image, line - image * self.height, slot - line * self.width
+
+    def index(self, image: Any, row: Any, column: Any) -> Any:
+        """Flat index: the inverse of `at`."""
+        return (image * self.height + row) * self.width + column
+
+    def wrapped(self, column: Any) -> Any:
+        """A column below twice the width, modulo the width."""
+        return dr.select(column >= self.width, column - self.width, column)
 
 
 class _Patches(dr.CustomOp):
@@ -48,43 +67,28 @@ class _Patches(dr.CustomOp):
 
     def eval(self, x: Any, channels: int, grid: Grid, side: int) -> Any:
         self.sizes = channels, grid, side
-        uint = dr.uint32_array_t(type(x))
         per_tap = channels * grid.columns
-        slot = dr.arange(uint, side * side * per_tap)
+        slot = dr.arange(dr.uint32_array_t(type(x)), side * side * per_tap)
         tap = slot // per_tap
-        inside = slot - tap * per_tap
-        down, right = tap // side, tap % side
-        line = inside // grid.width
-        column = inside - line * grid.width
-        image = line // grid.height
-        row = line - image * grid.height + down
-        # The first tap looks one row up and one column left, modulo the width.
-        column = column + right + (grid.width - 1)
-        column = dr.select(column >= grid.width, column - grid.width, column)
-        column = dr.select(column >= grid.width, column - grid.width, column)
-        seen = (row >= 1) & (row <= grid.height)
-        return dr.gather(type(x), x, (image * grid.height + row - 1) * grid.width + column, seen)
+        image, row, column = grid.at(slot - tap * per_tap)
+        # The first tap looks one row up and one column left.
+        row = row + tap // side
+        column = grid.wrapped(grid.wrapped(column + tap % side + (grid.width - 1)))
+        return dr.gather(type(x), x, grid.index(image, row - 1, column), (row >= 1) & (row <= grid.height))
 
     def _adjoint(self, g: Any) -> Any:
         channels, grid, side = self.sizes
-        uint = dr.uint32_array_t(type(g))
         per_tap = channels * grid.columns
-        slot = dr.arange(uint, per_tap)
-        line = slot // grid.width
-        column = slot - line * grid.width
-        image = line // grid.height
-        row = line - image * grid.height
+        image, row, column = grid.at(dr.arange(dr.uint32_array_t(type(g)), per_tap))
         total: Any = 0
         for down in range(side):
             for right in range(side):
                 # Pixel p was tap (down, right) of the pixel one row down and one column right of p - tap.
                 above = row + 1 - down
-                seen = (row + 1 >= down) & (above < grid.height)
-                beside = column + (grid.width + 1 - right)
-                beside = dr.select(beside >= grid.width, beside - grid.width, beside)
-                beside = dr.select(beside >= grid.width, beside - grid.width, beside)
-                index = (down * side + right) * per_tap + (image * grid.height + above) * grid.width + beside
-                total = total + dr.gather(type(g), g, index, seen)
+                inside = (row + 1 >= down) & (above < grid.height)
+                beside = grid.wrapped(grid.wrapped(column + (grid.width + 1 - right)))
+                index = (down * side + right) * per_tap + grid.index(image, above, beside)
+                total = total + dr.gather(type(g), g, index, inside)
         return total
 
     def forward(self) -> None:
@@ -103,7 +107,7 @@ def patches(x: Any, grid: Grid, side: int) -> Any:
 
     Args:
         x: images [channels, columns].
-        grid: their sizes.
+        grid: sizes of the images.
         side: 3: the pixel and its eight neighbours; 2: the pixel, its neighbours above and left.
     """
     channels = x.shape[0]
@@ -111,74 +115,68 @@ def patches(x: Any, grid: Grid, side: int) -> Any:
     return type(x)(flat, (side * side * channels, grid.columns))
 
 
-def convolve(params: Mapping[str, Any], name: str, x: Any, grid: Grid, side: int = 3) -> Any:
-    """A convolution of stride one with a bias, [outputs, columns]; its matrix is ``name.hidden``."""
-    return params[f"{name}.hidden"] @ patches(x, grid, side) + params[f"{name}.bias"]
+class Convolution(Linear):
+    """A convolution of stride one with a bias, [outputs, columns]; ``side`` as in `patches`."""
+
+    def __init__(self, inputs: int, side: int, outputs: int, rng: np.random.Generator, gain: float = GAIN) -> None:
+        super().__init__(inputs * side * side, outputs, rng, gain)
+        self.side = side
+
+    def __call__(self, x: Any, grid: Grid) -> Any:
+        """Outputs of images [inputs, columns]."""
+        return super().__call__(patches(x, grid, self.side))
+
+
+class InstanceNorm(Module):
+    """Each channel of each image scaled to mean 0 and variance 1, then by learned numbers.
+
+    Source: Ulyanov, Vedaldi and Lempitsky, "Instance normalization" (2016).
+    """
+
+    def __init__(self, channels: int) -> None:
+        self.scale: Any = np.ones((channels, 1), np.float32)
+        self.bias: Any = np.zeros((channels, 1), np.float32)
+
+    def __call__(self, x: Any, grid: Grid) -> Any:
+        """Scaled images [channels, columns]."""
+        channels = x.shape[0]
+        images: Any = dr.reshape(x, (channels * grid.batch, grid.pixels))
+        mean: Any = dr.reshape(dr.mean(images, axis=1), (channels * grid.batch, 1))
+        centred = images - mean
+        variance: Any = dr.reshape(dr.mean(centred * centred, axis=1), (channels * grid.batch, 1))
+        scaled: Any = dr.reshape(centred * dr.rsqrt(variance + NORM_FLOOR), (channels, grid.columns))
+        return scaled * self.scale + self.bias
 
 
 def finer(x: Any, grid: Grid) -> tuple[Any, Grid]:
     """Four times the channels, [4 c, columns], laid out as twice the rows and columns, [c, 4 columns]."""
     fine = Grid(grid.batch, 2 * grid.height, 2 * grid.width)
     channels = x.shape[0] // 4
-    slot = dr.arange(dr.uint32_array_t(type(x.array)), channels * fine.columns)
-    line = slot // fine.width
-    column = slot - line * fine.width
-    image = line // fine.height
-    row = line - image * fine.height
+    image, row, column = fine.at(dr.arange(dr.uint32_array_t(type(x.array)), channels * fine.columns))
     part = 2 * (row % 2) + column % 2
-    index = (part * (channels * grid.batch) + image) * grid.pixels + (row // 2) * grid.width + column // 2
+    index = grid.index(part * (channels * grid.batch) + image, row // 2, column // 2)
     return type(x)(_permuted(x.array, index), (channels, fine.columns)), fine
 
 
 def coarser(x: Any, grid: Grid) -> tuple[Any, Grid]:
-    """The reverse of `finer`: each block of 2 x 2 pixels becomes one of four times the channels."""
+    """The reverse of `finer`: each block of 2 x 2 pixels becomes a pixel of four times the channels."""
     coarse = Grid(grid.batch, grid.height // 2, grid.width // 2)
     channels = x.shape[0]
-    slot = dr.arange(dr.uint32_array_t(type(x.array)), 4 * channels * coarse.columns)
-    line = slot // coarse.width
-    column = slot - line * coarse.width
-    image = line // coarse.height
-    row = line - image * coarse.height
+    image, row, column = coarse.at(dr.arange(dr.uint32_array_t(type(x.array)), 4 * channels * coarse.columns))
     part = image // (channels * grid.batch)
-    image = image - part * (channels * grid.batch)
-    index = image * grid.pixels + (2 * row + part // 2) * grid.width + 2 * column + part % 2
+    index = grid.index(image - part * (channels * grid.batch), 2 * row + part // 2, 2 * column + part % 2)
     return type(x)(_permuted(x.array, index), (4 * channels, coarse.columns)), coarse
 
 
 def resized(x: Any, grid: Grid, height: int, width: int) -> tuple[Any, Grid]:
     """Rows and columns cut off at the end, or filled up with zeros."""
     new = Grid(grid.batch, height, width)
-    slot = dr.arange(dr.uint32_array_t(type(x.array)), x.shape[0] * new.columns)
-    line = slot // width
-    column = slot - line * width
-    image = line // height
-    row = line - image * height
-    seen = (row < grid.height) & (column < grid.width)
-    index = (image * grid.height + row) * grid.width + column
-    return type(x)(_permuted(x.array, index, seen), (x.shape[0], new.columns)), new
+    image, row, column = new.at(dr.arange(dr.uint32_array_t(type(x.array)), x.shape[0] * new.columns))
+    inside = (row < grid.height) & (column < grid.width)
+    return type(x)(_permuted(x.array, grid.index(image, row, column), inside), (x.shape[0], new.columns)), new
 
 
 def _permuted(x: Any, index: Any, active: Any = True) -> Any:
-    """A gather that takes no element twice, whose reverse adds without atomics.
-
-    (`ReduceMode.Permute` would overwrite what another use of the same array sends back.)
-    """
+    """A gather that takes no element twice, so that its reverse adds without atomics."""
+    # `ReduceMode.Permute` would overwrite the gradient of another use of the same array.
     return dr.gather(type(x), x, index, active, mode=dr.ReduceMode.NoConflicts)
-
-
-def instance_norm(params: Mapping[str, Any], name: str, x: Any, grid: Grid) -> Any:
-    """Each channel of each image scaled to mean 0 and variance 1, then by learned numbers.
-
-    Source: Ulyanov, Vedaldi and Lempitsky, "Instance normalization" (2016).
-    """
-    channels = x.shape[0]
-    images: Any = dr.reshape(x, (channels * grid.batch, grid.pixels))
-    mean: Any = dr.reshape(dr.mean(images, axis=1), (channels * grid.batch, 1))
-    centred = images - mean
-    variance: Any = dr.reshape(dr.mean(centred * centred, axis=1), (channels * grid.batch, 1))
-    scaled: Any = dr.reshape(centred * dr.rsqrt(variance + NORM_FLOOR), (channels, grid.columns))
-    return scaled * params[f"{name}.scale"] + params[f"{name}.bias"]
-
-
-NORM_FLOOR = 1e-5
-"""Added to variances: an image may be flat."""

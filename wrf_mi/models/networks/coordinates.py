@@ -1,4 +1,4 @@
-"""Transmitter positions as the networks of this package see them."""
+"""Transmitter positions as inputs of networks."""
 
 from __future__ import annotations
 
@@ -38,25 +38,28 @@ class Coordinates:
         return cls(centre, max(float(np.abs(p - centre).max()), LEAST_M))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """For a checkpoint."""
+        """Arrays for a run file."""
         return {"centre_m": self.centre_m, "extent_m": np.asarray(self.extent_m)}
 
     @classmethod
     def load(cls, arrays: Mapping[str, NDArray[Any]]) -> Coordinates:
-        """What `arrays` described."""
+        """The frame that `arrays` described."""
         return cls(np.asarray(arrays["centre_m"], float), float(arrays["extent_m"]))
 
     def features(self, positions_m: ArrayLike, octaves: int, scale_m: float) -> Any:
-        """Features of positions [n, 3]: a Dr.Jit tensor [3 + 6 octaves, n].
+        """Features of positions [n, 3]: a Dr.Jit tensor [3 + 6 octaves, n], see `with_encoding`."""
+        points = to_tensor((np.asarray(positions_m, float) - self.centre_m).T)
+        return with_encoding(points, octaves, scale_m, 1 / self.extent_m)
 
-        The coordinates in units of the extent, and their positional encoding in metres (`wrf_mi.gaussians.encoding`),
-        as NeRF's code gives its network both.
-        """
-        from_centre = np.asarray(positions_m, float) - self.centre_m
-        points = to_tensor(from_centre.T)
-        return dr.concat([points * (1 / self.extent_m), encode(points, octaves, scale_m)], axis=0)
+
+def with_encoding(points: Any, octaves: int, scale_m: float, factor: Any) -> Any:
+    """Points [3, n] times a factor, and their positional encoding, [3 + 6 octaves, n].
+
+    NeRF's code gives its network both. ``scale_m`` is the unit of the encoding (`wrf_mi.gaussians.encoding`).
+    """
+    return dr.concat([points * factor, encode(points, octaves, scale_m)], axis=0)
 
 
 def feature_count(octaves: int) -> int:
-    """Rows of what `Coordinates.features` returns."""
+    """Rows of the result of `with_encoding`."""
     return 3 + encoded_size(octaves)

@@ -1,33 +1,23 @@
 """NeRF2: two networks and a march along rays, for spectra, signal strengths and channels.
 
 Source: Zhao, An, Pan and Yang, "NeRF2: neural radio-frequency radiance fields" (MobiCom 2023), and the authors' code
-(XPengZhao/NeRF2, MIT). The networks and the march are in `wrf_mi.models.networks.nerf2_march`. As in that code there
-is one pair of networks for all receivers of a record, whose rays start where each receiver is; ``shared`` says
-otherwise.
+(XPengZhao/NeRF2, MIT). The networks and the march are in `wrf_mi.models.networks.nerf2_march`. As in that code all
+receivers of a record share a pair of networks, unless ``shared`` is false. Chosen here:
 
-What the authors leave open, and what was chosen:
-
-- Work. They take 8192 rays of 64 samples and 30,000 steps (spectra), 324 rays of 32 samples for signal strengths and
-  channels, hours on a GPU. Here a step draws some transmitters and some rays and pairs each with each, because the
-  attenuation network, most of the work, sees no transmitter: by default 16 spectra x 256 rays x 4 samples. From one
-  receiver the samples of a ray tell nothing about depth, so few are enough. Signal strengths and channels take 64 rays
-  over the full sphere (theirs cover the upper half), of equal solid angle.
-- How far rays go: as far as the farthest training transmitter (theirs: 5 m, 60 m by data set).
-- Encodings: their ten octaves have periods down to 12 mm, and spectra between training positions are then noise. Fewer
-  here, over coordinates and their sines as theirs.
-- Loss: squared error, as theirs, of greys; of powers in dB (they fit the amplitude to 1 + dBm / 100, which is a linear
-  scale of dB too; here the amplitude is physical, and one offset a receiver is fitted with it); of channels.
-- Channels: with an uplink, that takes the transmitter's place, antenna by antenna, the array's centre being where all
-  rays start (theirs start at each antenna, millimetres beside). Each uplink is normalised by its own size and mean
-  phase (theirs: by the largest value of all data, held-out rows included). Without one, the position is the condition
-  and antennas are outputs.
+- A step draws some transmitters and some rays and pairs each with each, because the attenuation network, most of the
+  work, does not depend on the transmitter. The authors take 64 samples along a ray and 30,000 steps. Signal strengths
+  and channels take rays of equal solid angle over the full sphere.
+- Rays end at the farthest training transmitter (the authors': at 5 m or 60 m by data set).
+- Encodings have fewer octaves than the authors' ten, whose shortest period of 12 mm makes spectra between training
+  positions noise.
+- The loss is the squared error of greys; of powers in dB, with an offset for each receiver; of channels.
+- With an uplink, that is the condition in place of the position, antenna by antenna, divided by its size and mean
+  phase; all rays start at the array's centre. Without an uplink, antennas are outputs.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -37,38 +27,43 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...core import Record, Split
-from ...core.settings import settings_from
 from ...core.types import IntArray
-from ...gaussians.network import Weights
 from ...tasks.conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
-from ..method import Inputs, Method, inputs_of
+from ..method import (
+    Inputs,
+    Method,
+    inputs_of,
+    keyed,
+    known_positions,
+    received_rows,
+    settings_array,
+    stored_settings,
+    under,
+)
 from .coordinates import Coordinates
-from .nerf2_field import Field, Frame, Nerf2Settings, condition_of, frame_of, step_loss
-from .nerf2_march import Seen
-from .tensors import columns
-from .training import Network, keyed, opaque_rows, positions, train_network, under, usable_rows
+from .layers import columns
+from .nerf2_field import Field, Nerf2Settings, step_loss
+from .nerf2_march import Nerf2Network, Seen
+from .training import Network, opaque_rows, train_network
 
 SCORED_RAYS = 512
 """Pixels of each validation spectrum by which steps are chosen."""
 FAR_M = 10.0
-"""Where rays end if positions are not known: the size of a large room."""
+"""Length of rays if positions are not known: the size of a large room."""
 
 
 class FittedNerf2:
-    """Fields that were fitted.
+    """Fitted fields.
 
     Args:
-        settings: of NeRF2.
-        frame: of the fields.
-        networks: weights of each group of receivers.
-        shape: of one observation.
+        field: evaluation of the fields.
+        networks: networks of each group of receivers.
+        shape: shape of an observation.
     """
 
-    def __init__(self, settings: Nerf2Settings, frame: Frame, networks: list[Weights], shape: tuple[int, ...]) -> None:
-        self._settings, self._frame, self._networks, self._shape = settings, frame, networks, shape
-        self._field = Field(settings, frame)
-        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in networks]
+    def __init__(self, field: Field, networks: list[Nerf2Network], shape: tuple[int, ...]) -> None:
+        self._field, self._networks, self._shape = field, networks, shape
         self._seen: tuple[int, list[Seen]] | None = None
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
@@ -77,41 +72,38 @@ class FittedNerf2:
         Raises:
             InputError: fitted to uplink channels, and there are none.
         """
-        group = next(g for g, members in enumerate(self._frame.groups) if receiver in members)
-        params = self._params[group]
+        field = self._field
+        network = next(n for n, members in zip(self._networks, field.groups, strict=True) if receiver in members)
         if self._seen is None or self._seen[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
-            self._seen = receiver, self._field.look(params, receiver)
-        condition, divisor = condition_of(self._frame, self._settings, inputs, receiver)
-        values = self._field.march(params, self._seen[1], condition, receiver)
-        shape = (len(inputs), *self._shape)
-        if self._frame.task.is_complex:
-            return channels_from(values, divisor, shape)
-        return values.reshape(shape)
+            self._seen = receiver, field.look(network, receiver)
+        condition, divisor = field.condition_of(inputs, receiver)
+        values, shape = field.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
+        return channels_from(values, divisor, shape) if field.task.is_complex else values.reshape(shape)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
-        own = {
-            "settings": np.asarray(json.dumps(asdict(self._settings))),
-            "far_m": np.asarray(self._frame.far_m),
-            "scales": self._frame.scales,
+        field = self._field
+        arrays = {
+            "settings": settings_array(field.settings),
+            "far_m": np.asarray(field.far_m),
+            "scales": field.scales,
+            **keyed("frame/", field.coordinates.arrays()),
         }
-        own |= keyed("frame", self._frame.coordinates.arrays())
-        for g, weights in enumerate(self._networks):
-            own |= keyed(f"group{g}", weights)
-        return own
+        for g, network in enumerate(self._networks):
+            arrays |= keyed(f"group{g}/", network.arrays())
+        return arrays
 
 
 def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, session: FitSession) -> FittedNerf2:
     """Fit the networks.
 
     Raises:
-        InputError: positions or poses that the data do not tell, a receiver without training rows, or an uplink of
-            others.
+        InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
     """
     known = split.all_train
     outputs = outputs_of(record)
-    where = record.tx_pos_m[known] if outputs.by_uplink else positions(record, "nerf2")[known]
+    where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
     known_rx = np.stack([receiver.position_m for receiver in record.receivers])
     rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
     if np.isfinite(where).all() and np.isfinite(known_rx).all():
@@ -119,30 +111,30 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, sessio
     else:
         where, farthest = rx, FAR_M
     scales = channel_scales(record, known)
-    frame = frame_of(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    field = Field(settings, frame)
-    networks = [_fit_group(record, split, field, seed, session, members) for members in frame.groups]
-    return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
+    field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
+    networks = [_fit_group(record, split, field, seed, session, members) for members in field.groups]
+    return FittedNerf2(field, networks, record.observation.shape[2:])
 
 
 def _fit_group(
     record: Record, split: Split, field: Field, seed: int, session: FitSession, members: tuple[int, ...]
-) -> Weights:
-    s, frame, outputs = field.settings, field.frame, field.frame.outputs
+) -> Nerf2Network:
+    s, outputs = field.settings, field.outputs
     known = split.all_train
     # From here on rows count within the training rows.
-    rows = {r: tuple(np.searchsorted(known, part) for part in usable_rows(record, split, r, "nerf2")) for r in members}
+    rows = {
+        r: tuple(np.searchsorted(known, part) for part in received_rows(record, split, r, "nerf2")) for r in members
+    }
     rng = np.random.default_rng([seed, *members])
-    condition, _ = condition_of(frame, s, inputs_of(record, known), members[0])
-    truth = np.concatenate([truth_of(record, outputs, r, known, frame.scales) for r in range(len(record.receivers))])
+    condition, _ = field.condition_of(inputs_of(record, known), members[0])
+    truth = np.concatenate([truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))])
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
-    weights = s.networks.init(condition.shape[0], outputs.count, rng)
-    weights["offset"] = np.zeros(len(record.receivers), np.float32)
-    if frame.task.in_decibel:
+    initial = field.initial(rng)
+    if field.task.in_decibel:
         for r in members:
-            weights["offset"][r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
-    n_rays, spectrum = frame.directions.shape[1], frame.task.image
+            initial.offset[r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
+    n_rays, spectrum = field.n_rays, field.task.image
     config = s if spectrum else replace(s, batch=s.sphere_batch)
     all_rays = opaque_rows(np.arange(n_rays))
 
@@ -150,18 +142,18 @@ def _fit_group(
         rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
-    def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
-        return step_loss(params, data, given, frame, s)
+    def loss(network: Nerf2Network, data: Any, given: Any) -> Any:
+        return step_loss(network, data, given, field)
 
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
-    def score(params: Mapping[str, Any]) -> float:
+    def score(network: Nerf2Network) -> float:
         errors = []
         for r in members:
             validation = conditions_of(rows[r][1], outputs)
             if len(validation):
-                seen = field.look(params, r, scored if spectrum else None)
-                found = field.march(params, seen, columns(condition, opaque_rows(validation)), r)
+                seen = field.look(network, r, scored if spectrum else None)
+                found = field.march(network, seen, columns(condition, opaque_rows(validation)), r)
                 wanted = truth[r * condition.shape[1] + validation]
                 errors.append(np.square(found - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
@@ -170,25 +162,20 @@ def _fit_group(
     everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
-    ends = train, everything, score if able else None, "mean squared error"
-    network = Network(name, weights, loss, data, draw, *ends)
-    return train_network(network, config, (seed, *members), session)[0]
+    score_or_none = score if able else None
+    network = Network(name, initial, loss, data, draw, train, everything, score_or_none, "mean squared error")
+    trained: Nerf2Network = train_network(network, config, (seed, *members), session)[0]
+    return trained
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
-    """What `FittedNerf2.arrays` described."""
-    settings = settings_from(Nerf2Settings, json.loads(str(arrays["settings"])), "nerf2")
-    coordinates = Coordinates.load(under("frame", arrays))
-    frame = frame_of(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-    networks = [under(f"group{g}", arrays) for g in range(len(frame.groups))]
-    return FittedNerf2(settings, frame, networks, record.observation.shape[2:])
+    """The fields that `FittedNerf2.arrays` described."""
+    settings = stored_settings(Nerf2Settings, arrays, "nerf2")
+    coordinates = Coordinates.load(under("frame/", arrays))
+    field = Field(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+    networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+    return FittedNerf2(field, networks, record.observation.shape[2:])
 
 
-METHOD = Method(
-    "nerf2",
-    ("spectrum", "rssi", "csi"),
-    Nerf2Settings,
-    fit,
-    load,
-    "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code",
-)
+SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
+METHOD = Method("nerf2", ("spectrum", "rssi", "csi"), Nerf2Settings, fit, load, SOURCE)

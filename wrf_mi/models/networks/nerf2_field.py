@@ -1,12 +1,13 @@
-"""A field of NeRF2 for a record's receivers: where its rays are, what they bring, what it is fitted to.
+"""A field of NeRF2 for a record's receivers: rays, reports of the instrument, and loss.
 
 Source: see `wrf_mi.models.networks.nerf2`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -16,21 +17,21 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
-from ...core import InputError, Receiver, Record
+from ...core import InputError, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
-from ...tasks.conditions import Outputs, known_uplink, normalised_uplink, outputs_of, placed_receivers
+from ...tasks.conditions import known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import AdamConfig
 from ..method import Inputs
-from .coordinates import Coordinates
-from .nerf2_march import Networks, Rays, Seen, constant_parts, look, march
-from .tensors import columns
+from .coordinates import Coordinates, feature_count
+from .layers import columns
+from .nerf2_march import Nerf2Network, Networks, Rays, Seen, constant_parts, look, march
 from .training import NetworkSettings, network_adam, opaque_rows
 
 DB_UNIT = 10.0
-"""Decibels that make one unit of the loss of signal strengths."""
+"""Unit of the loss of signal strengths, dB."""
 POINTS_PER_CHUNK = 1 << 15
 """Points whose attenuation is evaluated together in predictions."""
 PAIRS_PER_CHUNK = 1 << 18
@@ -39,27 +40,28 @@ PAIRS_PER_CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Nerf2Settings(NetworkSettings):
-    """Settings of NeRF2, beside those of the loop.
+    """Settings of NeRF2 and of the training loop.
 
     Attributes:
         batch: spectra of a step, at most.
         networks: sizes of the networks.
         rays: pixels of a spectrum in a step.
         sphere_rays: rays over the full sphere, for signal strengths and channels.
-        sphere_batch: transmitters of a step, at most, for these two; with an uplink, antennas of transmitters.
+        sphere_batch: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of
+            transmitters.
         samples: points along a ray.
-        near_m: distance at which rays start.
-        far_m: distance at which they end; 0: that of the farthest training transmitter, or where positions are
-            not known `FAR_M`.
-        tx_octaves: of the encoding of transmitter positions.
-        shared: one pair of networks for all receivers, or else one for each.
+        near_m: distance from the receiver at which rays start, metres.
+        far_m: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions
+            are not known.
+        tx_octaves: octaves of the encoding of transmitter positions.
+        shared: whether all receivers share a pair of networks.
     """
 
     steps: int = 5000
     batch: int = 16
     validate_every: int = 500
-    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    networks: Networks = field(default_factory=Networks)
+    optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
+    networks: Networks = dataclasses.field(default_factory=Networks)
     rays: Count = 256
     sphere_rays: Count = 64
     sphere_batch: Count = 128
@@ -70,94 +72,10 @@ class Nerf2Settings(NetworkSettings):
     shared: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what is no march.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Refuse settings out of range."""
         super().__post_init__()
         if self.far_m and self.far_m <= self.near_m:
             raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
-
-
-@dataclass(frozen=True)
-class Frame:
-    """All of a fitted field but its weights.
-
-    Attributes:
-        coordinates: frame of positions.
-        far_m: where rays end.
-        scales: channels of each receiver are in units of it [n_rx].
-        outputs: what rays bring.
-        task: of the record.
-        directions: of rays in the world [n_rx, rays, 3].
-        origins: of rays [n_rx, 3].
-        groups: indices of the receivers that share networks.
-    """
-
-    coordinates: Coordinates
-    far_m: float
-    scales: FloatArray
-    outputs: Outputs
-    task: Task
-    directions: NDArray[np.float64]
-    origins: NDArray[np.float64]
-    groups: tuple[tuple[int, ...], ...]
-
-
-def world_directions(record: Record, receivers: Sequence[Receiver], sphere_rays: int) -> FloatArray:
-    """Unit vectors of each receiver's rays in the world's frame, [n_rx, rays, 3].
-
-    Those of the pixels for spectra (`wrf_mi.core.angles`), else ``sphere_rays`` over the full sphere.
-    """
-    if task_of(record).image:
-        height, width = record.observation.shape[-2:]
-        own = pixel_directions(height, width).reshape(-1, 3)
-    else:
-        own = fibonacci_sphere(sphere_rays)
-    return np.stack([own @ receiver.to_world.T for receiver in receivers])
-
-
-def frame_of(
-    record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
-) -> Frame:
-    """The frame for a record's receivers.
-
-    Raises:
-        InputError: a receiver without a pose that is needed.
-    """
-    everyone = tuple(range(len(record.receivers)))
-    outputs = outputs_of(record)
-    receivers = placed_receivers(record, outputs.by_uplink)
-    return Frame(
-        coordinates,
-        far_m,
-        scales,
-        outputs,
-        task_of(record),
-        world_directions(record, receivers, settings.sphere_rays),
-        np.stack([receiver.position_m for receiver in receivers]),
-        (everyone,) if settings.shared else tuple((r,) for r in everyone),
-    )
-
-
-def device_data(frame: Frame, settings: Nerf2Settings) -> dict[str, Any]:
-    """What every evaluation needs, on the device: rays of all receivers, and the parts of `Rays` that all share."""
-    c = frame.coordinates
-    parts = constant_parts(
-        frame.origins[0],
-        c.centre_m,
-        float(np.abs(frame.origins - c.centre_m).max()) + frame.far_m,
-        settings.near_m,
-        frame.far_m,
-        settings.samples,
-        frame.outputs.frequencies_hz,
-    )
-    data = {name: to_tensor(values) for name, values in parts.items()}
-    data["origin"] = to_tensor((frame.origins - c.centre_m).T)
-    data["direction"] = to_tensor(frame.directions.reshape(-1, 3).T)
-    dr.make_opaque(data)
-    return data
 
 
 def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> Rays:
@@ -166,117 +84,153 @@ def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> 
     return Rays(columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver), **shared)
 
 
-def report(params: Mapping[str, Any], parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
-    """What the instrument reports, from the rays' flat parts [outputs * batch * rays]; a tensor.
+def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
+    """Report of the instrument, from the rays' flat parts [outputs * batch * rays]; a tensor.
 
     Greys [batch, rays]; powers in dBm [batch, 1]; channels' real parts, then imaginary ones, [batch, 2 outputs].
     """
     outputs, batch, rays = shape
     re, im = parts
-    tensor = type(params["offset"])
+    tensor = type(offset)
     if task.image:
         return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
-    # Of equal solid angle; the root keeps incoherent sums at one size for any number of rays.
+    # Rays have equal solid angles; the root makes the size of incoherent sums independent of the number of rays.
     re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
     if task.in_decibel:
-        offset = dr.gather(type(re), params["offset"].array, rx)
-        power = offset + float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
-        return tensor(power, (batch, 1))
+        decibels = float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
+        return tensor(dr.gather(type(re), offset.array, rx) + decibels, (batch, 1))
     both = tensor(dr.concat([re, im]), (2 * outputs, batch))
     return dr.moveaxis(both, 0, 1)
 
 
-def step_loss(
-    params: Mapping[str, Any], data: Mapping[str, Any], given: Mapping[str, Any], frame: Frame, s: Nerf2Settings
-) -> Any:
-    """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
-
-    Args:
-        params: weights.
-        data: of `device_data`, with ``condition`` [features, n] and ``truth`` [n_rx * n, values].
-        given: ``rows``, ``rays`` and ``receiver``, indices.
-        frame: of the field.
-        s: settings.
-    """
-    tensor, rays = type(data["direction"]), dr.width(given["rays"])
-    seen = look(s.networks, params, rays_of(data, given["receiver"], given["rays"], frame.directions.shape[1]))
-    condition = columns(data["condition"], given["rows"])
-    batch = condition.shape[1]
-    parts = march(params, seen, condition, s.samples)
-    predicted = report(params, parts, frame.task, (frame.outputs.count, batch, rays), given["receiver"])
-    values = data["truth"].shape[1]
-    asked = predicted.shape[1]
-    slot = dr.arange(type(given["rows"]), batch * asked)
-    row = dr.gather(type(slot), given["rows"], slot // asked) + given["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), given["rays"], slot % asked) if frame.task.image else slot % asked
-    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, asked))
-    error = predicted - truth
-    if frame.task.in_decibel:
-        error = error * (1 / DB_UNIT)
-    return dr.mean(error * error, axis=None).array
-
-
 class Field:
-    """A field that predicts: networks with their rays, and what its points were found to be.
+    """All of a fitted field but its weights, and its evaluation in two steps that are recorded once.
+
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
 
     Args:
-        settings: of NeRF2.
-        frame: of the field.
+        record: data with the receivers.
+        settings: settings of NeRF2.
+        coordinates: frame of positions.
+        far_m: distance at which rays end, metres.
+        scales: unit of each receiver's channels [n_rx].
+
+    Attributes:
+        outputs: complex numbers that a ray brings.
+        task: task of the record.
+        n_rays: rays of a receiver.
+        groups: indices of the receivers that share networks.
+        data: constants of every evaluation on the device: rays of all receivers, and the shared parts of `Rays`.
+        network: networks whose weights are to be replaced.
+
+    Raises:
+        InputError: a receiver without a pose that is needed.
     """
 
-    def __init__(self, settings: Nerf2Settings, frame: Frame) -> None:
-        self.settings, self.frame = settings, frame
-        self.data = device_data(frame, settings)
-        s, count = settings, frame.directions.shape[1]
+    def __init__(
+        self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
+    ) -> None:
+        self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
+        self.outputs, self.task = outputs_of(record), task_of(record)
+        receivers = placed_receivers(record, self.outputs.by_uplink)
+        everyone = tuple(range(len(receivers)))
+        self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
+        if self.task.image:
+            rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
+        else:
+            rays = fibonacci_sphere(settings.sphere_rays)
+        self.n_rays = len(rays)
+        self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
+        origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
+        extent_m, frequencies_hz = float(np.abs(origins).max()) + far_m, self.outputs.frequencies_hz
+        parts = {
+            **constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz),
+            "origin": origins.T,
+            "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
+        }
+        self.data = {name: to_tensor(values) for name, values in parts.items()}
+        dr.make_opaque(self.data)
+        self.network = self.initial(np.random.default_rng(0))
+        network, s = self.network, settings
 
         @Recorded
-        def looked(params: dict[str, Any], data: dict[str, Any], receiver: Any, picked: Any) -> Any:
+        def looked(params: dict[str, Any], rays: Rays) -> Any:
             with dr.suspend_grad():
-                return look(s.networks, params, rays_of(data, receiver, picked, count))
+                return look(network.with_state(params), rays)
 
         @Recorded
         def marched(params: dict[str, Any], seen: Seen, condition: Any, receiver: Any) -> Any:
             with dr.suspend_grad():
-                batch, rays = condition.shape[1], seen.own.shape[1] // s.samples
-                parts = march(params, seen, condition, s.samples)
-                return report(params, parts, frame.task, (frame.outputs.count, batch, rays), receiver)
+                batch, rays = condition.shape[1], seen.first.shape[1] // s.samples
+                parts = march(network.with_state(params), seen, condition, s.samples)
+                return report(params["offset"], parts, self.task, (self.outputs.count, batch, rays), receiver)
 
         self._looked, self._marched = looked, marched
 
-    def look(self, params: Mapping[str, Any], receiver: int, rays: IntArray | None = None) -> list[Seen]:
-        """What the points of a receiver's rays, all by default, are: in parts for spectra, else in one."""
-        everything = np.arange(self.frame.directions.shape[1]) if rays is None else rays
-        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
-        count = -(-len(everything) // most) if self.frame.task.image else 1
-        index = dr.opaque(mi.UInt32, receiver)
-        return [
-            self._looked(dict(params), self.data, index, opaque_rows(part))
-            for part in np.array_split(everything, count)
-        ]
+    def initial(self, rng: np.random.Generator) -> Nerf2Network:
+        """Networks with random weights."""
+        receivers = sum(len(members) for members in self.groups)
+        return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
-    def march(self, params: Mapping[str, Any], seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
-        """What the instrument reports for conditions [features, m]: [m, values]."""
+    def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
+        """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
+        index = dr.opaque(mi.UInt32, receiver)
+        everything = np.arange(self.n_rays) if rays is None else rays
+        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
+        chunks = np.array_split(everything, -(-len(everything) // most) if self.task.image else 1)
+        parts = [rays_of(self.data, index, opaque_rows(chunk), self.n_rays) for chunk in chunks]
+        # Shapes of results are recorded for the shapes of tensors, and not of arrays.
+        dr.eval(parts)
+        return [self._looked(network.state(), part) for part in parts]
+
+    def march(self, network: Nerf2Network, seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
+        """Reports of the instrument for conditions [features, m]: [m, values]."""
         m, index = condition.shape[1], dr.opaque(mi.UInt32, receiver)
         blocks = []
-        at_once = max(1, PAIRS_PER_CHUNK // max(part.own.shape[1] for part in seen))
-        for first in range(0, m, at_once):
-            chosen = columns(condition, opaque_rows(np.arange(first, min(m, first + at_once))))
+        at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in seen))
+        for start in range(0, m, at_once):
+            chosen = columns(condition, opaque_rows(np.arange(start, min(m, start + at_once))))
             dr.eval(chosen)
-            reports = [self._marched(dict(params), part, chosen, index).numpy() for part in seen]
+            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in seen]
             blocks.append(np.concatenate(reports, axis=1))
         return np.concatenate(blocks)
 
+    def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
+        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
 
-def condition_of(
-    frame: Frame, settings: Nerf2Settings, inputs: Inputs, receiver: int
-) -> tuple[Any, NDArray[Any] | float]:
-    """What the radiance network knows of transmitters [features, m], and what channels are multiplied by.
+        Raises:
+            InputError: no uplink, where one is needed.
+        """
+        if self.outputs.by_uplink:
+            features, divisor = normalised_uplink(known_uplink(inputs.uplink))
+            return to_tensor(features.T), divisor
+        s = self.settings
+        where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
+        return where, float(self.scales[receiver])
 
-    Raises:
-        InputError: no uplink, where one is needed.
+
+def step_loss(network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], field: Field) -> Any:
+    """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
+
+    Args:
+        network: both networks.
+        data: `Field.data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
+        given: ``rows``, ``rays`` and ``receiver``, indices.
+        field: field to be trained.
     """
-    if frame.outputs.by_uplink:
-        features, divisor = normalised_uplink(known_uplink(inputs.uplink))
-        return to_tensor(features.T), divisor
-    where = frame.coordinates.features(inputs.tx_pos_m, settings.tx_octaves, settings.networks.scale_m)
-    return where, float(frame.scales[receiver])
+    tensor, rays = type(data["direction"]), dr.width(given["rays"])
+    seen = look(network, rays_of(data, given["receiver"], given["rays"], field.n_rays))
+    condition = columns(data["condition"], given["rows"])
+    batch = condition.shape[1]
+    parts = march(network, seen, condition, field.settings.samples)
+    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), given["receiver"])
+    values = data["truth"].shape[1]
+    reported = predicted.shape[1]
+    slot = dr.arange(type(given["rows"]), batch * reported)
+    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
+    column = dr.gather(type(slot), given["rays"], slot % reported) if field.task.image else slot % reported
+    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
+    error = predicted - truth
+    if field.task.in_decibel:
+        error = error * (1 / DB_UNIT)
+    return dr.mean(error * error, axis=None).array

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -14,30 +13,25 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_float, to_tensor
 from ...core import Record, Split
-from ...core.settings import settings_from
-from ...gaussians.network import Weights
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
-from ..method import Inputs, Method
+from ..method import Inputs, Method, keyed, known_positions, received_rows, settings_array, stored_settings, under
 from .coordinates import Coordinates
-from .training import Network, keyed, positions, train_network, under, usable_rows
+from .training import Network, train_network
 
 SPECTRUM = TASKS["spectrum"]
-Generate = Callable[[Mapping[str, Any], Any, Any, tuple[int, int]], Any]
-"""Parameters, settings, features of positions [features, m] and a spectrum's height and width give greys
-[m * height * width], a flat Dr.Jit array."""
 
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """What a receiver's network learns from: rows that train, then those that choose.
+    """Rows that a receiver's network learns from, and after them those that choose the number of steps.
 
     Attributes:
-        receiver: its name.
+        receiver: name of the receiver.
         spectra: greys [n, height, width].
         where: features of the transmitters [features, n].
-        train: how many rows train while the others choose.
+        train: number of rows that train while the others choose.
     """
 
     receiver: str
@@ -50,25 +44,19 @@ class ReceiverRows:
         """Height and width of a spectrum."""
         return int(self.spectra.shape[1]), int(self.spectra.shape[2])
 
-    def network(self, kind: str, weights: Weights, loss: Any, data: Any, draw: Any, score: Any) -> Network:
-        """What is trained on these rows, see `Network`."""
-        train, everything = [np.arange(self.train)], [np.arange(len(self.spectra))]
-        ends = weights, loss, data, draw, train, everything, score
-        return Network(f"{kind} {self.receiver}", *ends, SPECTRUM.label, SPECTRUM.higher_is_better)
-
-    def score(self, generate: Generate, settings: Any) -> Callable[[Mapping[str, Any]], float] | None:
-        """Median structural similarity of the rows that choose; None without such rows."""
+    def network(self, kind: SpectrumNetwork, module: Any, loss: Any, data: Any, draw: Any) -> Network:
+        """Training of a network on these rows, scored by the median structural similarity of those that choose."""
         count = len(self.spectra) - self.train
-        if not count:
-            return None
-        asked, truth = to_tensor(self.where.numpy()[:, self.train :]), to_float(self.spectra[self.train :])
 
-        def of(params: Mapping[str, Any]) -> float:
+        def score(module: Any) -> float:
+            asked, truth = to_tensor(self.where.numpy()[:, self.train :]), to_float(self.spectra[self.train :])
             with dr.suspend_grad():
-                predicted = generate(params, settings, asked, self.shape)
+                predicted = getattr(module, kind.generator).spectra(asked)
             return float(np.median(ssim(predicted, truth, count, *self.shape).numpy()))
 
-        return of
+        rows = [np.arange(self.train)], [np.arange(len(self.spectra))], score if count else None
+        name = f"{kind.name} {self.receiver}"
+        return Network(name, module, loss, data, draw, *rows, SPECTRUM.label, SPECTRUM.higher_is_better)
 
 
 @dataclass(frozen=True)
@@ -76,96 +64,85 @@ class SpectrumNetwork:
     """A kind of network.
 
     Attributes:
-        name: of the method.
+        name: name of the method.
         settings: class of its settings, which have ``octaves`` and ``scale_m``.
-        network: what is trained, from a receiver's rows, settings and a generator of random numbers.
-        generate: spectra of positions by its weights.
-        generator: prefix of the weights that it needs.
+        network: training of a network, from a receiver's rows, settings and a generator of random numbers.
+        make: generator of spectra from settings, a spectrum's height and width, and random numbers; its method
+            ``spectra`` makes greys [m * height * width], a flat array, from features of positions [features, m].
+        generator: attribute of the trained network that is such a generator; no other part is stored.
         at_once: spectra that are predicted together, which bounds the memory.
-        source: who it is by.
+        source: publication.
     """
 
     name: str
     settings: type
     network: Callable[[ReceiverRows, Any, np.random.Generator], Network]
-    generate: Generate
+    make: Callable[[Any, tuple[int, int], np.random.Generator], Any]
     generator: str
     at_once: int
     source: str
 
     def method(self) -> Method:
-        """For the table of methods."""
+        """Entry of the registry."""
         return Method(self.name, ("spectrum",), self.settings, partial(_fit, self), partial(_load, self), self.source)
 
 
+@dataclass(frozen=True)
 class FittedNetworks:
-    """Networks that were fitted.
+    """Fitted networks.
 
-    Args:
-        kind: of network.
-        settings: of the networks.
+    Attributes:
+        kind: kind of network.
+        settings: settings of the networks.
         coordinates: frame of the positions.
-        networks: weights of each receiver's network.
+        generators: generator of each receiver.
         shape: height and width of a spectrum.
     """
 
-    def __init__(
-        self,
-        kind: SpectrumNetwork,
-        settings: Any,
-        coordinates: Coordinates,
-        networks: list[Weights],
-        shape: tuple[int, int],
-    ) -> None:
-        self._kind, self._settings, self._coordinates, self._shape = kind, settings, coordinates, shape
-        self._networks = networks
-        self._params = [{name: to_tensor(w) for name, w in weights.items()} for weights in networks]
+    kind: SpectrumNetwork
+    settings: Any
+    coordinates: Coordinates
+    generators: list[Any]
+    shape: tuple[int, int]
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """Spectra [m, height, width], float32."""
-        s, out = self._settings, np.empty((len(inputs), *self._shape), np.float32)
-        for first in range(0, len(inputs), self._kind.at_once):
-            part = slice(first, first + self._kind.at_once)
-            where = self._coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
+        s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
+        for first in range(0, len(inputs), self.kind.at_once):
+            part = slice(first, first + self.kind.at_once)
+            where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
             with dr.suspend_grad():
-                flat = self._kind.generate(self._params[receiver], s, where, self._shape)
-            out[part] = flat.numpy().reshape(-1, *self._shape)
+                out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
         return out
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
-        own = {"settings": np.asarray(json.dumps(asdict(self._settings))), "shape": np.asarray(self._shape)}
-        own |= keyed("frame", self._coordinates.arrays())
-        for r, weights in enumerate(self._networks):
-            own |= keyed(f"receiver{r}", weights)
-        return own
+        arrays = {"settings": settings_array(self.settings), "shape": np.asarray(self.shape)}
+        arrays |= keyed("frame/", self.coordinates.arrays())
+        for r, generator in enumerate(self.generators):
+            arrays |= keyed(f"receiver{r}/{self.kind.generator}.", generator.arrays())
+        return arrays
 
 
 def _fit(
     kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, session: FitSession
 ) -> FittedNetworks:
-    """Fit a network to each receiver.
-
-    Raises:
-        InputError: positions that the data do not tell, or a receiver without training rows.
-    """
-    coordinates = Coordinates.of(positions(record, kind.name)[split.all_train])
-    networks = []
+    coordinates = Coordinates.of(known_positions(record, split.all_train, kind.name))
+    generators = []
     for r, receiver in enumerate(record.receivers):
-        train, validation = usable_rows(record, split, r, kind.name)
+        train, validation = received_rows(record, split, r, kind.name)
         known = np.concatenate([train, validation])
         where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
-        own = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
-        network = kind.network(own, settings, np.random.default_rng([seed, r]))
-        weights, _ = train_network(network, settings, (seed, r), session)
-        networks.append({name: values for name, values in weights.items() if name.startswith(kind.generator)})
-    height, width = (int(side) for side in record.observation.shape[-2:])
-    return FittedNetworks(kind, settings, coordinates, networks, (height, width))
+        rows = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
+        network = kind.network(rows, settings, np.random.default_rng([seed, r]))
+        generators.append(getattr(train_network(network, settings, (seed, r), session)[0], kind.generator))
+    height, width = record.observation.shape[-2:]
+    return FittedNetworks(kind, settings, coordinates, generators, (height, width))
 
 
 def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record) -> FittedNetworks:
-    """What `FittedNetworks.arrays` described."""
-    settings: Any = settings_from(kind.settings, json.loads(str(arrays["settings"])), kind.name)
-    networks = [under(f"receiver{r}", arrays) for r in range(len(record.receivers))]
+    settings: Any = stored_settings(kind.settings, arrays, kind.name)
     height, width = (int(side) for side in arrays["shape"])
-    return FittedNetworks(kind, settings, Coordinates.load(under("frame", arrays)), networks, (height, width))
+    made = kind.make(settings, (height, width), np.random.default_rng(0))
+    generators = [made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(record.receivers))]
+    return FittedNetworks(kind, settings, Coordinates.load(under("frame/", arrays)), generators, (height, width))

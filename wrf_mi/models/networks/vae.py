@@ -1,23 +1,18 @@
 """Variational autoencoder of spatial spectra, conditioned on the transmitter's position.
 
-Source: Kingma and Welling, "Auto-encoding variational Bayes" (2014), which the WRF-GS papers name, and for the
-condition Sohn, Lee and Yan, "Learning structured output representation using deep conditional generative models"
-(2015). NeRF2, whose figures the papers compare with, says no more than that a VAE predicts spectra from positions, and
-has not released it. Chosen here:
+Source: Kingma and Welling, "Auto-encoding variational Bayes" (2014); condition: Sohn, Lee and Yan, "Learning structured
+output representation using deep conditional generative models" (2015). Chosen here:
 
-- Encoder q(z | spectrum, position) and decoder p(spectrum | z, position) are fully connected as in Kingma and Welling.
-  The encoder sees means over blocks of pixels: a spectrum of a small array has few degrees of freedom. The decoder's
-  last layer has one output a pixel, through a sigmoid.
-- Gaussian likelihood of stated deviation. Its pixels are far from independent, so that the Kullback-Leibler term is
-  weighted against the mean, not the sum, over pixels (Higgins et al. 2017, beta-VAE).
-- Predictions decode z = 0, the prior's mean. A decoder that is trained only on z from the encoder leaves to z what the
-  position could tell; Sohn et al.'s physics objective, taken here, also trains it on z from the prior.
-- Positions pass through the coordinates and their positional encoding.
+- Encoder q(z | spectrum, position) and decoder p(spectrum | z, position) are fully connected. The encoder sees means
+  over blocks of pixels; the decoder's last layer has one output a pixel, through a sigmoid.
+- The likelihood is Gaussian. Its pixels are far from independent, so the Kullback-Leibler term is weighted against the
+  mean over pixels (Higgins et al. 2017, beta-VAE).
+- Predictions decode z = 0, the prior's mean. The decoder is trained on z from the encoder and, as in Sohn et al.'s
+  hybrid objective, on z from the prior, so that it learns what the position tells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,10 +23,9 @@ from numpy.typing import NDArray
 from ...backend.device import to_tensor
 from ...core.settings import Count, Positive, Share
 from ...core.types import IntArray
-from ...gaussians.network import Weights, init_layer, linear, relu
 from .coordinates import feature_count
+from .layers import Linear, Mlp, Module, columns, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
-from .tensors import columns
 from .training import Network, NetworkSettings, opaque_rows
 
 CHUNK_SIZE = 64
@@ -40,16 +34,16 @@ CHUNK_SIZE = 64
 
 @dataclass(frozen=True)
 class VaeSettings(NetworkSettings):
-    """Settings of the variational autoencoder, beside those of the loop.
+    """Settings of the variational autoencoder and of the training loop.
 
     Attributes:
-        latent: numbers in z.
+        latent: size of z.
         width: neurons of the hidden layers.
-        last: neurons of the decoder's second hidden layer, from which each pixel is made: most weights lie behind it.
+        last: neurons of the decoder's second hidden layer, which precedes the pixels: most weights lie behind it.
         pool: largest side of the blocks of pixels whose means the encoder sees.
-        octaves: of the position's encoding.
-        scale_m: metres that make its unit (`wrf_mi.gaussians.encoding`).
-        noise: deviation of the likelihood, in grey levels from 0 to 1.
+        octaves: octaves of the position's encoding.
+        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
+        noise: standard deviation of the likelihood, in grey levels from 0 to 1.
         beta: weight of the Kullback-Leibler divergence against the mean over pixels.
         prior_share: share of the reconstruction whose z is drawn from the prior.
     """
@@ -81,89 +75,82 @@ def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
     return blocks.mean(axis=(2, 4), dtype=np.float64).reshape(n, -1).astype(np.float32)
 
 
-def initial_weights(settings: VaeSettings, cells: int, pixels: int, rng: np.random.Generator) -> Weights:
-    """Random weights of encoder (``q``) and decoder (``p``)."""
-    where, width = feature_count(settings.octaves), settings.width
-    weights = init_layer("q.0", {"image": cells, "position": where}, width, rng)
-    weights |= init_layer("q.1", {"hidden": width}, width, rng)
-    weights |= init_layer("q.out", {"hidden": width}, 2 * settings.latent, rng, gain=0.1)
-    weights |= init_layer("p.0", {"latent": settings.latent, "position": where}, width, rng)
-    weights |= init_layer("p.1", {"hidden": width}, settings.last, rng)
-    return weights | init_layer("p.out", {"hidden": settings.last}, pixels, rng, gain=1.0)
-
-
-def encoder(params: Mapping[str, Any], cells: Any, where: Any) -> tuple[Any, Any]:
-    """Mean and logarithm of the variance of q(z | spectrum, position), each [latent, batch]."""
-    hidden = relu(linear(params, "q.0", cells, "image") + params["q.0.position"] @ where)
-    out = linear(params, "q.out", relu(linear(params, "q.1", hidden)))
-    half = out.shape[0] // 2
-    return out[:half, :], out[half:, :]
-
-
-def decoder(params: Mapping[str, Any], latent: Any, where: Any) -> Any:
+class Decoder(Mlp):
     """Mean of p(spectrum | z, position), [pixels, batch], in 0..1."""
-    hidden = relu(linear(params, "p.0", latent, "latent") + params["p.0.position"] @ where)
-    out = linear(params, "p.out", relu(linear(params, "p.1", hidden)))
-    return dr.rcp(1 + dr.exp(-out))
+
+    def __init__(self, s: VaeSettings, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        first = Linear({"latent": s.latent, "position": feature_count(s.octaves)}, s.width, rng)
+        super().__init__([first, Linear(s.width, s.last, rng)], Linear(s.last, shape[0] * shape[1], rng, gain=1.0))
+        self.size = s.latent
+
+    def spectra(self, where: Any) -> Any:
+        """Spectra at the prior's mean, z = 0, a flat array, from features of positions [features, m]."""
+        pixels = sigmoid(self(latent=dr.zeros(type(where), (self.size, where.shape[1])), position=where))
+        return dr.moveaxis(pixels, 0, 1).array
 
 
-def elbo_loss(params: Mapping[str, Any], data: Any, given: Any, noise: float, beta: float, prior_share: float) -> Any:
+class Vae(Module):
+    """Encoder ``q`` and decoder ``p``."""
+
+    def __init__(self, s: VaeSettings, cells: int, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        first = Linear({"image": cells, "position": feature_count(s.octaves)}, s.width, rng)
+        self.q = Mlp([first, Linear(s.width, s.width, rng)], Linear(s.width, 2 * s.latent, rng, gain=0.1))
+        self.p = Decoder(s, shape, rng)
+
+
+def normal_divergence(mean: Any, log_variance: Any) -> Any:
+    """Sum of the divergences of N(mean, variance) from N(0, 1) (Kingma and Welling, appendix B)."""
+    return 0.5 * dr.sum(mean * mean + dr.exp(log_variance) - 1 - log_variance, axis=None)
+
+
+def elbo_loss(vae: Vae, data: Any, given: Any, s: VaeSettings) -> Any:
     """Negative evidence lower bound a pixel, mixed with the likelihood under the prior.
 
     Args:
-        params: weights.
+        vae: network.
         data: ``cells`` [cells, n], ``where`` [features, n] and ``pixels`` [pixels, n] of all rows.
         given: ``rows`` [batch] and two draws of a normal distribution, ``noise`` and ``prior`` [latent, batch].
-        noise: deviation of the likelihood.
-        beta: weight of the divergence.
-        prior_share: share of the likelihood with z from the prior.
+        s: settings.
     """
     cells, where, truth = (columns(data[name], given["rows"]) for name in ("cells", "where", "pixels"))
-    mean, log_variance = encoder(params, cells, where)
+    out = vae.q(image=cells, position=where)
+    mean, log_variance = out[: s.latent, :], out[s.latent :, :]
     latent = mean + dr.exp(0.5 * log_variance) * given["noise"]
-    # Divergence of N(mean, variance) from N(0, 1), Kingma and Welling, appendix B.
-    divergence = 0.5 * dr.sum(mean * mean + dr.exp(log_variance) - 1 - log_variance, axis=None)
+    divergence = normal_divergence(mean, log_variance)
     # One product for both, since the decoder's last matrix is the large one.
-    both = decoder(params, dr.concat([latent, given["prior"]], axis=1), dr.concat([where, where], axis=1))
-    batch = mean.shape[1]
-    error = dr.mean(dr.square(both[:, :batch] - truth), axis=None)
-    free = dr.mean(dr.square(both[:, batch:] - truth), axis=None)
-    likelihood = ((1 - prior_share) * error + prior_share * free) / (2 * noise * noise)
-    return (likelihood + (beta / batch) * divergence).array
+    latent, both = dr.concat([latent, given["prior"]], axis=1), dr.concat([where, where], axis=1)
+    greys, batch = sigmoid(vae.p(latent=latent, position=both)), mean.shape[1]
+    error = dr.mean(dr.square(greys[:, :batch] - truth), axis=None)
+    free = dr.mean(dr.square(greys[:, batch:] - truth), axis=None)
+    likelihood = ((1 - s.prior_share) * error + s.prior_share * free) / (2 * s.noise * s.noise)
+    return (likelihood + (s.beta / batch) * divergence).array
 
 
-def generate(params: Mapping[str, Any], s: VaeSettings, where: Any, shape: tuple[int, int]) -> Any:
-    """Spectra of the decoder at the prior's mean, z = 0, a flat array."""
-    pixels = decoder(params, dr.zeros(type(where), (s.latent, where.shape[1])), where)
-    return dr.moveaxis(pixels, 0, 1).array
-
-
-def network(own: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
-    """A receiver's encoder and decoder, to be trained."""
-    cells, flat = pooled(own.spectra, s.pool), own.spectra.reshape(len(own.spectra), -1)
-    data = {"cells": to_tensor(cells.T), "where": own.where, "pixels": to_tensor(flat.T)}
+def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
+    """Encoder and decoder of a receiver, to be trained."""
+    cells, flat = pooled(rows.spectra, s.pool), rows.spectra.reshape(len(rows.spectra), -1)
+    data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
     dr.make_opaque(data)
-    weights = initial_weights(s, cells.shape[1], flat.shape[1], rng)
+    vae = Vae(s, cells.shape[1], rows.shape, rng)
     # The decoder starts at the mean spectrum of the rows that it may learn from.
-    mean = np.clip(flat[: own.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
-    weights["p.out.bias"] = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
+    mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
+    assert vae.p.out is not None
+    vae.p.out.bias = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
 
-    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        noise, prior = rng.standard_normal((2, s.latent, len(rows)))
-        return {"rows": opaque_rows(rows), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+    def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        noise, prior = rng.standard_normal((2, s.latent, len(chosen)))
+        return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
 
-    def loss(params: Mapping[str, Any], data: Any, given: Any) -> Any:
-        return elbo_loss(params, data, given, s.noise, s.beta, s.prior_share)
-
-    return own.network("vae", weights, loss, data, draw, own.score(generate, s))
+    return rows.network(KIND, vae, lambda vae, data, given: elbo_loss(vae, data, given, s), data, draw)
 
 
-METHOD = SpectrumNetwork(
+KIND = SpectrumNetwork(
     "vae",
     VaeSettings,
     network,
-    generate,
-    "p.",
+    Decoder,
+    "p",
     CHUNK_SIZE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
-).method()
+)
+METHOD = KIND.method()

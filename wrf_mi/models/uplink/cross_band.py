@@ -1,31 +1,28 @@
-"""Downlink from paths of the uplink: what R2F2 and OptML share, down to which wave model suits the data.
+"""Downlink from paths of the uplink: settings and choice of the wave model, shared by R2F2 and OptML.
 
-Left open by both papers, which have a line of a few antennas far from everything and frequencies in hand: arrays whose
-size is not small against the distance of walls and users, arrays whose elements nobody wrote down, frequencies that
-nobody wrote down. What is open is chosen by the downlink of a few validation rows, among: spherical waves, plane waves
-and a gain of each antenna's own (the latter alone without elements); without frequencies, bands that follow each other
-at once or with one subcarrier between them (the carrier, which 802.11 leaves out in the middle).
+The papers have a line of a few antennas in the far field and known frequencies. For other data the wave model with the
+best downlink of a few validation rows is chosen: spherical waves, plane waves or a gain for each antenna (the latter
+without known elements). Without known frequencies, bands that follow each other at once are compared with bands with a
+subcarrier between them, the carrier of 802.11.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core import InputError, Record, Split
+from ...core.settings import Count, Positive, check
 from ...training.session import OnProgress
-from ..method import Method
-from .csi_bands import Bands, bands_of, relative_error, training_rows
-from .uplink_paths import Paths, find_paths
-from .uplink_waves import Complex, Waves, waves_of
+from .csi_bands import Bands, bands_of, known_rows, relative_error
+from .uplink_paths import find_paths
+from .uplink_waves import waves_of
 
 Kind = Literal["auto", "spherical", "plane", "free"]
 BOTH_GAPS = (1, 2)
-"""Spacings between the last uplink and the first downlink subcarrier, where the data do not tell."""
+"""Spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown."""
 
 
 @dataclass(frozen=True)
@@ -33,52 +30,39 @@ class PathSettings:
     """Settings of the search for paths.
 
     Attributes:
-        wavefront: ``spherical``, ``plane``, ``free`` (a gain of each antenna's own) or ``auto``, chosen on validation
-            rows.
+        wavefront: ``spherical``, ``plane``, ``free`` (a gain for each antenna) or ``auto``, chosen on validation rows.
         max_paths: most paths of a row.
         max_distance_m: longest path, metres.
         between: steps of refinement of all paths after each addition.
-        final: steps after the last.
-        spacing_hz: distance of subcarriers where the data do not tell; that of 802.11 at 20 MHz.
-        choice_rows: validation rows that choose what is open.
+        final: steps of refinement after the last addition.
+        spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
+        choice_rows: validation rows that choose the wave model.
     """
 
     wavefront: Kind = "auto"
-    max_paths: int = 40
-    max_distance_m: float = 100.0
+    max_paths: Count = 40
+    max_distance_m: Positive = 100.0
     between: int = 1
     final: int = 15
-    spacing_hz: float = 312.5e3
-    choice_rows: int = 16
+    spacing_hz: Positive = 312.5e3
+    choice_rows: Count = 16
 
     def __post_init__(self) -> None:
-        """Refuse what is no search.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        counts = (self.max_paths, self.choice_rows)
-        if min(counts) < 1 or min(self.between, self.final) < 0 or not self.max_distance_m > 0:
-            raise InputError(
-                f"paths: {self.max_paths} paths within {self.max_distance_m} m, {self.between} and {self.final} steps, "
-                f"{self.choice_rows} rows to choose by; choose positive numbers"
-            )
-        if self.wavefront not in ("auto", "spherical", "plane", "free"):
-            raise InputError(f"wavefront {self.wavefront!r}: choose auto, spherical, plane or free")
+        """Refuse settings out of range."""
+        check(self)
 
 
 def choose(
-    method: Method, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress
+    name: str, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress
 ) -> tuple[str, Bands]:
     """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
 
-    The median over rows and antennas counts: rows alone are few. Where nothing is open, nothing is tried. Without
-    validation rows, training rows decide.
+    The criterion is the median over rows and antennas. Without validation rows, training rows decide.
 
     Raises:
-        InputError: as `bands_of` and `training_rows`, or a wave front that needs elements where there are none.
+        InputError: as `bands_of` and `known_rows`, or a wave front that needs elements where there are none.
     """
-    train, validation = training_rows(method, record, split)
+    train, validation = known_rows(name, record, split)
     first = bands_of(record, settings.spacing_hz)
     if first.elements_m is None:
         if settings.wavefront in ("spherical", "plane"):
@@ -91,7 +75,7 @@ def choose(
         kinds = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
     options = [
         (kind, bands)
-        for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, g) for g in BOTH_GAPS])
+        for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
         for kind in kinds
     ]
     if len(options) == 1:
@@ -105,34 +89,6 @@ def choose(
         on_progress(f"choosing a wave model: {kind}", number / len(options))
         waves = waves_of(kind, bands, settings.max_distance_m)
         paths = find_paths(waves, uplink, settings.max_paths, settings.between, settings.final)
-        errors.append(float(np.median(relative_error(downlink(waves, paths, bands), truth))))
+        predicted = waves.evaluate(paths.theta, paths.gains, bands.downlink_hz)
+        errors.append(float(np.median(relative_error(predicted, truth))))
     return options[int(np.argmin(errors))]
-
-
-def downlink(waves: Waves, paths: Paths, bands: Bands) -> Complex:
-    """What paths give at the downlink's subcarriers, [n, antennas, g]."""
-    return waves.evaluate(paths.theta, paths.gains, bands.downlink_hz)
-
-
-def bands_arrays(kind: str, bands: Bands) -> dict[str, NDArray[Any]]:
-    """Arrays from which `bands_from` makes the same again."""
-    arrays = {
-        "wavefront": np.array(kind),
-        "uplink_hz": bands.uplink_hz,
-        "downlink_hz": bands.downlink_hz,
-        "antennas": np.array(bands.antennas),
-        "known": np.array(bands.known),
-    }
-    return arrays if bands.elements_m is None else arrays | {"elements_m": bands.elements_m}
-
-
-def bands_from(arrays: Mapping[str, NDArray[Any]]) -> tuple[str, Bands]:
-    """Wave model and bands of `bands_arrays`."""
-    bands = Bands(
-        arrays["uplink_hz"],
-        arrays["downlink_hz"],
-        int(arrays["antennas"]),
-        arrays.get("elements_m"),
-        bool(arrays["known"]),
-    )
-    return str(arrays["wavefront"]), bands

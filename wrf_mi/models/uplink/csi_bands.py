@@ -1,7 +1,8 @@
-"""What every method that predicts downlink from uplink coefficients is told: the two bands and the array."""
+"""The two bands and the array of data for methods that predict downlink from uplink coefficients."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +12,11 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ...datasets.observations import check_observations
-from ..checks import check_record
-from ..method import Inputs, Method
+from ..method import Inputs, received_rows
 
 FLAT = 0.01
-"""Extent of an array along a principal axis, as a share of its longest, below which it counts as flat there: the wave's
-direction along that axis cannot be told from phases of a few degrees."""
+"""Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
+wave's direction along that axis."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,10 @@ class Bands:
 
     Attributes:
         uplink_hz: frequency of each uplink subcarrier [f].
-        downlink_hz: of each downlink subcarrier [g].
+        downlink_hz: frequency of each downlink subcarrier [g].
         antennas: number of antennas.
-        elements_m: their positions about the centre of the array, along its q principal axes [antennas, q], metres;
-            None where the data do not tell.
+        elements_m: positions of the antennas about the centre of the array, along its q principal axes [antennas, q],
+            metres; None: unknown.
         known: whether the frequencies come with the data.
     """
 
@@ -41,25 +40,37 @@ class Bands:
 
     @property
     def reference_hz(self) -> float:
-        """Middle of the uplink, from which phases over frequency count."""
+        """Middle of the uplink, the reference of phases over frequency."""
         return float(self.uplink_hz.mean())
 
     @property
     def spacing_hz(self) -> float:
-        """Smallest distance of two uplink subcarriers; of a band of one, infinite."""
+        """Smallest distance of two uplink subcarriers; infinite with a single subcarrier."""
         return float(np.diff(np.sort(self.uplink_hz)).min(initial=np.inf))
+
+    def arrays(self, wavefront: str) -> dict[str, NDArray[Any]]:
+        """Arrays of a run file, with the name of a wave model."""
+        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        return {"wavefront": np.array(wavefront), **arrays}
+
+    @classmethod
+    def load(cls, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, Bands]:
+        """Wave model and bands that `arrays` described."""
+        elements_m, known = arrays.get("elements_m"), bool(arrays["known"])
+        bands = cls(arrays["uplink_hz"], arrays["downlink_hz"], int(arrays["antennas"]), elements_m, known)
+        return str(arrays["wavefront"]), bands
 
 
 def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     """The bands of a record.
 
-    Where it names no frequencies, the subcarriers are taken to be ``spacing_hz`` apart around 0 Hz, the downlink
-    ``gap`` spacings above the uplink, and the array's elements are of no use, since the wavelength is not known.
+    Without known frequencies, subcarriers are taken to be ``spacing_hz`` apart around 0 Hz, the downlink ``gap``
+    spacings above the uplink, and the array's elements are not used, since the wavelength is unknown.
 
     Raises:
-        InputError: one uplink subcarrier, frequencies for another number of them, or an array of another size.
+        InputError: a single uplink subcarrier, or an array of another size.
     """
-    assert record.uplink is not None, "see `training_rows`"
+    assert record.uplink is not None
     (antennas, up), down = record.uplink.shape[1:], record.observation.shape[3]
     if up < 2:
         raise InputError(f"{record.name}: {up} uplink subcarrier; delays show in two or more")
@@ -67,15 +78,8 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     if known:
         uplink_hz, downlink_hz = np.asarray(record.uplink_hz, float), np.asarray(record.frequencies_hz, float)
     else:
-        if not (spacing_hz > 0 and gap >= 1):
-            raise InputError(f"subcarriers {spacing_hz} Hz apart, bands {gap} spacings: both must be positive")
         uplink_hz = spacing_hz * (np.arange(up) - up - (gap - 1) / 2 + 0.5)
         downlink_hz = spacing_hz * (np.arange(down) + (gap - 1) / 2 + 0.5)
-    if len(uplink_hz) != up or len(downlink_hz) != down:
-        raise InputError(
-            f"{record.name}: {up} uplink and {down} downlink subcarriers, but {len(uplink_hz)} and {len(downlink_hz)} "
-            "frequencies; give one for each"
-        )
     array_m = record.receivers[0].array_m
     elements = None if array_m is None or not known else np.asarray(array_m, float)
     if elements is not None and elements.shape != (antennas, 3):
@@ -93,60 +97,28 @@ def principal(elements_m: FloatArray) -> FloatArray:
     return np.asarray(centred @ axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)].T)
 
 
-def training_rows(method: Method, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Rows to learn from while choosing and rows to choose by, those that were received, of a record that was checked.
-
-    Without the former, the latter are learned from.
+def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
+    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.method.received_rows`.
 
     Raises:
-        InputError: as `check_record` and `check_observations`; several receivers, no axis of antennas, or fewer than
-            two rows.
+        InputError: several receivers, no axis of antennas, or fewer than two rows.
     """
-    check_record(method, record)
-    check_observations(record, split)
     shape = record.observation.shape
     if len(shape) != 4 or shape[0] != 1:
         raise InputError(
-            f"{record.name}: channel coefficients {list(shape)}; {method.name} needs one receiver with the antennas "
+            f"{record.name}: channel coefficients {list(shape)}; {name} needs one receiver with the antennas "
             "that the uplink has, [1, rows, antennas, subcarriers]"
         )
-    seen = np.isfinite(record.observation[0]).all(axis=(1, 2))
-    train, validation = split.train[seen[split.train]], split.validation[seen[split.validation]]
-    if len(train) + len(validation) < 2:
-        raise InputError(
-            f"{record.name}: {len(train) + len(validation)} training row; {method.name} needs two at least"
-        )
-    return (train, validation) if len(train) else (validation, train)
+    return received_rows(record, split, 0, name)
 
 
-def uplink_of(inputs: Inputs, bands: Bands) -> NDArray[np.complex128]:
-    """The uplink coefficients [m, antennas, subcarriers] of rows to predict.
-
-    Raises:
-        InputError: none, of another shape, or not finite.
-    """
-    return finite_uplink(inputs, bands.antennas, len(bands.uplink_hz))
-
-
-def finite_uplink(inputs: Inputs, antennas: int, subcarriers: int) -> NDArray[np.complex128]:
-    """The same of a model that knows no frequencies.
-
-    Raises:
-        InputError: as `uplink_of`.
-    """
-    if inputs.uplink is None:
-        raise InputError("rows without uplink coefficients: give `uplink` [rows, antennas, subcarriers]")
-    expected = (antennas, subcarriers)
-    if inputs.uplink.ndim != 3 or inputs.uplink.shape[1:] != expected:
-        raise InputError(f"uplink {inputs.uplink.shape}: fitted on {expected} antennas and subcarriers a row")
-    wrong = int(np.count_nonzero(~np.isfinite(inputs.uplink)))
-    if wrong:
-        raise InputError(f"uplink: {wrong} of {inputs.uplink.size} values are not finite; correct or remove the rows")
+def uplink_of(inputs: Inputs) -> NDArray[np.complex128]:
+    """Uplink coefficients [m, antennas, subcarriers] of rows to predict, checked by `wrf_mi.models.checks`."""
     return np.asarray(inputs.uplink, complex)
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
-    """Squared error over energy of coefficients, summed over the last axis: what CEA is the logarithm of."""
+    """Squared error over energy of coefficients, summed over the last axis: CEA in linear units."""
     power = np.square(np.abs(truth)).sum(axis=-1)
     error = np.square(np.abs(prediction - truth)).sum(axis=-1)
     return np.asarray(error / np.maximum(power, np.finfo(np.float32).tiny))

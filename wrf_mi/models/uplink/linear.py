@@ -1,19 +1,13 @@
 """Linear map from uplink to downlink: the linear minimum-mean-square-error estimator, learned by ridge regression.
 
-Each antenna's downlink y [g] is its uplink x [f] times one complex matrix [f, g] that all antennas share. The matrix
-minimises the squared error over the training rows plus a penalty on its own squared entries, by the normal equations.
+Each antenna's downlink y [g] is its uplink x [f] times a complex matrix [f, g] that all antennas share. The matrix
+minimises the squared error over the training rows plus a penalty on its squared entries, by the normal equations.
 Without the penalty, and with means in place of sums, it is the estimator of Kay (below), E[x^H x]^-1 E[x^H y] for rows
-x and y. It has no offset: the phase of a radio is arbitrary, so that means are zero.
+x and y. It has no offset: the phase of a radio is arbitrary, so that means are zero. Chosen here:
 
-Chosen here:
-
-- Weights. Other methods divide uplinks by their size and mean phase (`wrf_mi.tasks.conditions`); a linear map
-  commutes with that, so only the weight of each antenna in the sums would change. An antenna's squared error counts in
-  units of its row's downlink energy, as the score (CEA) does. With antennas that were divided and all of one weight,
-  the median CEA of validation rows was 0.13 dB lower on ``traced-csi-flat`` and 0.43 dB lower on
-  ``traced-csi-office``: antennas in a fade, mostly noise, then count as much as strong ones.
-- Penalty. The one of `PENALTIES`, in units of the mean energy of an uplink coefficient, with the best median CEA of
-  the validation rows, or without these of every fifth training row. Then all training rows are fitted with it.
+- An antenna's squared error counts in units of its row's downlink energy, as the score (CEA) does.
+- The penalty of `PENALTIES`, in units of the mean energy of an uplink coefficient, has the best median CEA of the
+  validation rows, or without these of every fifth training row. Then all training rows are fitted with it.
 
 Source: Kay, "Fundamentals of statistical signal processing: estimation theory" (1993), chapter 12; Hoerl and Kennard,
 "Ridge regression: biased estimation for nonorthogonal problems", Technometrics 12, 55 (1970).
@@ -31,12 +25,12 @@ from ...core import InputError, Record, Split
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..method import Inputs, Method
-from .csi_bands import finite_uplink, relative_error, training_rows
+from .csi_bands import known_rows, relative_error, uplink_of
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
-"""That are tried: from what float64 resolves in normal equations to a map of nearly zero."""
+"""Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
 JUDGES = 5
-"""Without validation rows, one training row of so many chooses the penalty."""
+"""Without validation rows, every so-many-th training row chooses the penalty."""
 CHUNK_SIZE = 256
 """Rows whose products are added together: bounds the memory beside the data."""
 
@@ -52,42 +46,32 @@ class LinearSettings:
     penalty: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no penalty.
-
-        Raises:
-            InputError: naming the setting.
-        """
+        """Refuse a penalty out of range."""
         if self.penalty is not None and not 0 < self.penalty < np.inf:
             raise InputError(f"linear: penalty {self.penalty}; choose a positive number, or null to have it chosen")
 
 
+@dataclass(frozen=True)
 class LinearMap:
     """A fitted map.
 
-    Args:
+    Attributes:
         matrix: from uplink to downlink coefficients, [f, g].
-        antennas: of a row.
-        penalty: that was used.
+        antennas: antennas of a row.
+        penalty: penalty of the fit.
     """
 
-    def __init__(self, matrix: NDArray[np.complex128], antennas: int, penalty: float) -> None:
-        self.matrix, self.antennas, self.penalty = matrix, antennas, penalty
+    matrix: NDArray[np.complex128]
+    antennas: int
+    penalty: float
 
     def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
-        """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``.
-
-        Raises:
-            InputError: no uplink, one of another shape, or one that is not finite.
-        """
-        return (finite_uplink(inputs, self.antennas, len(self.matrix)) @ self.matrix).astype(np.complex64)
+        """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
+        return (uplink_of(inputs) @ self.matrix).astype(np.complex64)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """See `wrf_mi.models.method.Fitted`."""
-        return {
-            "matrix": self.matrix,
-            "antennas": np.asarray(self.antennas),
-            "penalty": np.asarray(self.penalty),
-        }
+        """Matrix, number of antennas and penalty."""
+        return {name: np.asarray(value) for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -97,7 +81,7 @@ class Normal:
     Attributes:
         values: eigenvalues of the uplink's products x^H x, [f].
         vectors: their eigenvectors, [f, f].
-        right: the uplink's with the downlink, x^H y, [f, g].
+        right: products of uplink and downlink, x^H y, [f, g].
     """
 
     values: NDArray[np.float64]
@@ -106,14 +90,14 @@ class Normal:
 
     @classmethod
     def of(cls, record: Record, rows: IntArray) -> Normal:
-        """Those of some rows.
+        """The normal equations of some rows.
 
         Raises:
-            InputError: a downlink without energy in all of them.
+            InputError: rows without any downlink energy.
         """
         assert record.uplink is not None
         up, down = record.uplink.shape[2], record.observation.shape[3]
-        own, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
+        left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
         for first in range(0, len(rows), CHUNK_SIZE):
             some = rows[first : first + CHUNK_SIZE]
             x, y = record.uplink[some].astype(complex), record.observation[0, some].astype(complex)
@@ -121,11 +105,11 @@ class Normal:
             # A row without energy has no relative error.
             scale = np.where(energy > 0, 1 / np.sqrt(np.where(energy > 0, energy, 1)), 0)[:, None, None]
             x, y = (x * scale).reshape(-1, up), (y * scale).reshape(-1, down)
-            own += x.conj().T @ x
+            left += x.conj().T @ x
             right += x.conj().T @ y
-        if not np.trace(own).real > 0:
+        if not np.trace(left).real > 0:
             raise InputError(f"{record.name}: no training row's downlink has any energy; use other rows")
-        return cls(*np.linalg.eigh(own), right)
+        return cls(*np.linalg.eigh(left), right)
 
     def matrix(self, penalty: float) -> NDArray[np.complex128]:
         """The map [f, g] that solves them with a penalty in units of the mean eigenvalue."""
@@ -148,13 +132,8 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
 
 
 def fit(record: Record, split: Split, settings: LinearSettings, seed: int, session: FitSession) -> LinearMap:
-    """Choose the penalty, then fit the map to all training rows; nothing is drawn.
-
-    Raises:
-        InputError: no uplink, shapes that do not fit, coefficients that are not finite, one training row, or
-            downlinks without energy.
-    """
-    train, validation = training_rows(METHOD, record, split)
+    """Choose the penalty, then fit the map to all training rows."""
+    train, validation = known_rows(METHOD.name, record, split)
     known = np.concatenate([train, validation])
     if not len(validation):
         picked = np.arange(len(train)) % JUDGES == 0
@@ -166,16 +145,9 @@ def fit(record: Record, split: Split, settings: LinearSettings, seed: int, sessi
 
 
 def load(arrays: dict[str, NDArray[Any]], record: Record) -> LinearMap:
-    """From `LinearMap.arrays`."""
+    """The map that `LinearMap.arrays` described."""
     return LinearMap(np.asarray(arrays["matrix"], complex), int(arrays["antennas"]), float(arrays["penalty"]))
 
 
-METHOD = Method(
-    name="linear",
-    tasks=("csi",),
-    settings=LinearSettings,
-    fit=fit,
-    load=load,
-    source="Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12",
-    needs_uplink=True,
-)
+SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
+METHOD = Method("linear", ("csi",), LinearSettings, fit, load, SOURCE, needs_uplink=True)

@@ -1,13 +1,13 @@
 """Propagation paths of an uplink by greedy search and nonlinear least squares, many rows at once.
 
-Paths are found one after the other where the matched filter of what is left is greatest, and after each one all paths
-found so far are refined together (Levenberg and Marquardt). A row takes no further path once the Bayesian information
-criterion of complex white noise of unknown power, 2 N log(residual energy) + freedom log(2 N) for N coefficients,
-would rise: the noise ends the search, no threshold does.
+Paths are found one after the other at the maximum of the matched filter of the residual, and after each addition all
+paths are refined together (Levenberg and Marquardt). A row takes no further path once the Bayesian information
+criterion of complex white noise of unknown power, 2 N log(residual energy) + freedom log(2 N) for N coefficients, would
+rise.
 
-Source: Vasisht et al. (2016), sections 5.2 to 5.4 (search on a grid, then refinement, paths added one by one until the
-residual tells no more); Mamandipoor et al., "Newtonized orthogonal matching pursuit" (2016) (refinement after each
-path); Schwarz, "Estimating the dimension of a model" (1978) (criterion).
+Source: Vasisht et al. (2016), sections 5.2 to 5.4 (search on a grid, then refinement); Mamandipoor et al., "Newtonized
+orthogonal matching pursuit" (2016) (refinement after each path); Schwarz, "Estimating the dimension of a model" (1978)
+(criterion).
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ T = TypeVar("T")
 
 ROWS = 16
 """Rows refined together: more leave the processor's cache."""
-ALONE = 4
+FIRST_STEPS = 4
 """Steps of refinement of a new path before all are refined."""
 ACCURACY = 1e-26
-"""Share of the energy, the square of what float64 resolves times what sums lose, at which a fit is perfect."""
-SETTLED = 1e-9
-"""Relative fall of the residual's energy below which a refinement is done."""
+"""Share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums."""
+CONVERGED = 1e-9
+"""Relative fall of the residual's energy below which a refinement has converged."""
+PARTS = ("gains", "residual", "atoms", "gram")
+"""Attributes of `Solved`."""
 
 
 @dataclass
@@ -42,8 +44,8 @@ class Paths:
 
     Attributes:
         theta: parameters [n, k, p], see `Waves`.
-        present: which of the k a row has, [n, k].
-        gains: [n, k] or [n, k, antennas].
+        present: whether a row has each of the k paths, [n, k].
+        gains: complex gains [n, k, antennas], or [n, k, 1] for all antennas.
     """
 
     theta: FloatArray
@@ -54,12 +56,7 @@ class Paths:
 def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
     """Paths of uplinks [n, antennas, f].
 
-    Args:
-        waves: wave model.
-        h: coefficients, finite.
-        max_paths: most paths of a row.
-        between: steps of refinement after each path.
-        final: steps after the last.
+    All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last.
     """
     return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final), len(h)))
 
@@ -70,11 +67,8 @@ def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, ste
 
 
 def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
-    """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use.
-
-    Products run on one thread each: those of the BLAS wait for each other by spinning, and where another process has
-    a processor the fit of a row then takes seconds.
-    """
+    """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use."""
+    # Threads of the BLAS wait for each other by spinning: with another process on a processor, a row takes seconds.
     parts = [slice(start, start + ROWS) for start in range(0, count, ROWS)]
     affinity = getattr(os, "sched_getaffinity", None)
     workers = len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -99,20 +93,20 @@ def join_paths(parts: list[Paths]) -> Paths:
 def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
     n, count = len(h), h.shape[1] * h.shape[2]
     energy = np.square(np.abs(h)).sum(axis=(1, 2))
-    # A dead antenna array has no paths; its row is predicted as zero.
+    # An uplink of zeros has no paths; its row is predicted as zero.
     active = np.flatnonzero(energy > 0)
     theta: FloatArray = np.zeros((n, 0, 1 + waves.cosines.shape[1]))
     present: Mask = np.zeros((n, 0), bool)
     best = energy.copy()
     residual = h
     for number in range(max_paths):
-        # A row that has stopped keeps its first path's parameters, masked, as a place holder that is defined.
+        # A finished row gets its first path's parameters, masked.
         fresh = strongest(waves, residual) if number == 0 else theta[:, 0].copy()
         if number:
             fresh[active] = strongest(waves, residual[active])
-        # One path alone costs little, and starts the refinement of all much nearer to its end.
-        lonely = np.ones((len(active), 1), bool)
-        fresh[active] = refine(waves, residual[active], fresh[active][:, None], lonely, ALONE)[0][:, 0]
+        # A single path costs little to refine, and brings the refinement of all nearer to convergence.
+        single = np.ones((len(active), 1), bool)
+        fresh[active] = refine(waves, residual[active], fresh[active][:, None], single, FIRST_STEPS)[0][:, 0]
         theta = np.concatenate([theta, fresh[:, None]], axis=1)
         present = np.concatenate([present, np.zeros((n, 1), bool)], axis=1)
         trial = present[active]
@@ -134,7 +128,7 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int) ->
 
 
 def _finish(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
-    """Refine, then settle the gains: a path is not stronger than the whole channel, which holds back close pairs."""
+    """Refine, then solve for gains with a prior of the channel's power, which limits the gains of close pairs."""
     count = h.shape[1] * h.shape[2]
     theta, solved = refine(waves, h, theta, present, steps)
     power = np.square(np.abs(h)).mean(axis=(1, 2))
@@ -145,7 +139,7 @@ def _finish(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: i
 
 
 def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> tuple[FloatArray, Solved]:
-    """Levenberg and Marquardt's steps on all paths of each row; a step that raises the residual is taken back."""
+    """Levenberg and Marquardt's steps on all paths of each row; a step that raises the residual is discarded."""
     theta, solved = theta.copy(), waves.solve(theta, present, h)
     damping = np.full(len(h), 1e-3)
     energy, whole = solved.energy, np.square(np.abs(h)).sum(axis=(1, 2))
@@ -153,7 +147,7 @@ def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: in
     for _ in range(steps):
         if not len(active):
             break
-        now = Solved(*(getattr(solved, name)[active] for name in ("gains", "residual", "atoms", "gram")))
+        now = Solved(*(getattr(solved, name)[active] for name in PARTS))
         normal, right = waves.normal(theta[active], now)
         diagonal = np.arange(normal.shape[1])
         scale = np.maximum(normal[:, diagonal, diagonal], 0)
@@ -166,13 +160,13 @@ def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: in
         tried = waves.solve(trial, present[active], h[active])
         left = tried.energy
         better = left < energy[active]
-        settled = better & (left > (1 - SETTLED) * energy[active])
+        converged = better & (left > (1 - CONVERGED) * energy[active])
         kept = active[better]
         theta[kept] = trial[better]
-        for name in ("gains", "residual", "atoms", "gram"):
+        for name in PARTS:
             getattr(solved, name)[kept] = getattr(tried, name)[better]
         energy[kept] = left[better]
         damping[active] = np.where(better, damping[active] / 5, damping[active] * 8).clip(1e-12, 1e6)
-        done = settled | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)
+        done = converged | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)
         active = active[~done]
     return theta, solved

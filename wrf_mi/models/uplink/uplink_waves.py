@@ -1,11 +1,11 @@
-"""Wave models of an uplink: what one propagation path gives at every antenna and subcarrier.
+"""Wave models of an uplink: coefficients of a propagation path at every antenna and subcarrier.
 
 With f0 the middle of the uplink, p_a the elements and g_k complex gains,
 
 - array: h_af = sum_k g_k (d_k / s_ka) exp(-j 2 pi / c ((f - f0) d_k + f (s_ka - d_k))), where s_ka is the distance of
   element a from the path's image source at distance d_k in the direction with cosines psi_k along the array's axes:
   s = d - p . psi for a plane wave (no amplitude factor), s^2 = d^2 - 2 d p . psi + |p|^2 for a spherical one;
-- free: h_af = sum_k g_ka exp(-j 2 pi / c (f - f0) d_k), where each antenna has its own gain.
+- free: h_af = sum_k g_ka exp(-j 2 pi / c (f - f0) d_k), with a gain for each antenna.
 
 Both are linear in the gains, which are eliminated (variable projection: Golub and Pereyra, "The differentiation of
 pseudo-inverses and nonlinear least squares problems whose variables separate", 1973, with Kaufman's simplification).
@@ -13,8 +13,9 @@ pseudo-inverses and nonlinear least squares problems whose variables separate", 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ AXIS_POINTS = 64
 FINE = 4
 """Grid points of the first search in one resolution cell of distance."""
 UNIFORM = 1e-9
-"""Spacings by which subcarriers may lie off a grid: a phase below what float64 keeps of a path of 100 m."""
+"""Distance from a grid, in spacings, of uniform subcarriers: a phase below the rounding of a path of 100 m."""
 SINGULAR = 1e-12
 """Added to normal matrices, of the power of one path: two equal paths then share their gain."""
 
@@ -41,10 +42,10 @@ class Solved:
     """Best gains for some paths.
 
     Attributes:
-        gains: [n, paths] or [n, paths, antennas].
-        residual: what they leave of the uplink [n, antennas, f].
-        atoms: what the paths give at unit gain.
-        gram: their products [n, paths, paths].
+        gains: complex gains [n, paths, antennas], or [n, paths, 1] for all antennas.
+        residual: uplink minus the paths [n, antennas, f].
+        atoms: `Waves.unit` of the paths, 0 for absent ones.
+        gram: products of the atoms [n, paths, paths].
     """
 
     gains: Complex
@@ -58,37 +59,51 @@ class Solved:
         return np.asarray(np.square(np.abs(self.residual)).sum(axis=(1, 2)))
 
 
-class Waves(Protocol):
-    """A wave model; parameters of paths are [n, paths, p], present ones marked in [n, paths]."""
+class Waves(ABC):
+    """A wave model; parameters of paths are [n, paths, p], present paths marked in [n, paths].
+
+    Attributes:
+        freedom: real numbers that describe a path, gains included.
+        grid: distances of the grid, ascending, metres.
+        cosines: directions of the grid [cells, p - 1].
+        lattice: indices of these on the lattice of directions, [cells, p - 1].
+    """
 
     freedom: int
-    """Real numbers that describe one path, gains included."""
     grid: FloatArray
-    """Distances of the grid, ascending, metres."""
     cosines: FloatArray
-    """Directions of the grid [cells, p - 1]."""
     lattice: NDArray[np.int64]
-    """Where these are on the lattice of directions, [cells, p - 1]."""
 
+    @abstractmethod
     def power(self, residual: Complex) -> FloatArray:
         """Power of a residual in each cell of the grid, [n, distances, cells]: a matched filter."""
-        ...
+
+    @abstractmethod
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, f] or, with one gain for all antennas, antennas * f."""
 
     def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
         """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
-        ...
+        atoms = self.unit(theta) * present[..., None]
+        count = atoms.shape[2]
+        left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
+        gram, diagonal = left @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
+        # The atoms of absent paths are zero: 1 on the diagonal keeps the matrix regular and their gains zero.
+        gram[:, diagonal, diagonal] += ~present
+        gains = _solve(gram, left @ right, ridge, count)
+        return Solved(gains, h - (gains.transpose(0, 2, 1) @ atoms).reshape(h.shape), atoms, gram)
 
+    @abstractmethod
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
         """Normal matrix [n, m, m] and right side [n, m] of a Gauss-Newton step of all m = paths * p parameters."""
-        ...
 
+    @abstractmethod
     def limit(self, theta: FloatArray) -> FloatArray:
-        """Parameters brought back to where the model is defined."""
-        ...
+        """Parameters limited to the domain of the model."""
 
+    @abstractmethod
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
         """Coefficients [n, antennas, frequencies]."""
-        ...
 
 
 def waves_of(kind: str, bands: Bands, max_distance_m: float) -> Waves:
@@ -99,10 +114,7 @@ def waves_of(kind: str, bands: Bands, max_distance_m: float) -> Waves:
 
 
 def distances(bands: Bands, max_distance_m: float) -> FloatArray:
-    """Distances of the first search, metres: negative ones too, as a clock may run ahead.
-
-    No further than what subcarriers of this spacing can tell apart.
-    """
+    """Distances of the first search, metres, also negative ones, within the range that the spacing resolves."""
     width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
     reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
     step = speed_of_light / width / FINE
@@ -133,15 +145,8 @@ def _turn(angle: FloatArray) -> Complex:
     return turned
 
 
-def _mark_absent(gram: Complex, present: Mask) -> Complex:
-    """A path that is absent has zero atoms: a one on the diagonal keeps the matrix regular, the gain zero."""
-    diagonal = np.arange(gram.shape[-1])
-    gram[:, diagonal, diagonal] += ~present
-    return gram
-
-
-class FreeWaves:
-    """Paths whose delay all antennas share and whose gain is each antenna's own."""
+class FreeWaves(Waves):
+    """Paths with a delay that all antennas share and a gain for each antenna."""
 
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
         self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
@@ -152,38 +157,35 @@ class FreeWaves:
         self.freedom = 1 + 2 * bands.antennas
 
     def power(self, residual: Complex) -> FloatArray:
-        """See `Waves`."""
+        """Power of a residual in each cell of the grid, [n, distances, cells]."""
         return np.asarray(np.square(np.abs(residual @ self.steering.conj().T)).sum(axis=1)[:, :, None])
 
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """See `Waves`."""
-        atoms = np.exp(theta * self.slope) * present[..., None]
-        gram = _mark_absent(atoms.conj() @ atoms.transpose(0, 2, 1), present)
-        gains = _solve(gram, atoms.conj() @ h.transpose(0, 2, 1), ridge, len(self.slope))
-        return Solved(gains, h - gains.transpose(0, 2, 1) @ atoms, atoms, gram)
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, f]."""
+        return np.asarray(np.exp(theta * self.slope))
 
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
-        """See `Waves`."""
+        """Normal matrix and right side of a Gauss-Newton step."""
         tilt = solved.atoms * self.slope
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
-        own = tilt.conj() @ tilt.transpose(0, 2, 1)
-        projected = own - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, len(self.slope))
+        products = tilt.conj() @ tilt.transpose(0, 2, 1)
+        projected = products - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, len(self.slope))
         shared = solved.gains.conj() @ solved.gains.transpose(0, 2, 1)
         right = (solved.gains.conj() * (tilt.conj() @ solved.residual.transpose(0, 2, 1))).sum(axis=-1)
         return (projected * shared).real, right.real
 
     def limit(self, theta: FloatArray) -> FloatArray:
-        """See `Waves`."""
+        """Parameters limited to the domain of the model."""
         return np.asarray(theta.clip(self.grid[0], self.grid[-1]))
 
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
-        """See `Waves`."""
+        """Coefficients [n, antennas, frequencies]."""
         slope = -2j * np.pi / speed_of_light * (frequencies_hz - self.reference_hz)
         return np.asarray(gains.transpose(0, 2, 1) @ np.exp(theta * slope))
 
 
-class ArrayWaves:
-    """Paths with one gain, a distance and a direction, at an array whose elements are known."""
+class ArrayWaves(Waves):
+    """Paths with a gain, a distance and a direction, at an array of known elements."""
 
     def __init__(self, bands: Bands, max_distance_m: float, spherical: bool) -> None:
         assert bands.elements_m is not None
@@ -226,7 +228,7 @@ class ArrayWaves:
         return d, along, root
 
     def atoms(self, theta: FloatArray, frequencies_hz: FloatArray) -> Complex:
-        """What paths of unit gain give, [n, k, antennas, frequencies]."""
+        """Coefficients of paths of unit gain, [n, k, antennas, frequencies]."""
         d, along, s = self._phase(theta)
         excess = -along if s is None else (self.square - 2 * d * along) / (s + d)
         k = 2 * np.pi / speed_of_light
@@ -269,7 +271,7 @@ class ArrayWaves:
         return constant, factor
 
     def power(self, residual: Complex) -> FloatArray:
-        """See `Waves`.
+        """Power of a residual in each cell of the grid, [n, distances, cells].
 
         Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
         """
@@ -282,35 +284,28 @@ class ArrayWaves:
             power[:, index] = np.square(np.abs(combined[:, :, index] @ steering))
         return power
 
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """See `Waves`."""
-        n, paths = present.shape
-        atoms = self.atoms(theta, self.frequencies).reshape(n, paths, -1) * present[..., None]
-        flat = h.reshape(n, -1, 1)
-        left = atoms.conj()
-        gram = _mark_absent(left @ atoms.transpose(0, 2, 1), present)
-        gains = _solve(gram, left @ flat, ridge, flat.shape[1])[..., 0]
-        residual = h - (gains[:, None] @ atoms).reshape(h.shape)
-        return Solved(gains, residual, atoms, gram)
+    def unit(self, theta: FloatArray) -> Complex:
+        """Uplink coefficients of paths of unit gain, [n, paths, antennas * f]."""
+        return self.atoms(theta, self.frequencies).reshape(*theta.shape[:2], -1)
 
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
-        """See `Waves`."""
+        """Normal matrix and right side of a Gauss-Newton step."""
         n, k, p = theta.shape
         antennas, subcarriers = solved.residual.shape[1:]
         constant, factor = self._slopes(theta)
         slopes = constant[..., None] + 1j * factor[..., None] * self.frequencies
-        moved = (solved.atoms * solved.gains[..., None]).reshape(n, k, 1, antennas, subcarriers)
+        moved = (solved.atoms * solved.gains).reshape(n, k, 1, antennas, subcarriers)
         tilt = (moved * slopes).reshape(n, k * p, -1)
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
         # Only the real part of the products is needed: half the work.
         pairs, residual = tilt.view(float), solved.residual.reshape(n, -1, 1).view(float).reshape(n, -1, 1)
-        own = pairs @ pairs.transpose(0, 2, 1)
+        products = pairs @ pairs.transpose(0, 2, 1)
         size = antennas * subcarriers
         shadow = cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, size)
-        return own - shadow.real, (pairs @ residual)[..., 0]
+        return products - shadow.real, (pairs @ residual)[..., 0]
 
     def limit(self, theta: FloatArray) -> FloatArray:
-        """See `Waves`."""
+        """Parameters limited to the domain of the model."""
         limited = theta.copy()
         limited[..., 0] = theta[..., 0].clip(max(self.near, 1e-3) if self.spherical else -self.far, self.far)
         length = np.linalg.norm(theta[..., 1:], axis=-1, keepdims=True)
@@ -318,5 +313,5 @@ class ArrayWaves:
         return limited
 
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
-        """See `Waves`."""
-        return np.asarray(np.einsum("nk,nkaf->naf", gains, self.atoms(theta, frequencies_hz)))
+        """Coefficients [n, antennas, frequencies]."""
+        return np.asarray(np.einsum("nk,nkaf->naf", gains[..., 0], self.atoms(theta, frequencies_hz)))

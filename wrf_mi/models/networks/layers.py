@@ -1,0 +1,124 @@
+"""Networks that hold their weights, on Dr.Jit tensors whose columns are samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any, Self
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+from numpy.typing import NDArray
+
+from ...backend.device import to_tensor
+
+GAIN = float(np.sqrt(2.0))
+"""Deviation of initial weights times the root of a layer's inputs, where a rectifier follows (He et al. 2015)."""
+relu = nn.ReLU()
+
+
+class Module:
+    """A network or a part of a network: every array among its attributes is a weight.
+
+    Weights have dotted paths of attribute names: ``q.out.bias`` is the bias of the layer ``out`` of the module ``q``.
+    Modules of a list ``norm`` are ``norm0``, ``norm1``, ...; those of a list ``layers`` are ``0``, ``1``, ... A
+    trailing underscore is no part of a path.
+    """
+
+    def state(self) -> dict[str, Any]:
+        """All weights by path."""
+        found: dict[str, Any] = {}
+        _mapped(self, "", lambda path, weight: found.setdefault(path, weight))
+        return found
+
+    def with_state(self, weights: Mapping[str, Any]) -> Self:
+        """The same network with other weights, by path."""
+        changed: Self = _mapped(self, "", lambda path, _: weights[path])
+        return changed
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All weights by path, as NumPy arrays."""
+        return {path: np.asarray(weight) for path, weight in self.state().items()}
+
+    def on_device(self, weights: Mapping[str, NDArray[Any]]) -> Self:
+        """The same network with other weights, as single-precision tensors."""
+        return self.with_state({path: to_tensor(values) for path, values in weights.items()})
+
+
+def _mapped(value: Any, path: str, change: Callable[[str, Any], Any]) -> Any:
+    """A module, list of modules or weight at a path, with each weight replaced by ``change(path, weight)``."""
+    if isinstance(value, Module):
+        changed, start = copy(value), f"{path}." if path else ""
+        for name, inner in vars(value).items():
+            setattr(changed, name, _mapped(inner, start + name.removesuffix("_"), change))
+        return changed
+    if isinstance(value, list):
+        stem = path.removesuffix("layers")
+        return [_mapped(inner, f"{stem}{number}", change) for number, inner in enumerate(value)]
+    return change(path, value) if isinstance(value, np.ndarray | dr.ArrayBase) else value
+
+
+class Linear(Module):
+    """Affine map of one input, or of the concatenation of named inputs with a matrix each.
+
+    Weights are normal with deviation gain / sqrt(inputs) (He et al. 2015), the bias [outputs, 1] is zero.
+
+    Args:
+        inputs: number of inputs, or numbers by name. The matrix of a single input is ``hidden``.
+        outputs: number of outputs.
+        rng: source of the weights.
+        gain: `GAIN` before a rectifier, 1 before no activation.
+    """
+
+    bias: Any
+
+    def __init__(
+        self, inputs: int | Mapping[str, int], outputs: int, rng: np.random.Generator, gain: float = GAIN
+    ) -> None:
+        sizes = {"hidden": inputs} if isinstance(inputs, int) else inputs
+        deviation = gain / np.sqrt(sum(sizes.values()))
+        for name, size in sizes.items():
+            setattr(self, name, (rng.standard_normal((outputs, size)) * deviation).astype(np.float32))
+        self.bias = np.zeros((outputs, 1), np.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        """The matrix of a named input."""
+        raise AttributeError(f"layer without an input {name}")
+
+    def __call__(self, *hidden: Any, **parts: Any) -> Any:
+        """Outputs [outputs, n] of the inputs [size, n] by name."""
+        products = [getattr(self, name) @ x for name, x in [*(("hidden", x) for x in hidden), *parts.items()]]
+        return sum(products[1:], products[0] + self.bias)
+
+
+class Mlp(Module):
+    """Hidden layers with an activation after each, and an output layer without.
+
+    Args:
+        layers: hidden layers; the first may have named inputs.
+        out: output layer; None: the last hidden layer is the output.
+        activation: of the hidden layers.
+    """
+
+    def __init__(self, layers: list[Linear], out: Linear | None, activation: Callable[[Any], Any] = relu) -> None:
+        self.layers, self.out, self.activation = layers, out, activation
+
+    def __call__(self, *hidden: Any, **parts: Any) -> Any:
+        """Outputs of the inputs of the first layer."""
+        first, *others = self.layers
+        x = self.activation(first(*hidden, **parts))
+        for layer in others:
+            x = self.activation(layer(x))
+        return x if self.out is None else self.out(x)
+
+
+def sigmoid(x: Any) -> Any:
+    """1 / (1 + exp(-x))."""
+    return dr.rcp(1 + dr.exp(-x))
+
+
+def columns(x: Any, picked: Any) -> Any:
+    """Columns of a tensor [size, n] by index, [size, batch]."""
+    # `dr.take` drops the axis for a single index.
+    return dr.reshape(dr.take(x, picked, axis=1), (x.shape[0], dr.width(picked)))
