@@ -56,4 +56,4 @@ if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
     "$venv/bin/python" -c 'import open3d' 2>/dev/null ||
         stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y $open3d_needs"
 fi
-"$venv/bin/python" -m wrf_mi.cli.doctor --install-llvm
+"$venv/bin/python" -m wrf_mi.cli doctor --install-llvm

@@ -18,7 +18,7 @@ from wrf_mi.cli.main import main
 
 SMALL = ["initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "log_every=2", "validate_every=4", "steps=4"]
 SET = [part for setting in SMALL for part in ("--set", setting)]
-"""A training of a moment."""
+"""Settings of a very short training."""
 
 
 def call(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
@@ -33,7 +33,7 @@ def call(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> tuple[int,
 
 
 def refused(arguments: list[Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command says in one line what is wrong, and nothing else."""
+    """The command prints one line with the error, and nothing else."""
     status, out, err = call(arguments, capsys)
     assert status == 2
     assert out == ""
@@ -44,7 +44,7 @@ def refused(arguments: list[Any], message: str, capsys: pytest.CaptureFixture[st
 
 
 def stored(run: Path) -> dict[str, np.ndarray]:
-    """What ``predictions.npz`` of a run holds."""
+    """Content of ``predictions.npz`` of a run."""
     with np.load(run / "predictions.npz", allow_pickle=False) as arrays:
         return dict(arrays)
 

@@ -27,10 +27,13 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Dr.Jit computes on this process's share of the cores, and on all of them where a test is marked so.
+    """Set Dr.Jit's threads to this process's share of the cores, or to all cores where a test is marked so.
 
-    Before each test, fixtures of its file included: deterministic fits leave the process on one thread.
+    This precedes each test and its fixtures, as deterministic fits leave the process on one thread. Runs time two
+    single predictions instead of twenty.
     """
+    if evaluate := sys.modules.get("wrf_mi.runs.evaluate"):
+        evaluate.REPEATS = 2
     if "drjit" in sys.modules:
         from wrf_mi.backend import set_threads
 

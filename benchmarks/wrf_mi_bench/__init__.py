@@ -1,5 +1,4 @@
-"""Benchmarks of `wrf_mi`, which ``wrf-mi bench`` runs."""
+"""Benchmarks of `wrf_mi`, which ``wrf-mi bench`` runs.
 
-from wrf_mi.backend import init
-
-init()
+The entry points `bench`, `check` and `subprocess_job` start the backend, so that a subprocess can choose its own.
+"""

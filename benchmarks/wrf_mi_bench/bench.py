@@ -1,7 +1,6 @@
-"""The figures of this project, measured by its own command and stored with how they were made.
+"""Cases and checks of ``wrf-mi bench``: measured in subprocesses and stored as JSON with machine and versions.
 
-A case is either a run of ``wrf-mi`` that leaves a run folder, or a check: a function that measures one part
-against what it is held to, on data or scenes that others made.
+A case is a run of ``wrf-mi`` with a run folder; a check is a function that compares a part with a reference.
 """
 
 from __future__ import annotations
@@ -28,40 +27,30 @@ from wrf_mi.runs.fit_key import dataset_files, fit_key
 from wrf_mi.runs.folder import CONFIG, METRICS, versions
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
-"""Data sets that are measured elsewhere; all others are made on this machine."""
+"""Public data sets; all others are made on this machine."""
 
 
 class BenchFailed(RuntimeError):
-    """A case did not finish; its command said why."""
+    """A case or check failed."""
 
     exit_status = 1
 
 
 REFUSED = 2
 """Exit status of bad input."""
+ENTRY_POINTS = "wrf_mi.benchmarks"
+"""Group of entry points by which other packages add checks."""
+MEASURED, STORED_CHECK = "bench.json", "check.json"
+"""Files in the folder of a finished case, and of a finished check."""
 
 
 class CheckRefused(InputError):
-    """What a check needs is not on this machine; its process has said so on standard error."""
-
-
-ENTRY_POINTS = "wrf_mi.benchmarks"
-"""Group of the entry points by which other packages add checks."""
-
-
-def _here(function: str) -> str:
-    return f"{__package__}.{function}"
+    """Data of a check are missing; its process has printed that on standard error."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement.
-
-    Attributes:
-        title: for the table.
-        arguments: of ``wrf-mi``, without ``--out``.
-        data: data sets that it reads.
-    """
+    """A run of ``wrf-mi``: its title, arguments without ``--out``, and data sets."""
 
     title: str
     arguments: tuple[str, ...]
@@ -70,19 +59,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Check:
-    """One measurement by a function.
+    """A measurement by a function.
 
     Attributes:
-        title: for the table.
-        function: ``module:function``; it takes nothing and returns ``rows``, a list of dictionaries ``what``, ``value``
-            (text with its unit) and ``asked``, beside whatever else it measured, and ``failed``, a line, where the
-            command has to end with status 1 after all is stored.
-        quick: likewise, the same with few cases, for `quick_checks`; it raises `BenchFailed` where a bound is not held.
-            Empty: there is none.
+        title: title in the table.
+        function: ``module:function`` without arguments that returns ``rows`` (dictionaries of ``what``, ``value`` with
+            its unit and ``asked``), other figures, and ``failed``, a line, where the command has to end with status 1.
+        quick: ``module:function`` with few cases, which raises `BenchFailed` beyond a bound; "": none.
         data: data sets that it reads where they are on this machine.
-        resumes: whether the function keeps what it measured, and every call of the benchmark calls it; others are
-            called again with other versions or data only.
-        table: ``module:function`` that makes a table of ``rows``; empty: their ``what``, ``value`` and ``asked``.
+        resumes: whether the function keeps its results and is called every time.
+        table: ``module:function`` that makes a table of ``rows``; "": `check_table`.
     """
 
     title: str
@@ -93,16 +79,15 @@ class Check:
     table: str = ""
 
 
-MEASURED, STORED_CHECK = "bench.json", "check.json"
-"""In the folder of a case that is finished, and of a check."""
-
-
 SHORT = ("--set", "steps=3000", "--set", "holdout_steps_fraction=0")
-"""The schedule of the blocked split, whose five folds are fitted in turn."""
-
-
+"""Schedule of the blocked split, which has five fits."""
 LONG = ("--set", "steps=15000")
-"""The schedule of the authors' split; the default of WRF-GS+, 9,000 steps, scores as high on held-out rows."""
+"""Schedule of the authors' split; 9,000 steps, the default, score as high on held-out rows."""
+
+
+def _here(title: str, function: str, *data: str, quick: str = "", table: str = "", **more: Any) -> Check:
+    function, quick, table = (name and f"{__package__}.{name}" for name in (function, quick, table))
+    return Check(title, function, quick, data, table=table, **more)
 
 
 def _train(*arguments: str) -> tuple[str, ...]:
@@ -125,45 +110,44 @@ CASES: Mapping[str, Case] = {
 
 
 _OWN: Mapping[str, Check] = {
-    "traced-and-splatted": Check("Mitsuba integrator", _here("traced:main")),
-    "image-method": Check("Sionna RT against MATLAB", _here("trace:newrf"), data=(CONFERENCE, OFFICE)),
-    "scan-to-paths": Check("mesh from a scan", _here("scene:scans"), data=(CONFERENCE, OFFICE)),
-    "large-scan": Check("mesh from a scan", _here("scene:large_scan"), data=(OFFICE,)),
-    "flat-plan": Check("mesh of a flat", _here("plan:flat_plan"), data=(FLAT,)),
-    "flat-ble": Check("ray tracing in a flat", _here("calibration:flat"), data=(FLAT,)),
-    "stress": Check("numbers under stress", _here("stress:main"), _here("stress:quick")),
-    "determinism": Check("the same again", _here("determinism:main"), data=(RFID, FLAT, CONFERENCE)),
-    "physics-rfid-lab": Check("physics, rfid-lab", _here("physics_spectrum:rfid_lab"), data=(RFID,)),
-    "physics-flat": Check("physics, flat-ble", _here("physics_rssi:all_rows"), data=(FLAT,)),
-    "physics-flat-64": Check("physics, flat-ble", _here("physics_rssi:few_rows"), data=(FLAT,)),
-    "physics-conference": Check("physics, newrf", _here("physics_csi:conference"), data=(CONFERENCE,)),
-    "physics-office": Check("physics, newrf", _here("physics_csi:office"), data=(OFFICE,)),
-    "physics-room": Check("physics, traced room", _here("physics_room:main")),
-    "physics-starts": Check("WRF-GS+, traced room", _here("starts:main")),
-    "pareto": Check("traced room", _here("pareto:main"), data=("traced-room",)),
-    "scaling": Check("cost against work", _here("scaling:main")),
-    "operator": Check("prediction by operator", _here("operator:main")),
-    "budgets": Check("fields at budgets", _here("budget:main"), data=(RFID,)),
-    "training": Check("training", _here("training:main"), data=(RFID,)),
-    "sentinels": Check(
+    "traced-and-splatted": _here("Mitsuba integrator", "traced:main"),
+    "image-method": _here("Sionna RT against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
+    "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
+    "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
+    "flat-plan": _here("mesh of a flat", "plan:flat_plan", FLAT),
+    "flat-ble": _here("ray tracing in a flat", "physics_rssi:flat", FLAT),
+    "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
+    "determinism": _here("the same again", "determinism:main", RFID, FLAT, CONFERENCE),
+    "physics-rfid-lab": _here("physics, rfid-lab", "physics_spectrum:rfid_lab", RFID),
+    "physics-flat": _here("physics, flat-ble", "physics_rssi:all_rows", FLAT),
+    "physics-flat-64": _here("physics, flat-ble", "physics_rssi:few_rows", FLAT),
+    "physics-conference": _here("physics, newrf", "physics_csi:conference", CONFERENCE),
+    "physics-office": _here("physics, newrf", "physics_csi:office", OFFICE),
+    "physics-room": _here("physics, traced room", "physics_room:main"),
+    "physics-starts": _here("WRF-GS+, traced room", "physics_room:starts"),
+    "pareto": _here("traced room", "pareto:main", "traced-room"),
+    "scaling": _here("cost against work", "scaling:main"),
+    "operator": _here("prediction by operator", "operator:main"),
+    "budgets": _here("fields at budgets", "budget:main", RFID),
+    "training": _here("training", "training:main", RFID),
+    "sentinels": _here(
         "figures kept",
-        _here("sentinels:main"),
-        data=(RFID, FLAT, CONFERENCE, OFFICE),
+        "sentinels:main",
+        RFID,
+        FLAT,
+        CONFERENCE,
+        OFFICE,
         resumes=True,
-        table=_here("sentinels:table"),
+        table="sentinels:table",
     ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
 CHECKS: Mapping[str, Check] = _CHECKS
-"""Every check by its name."""
+"""All checks by name."""
 
 
 def register(name: str, check: Check) -> None:
-    """Add a check for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
-
-    Raises:
-        InputError: a name that is taken.
-    """
+    """Add a check for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`."""
     _CHECKS.add(name, check)
 
 
@@ -174,24 +158,13 @@ SHARED_NOTE = (
 
 
 def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
-    """Measure cases one after the other, each as a process of its own, and write the table.
+    """Measure cases and checks, each in a subprocess, and write ``<case>.json`` and ``README.md`` to ``out``.
 
-    A case that is finished for the same arguments, data and versions is only written down again; one that was stopped
-    goes on.
-
-    Args:
-        names: keys of `CASES` and `CHECKS`.
-        out: folder for ``<case>.json`` and the tables, ``README.md``.
-        runs: folder for run folders.
-        scheduler: whose workers measure a case each at a time, with their number of threads, and must see ``runs`` and
-            the data under the same names; None: this process.
+    A case that is finished in ``runs`` for the same arguments, data and versions is used again; one that was stopped
+    is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths.
 
     Returns:
-        One dictionary a case, as in its JSON file.
-
-    Raises:
-        InputError: an unknown case, or what a check needs is not on this machine.
-        BenchFailed: a case that did not finish.
+        Content of the JSON file of each case.
     """
     for name in names:
         if name not in CASES and name not in CHECKS:
@@ -213,28 +186,13 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
 
 
 def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:
-    """Checks with few cases, in this process; nothing is stored, as stored figures are those of all cases.
-
-    Args:
-        names: keys of `CHECKS`.
-
-    Returns:
-        One dictionary a check: ``case``, ``title`` and ``figures``.
-
-    Raises:
-        InputError: an unknown name, or one without a quick form.
-        BenchFailed: a bound that is not held.
-    """
+    """``case``, ``title`` and ``figures`` of checks with few cases, measured in this process and not stored."""
     able = [name for name, check in CHECKS.items() if check.quick]
     for name in names:
         if name not in able:
             what = "has no quick form" if name in CHECKS or name in CASES else "unknown"
-            raise InputError(f"bench {name} --quick: {what}; only {', '.join(able)} has one, or leave --quick away")
-    results = []
-    for name in names:
-        figures = resolve(CHECKS[name].quick)()
-        results.append({"case": name, "title": CHECKS[name].title, "figures": figures})
-    return results
+            raise InputError(f"bench {name} --quick: {what}; only {', '.join(able)} has one, or omit --quick")
+    return [{"case": name, "title": CHECKS[name].title, "figures": resolve(CHECKS[name].quick)()} for name in names]
 
 
 def _case(runs: Path, name: str) -> dict[str, Any]:
@@ -254,42 +212,48 @@ def case_folder(runs: Path, name: str) -> Path:
 
 def _measure(name: str, folder: Path) -> dict[str, Any]:
     case = CASES[name]
-    arguments = [*case.arguments, "--out", str(folder)]
     if not (folder / METRICS).exists() or not (folder / MEASURED).exists():
-        resumed = (folder / CONFIG).exists()
-        call = ["train", "--resume", str(folder)] if resumed else arguments
-        start = time.perf_counter()
-        status, said = run_module("wrf_mi.cli", call)
-        if status != 0:
-            raise BenchFailed(f"bench {name}: `wrf-mi {' '.join(call)}` ended with status {status} {said}".rstrip())
-        # The time of the whole process means something only where it ran in one go.
-        wall = None if resumed else time.perf_counter() - start
-        # Written when it is measured: the table may be made again elsewhere.
+        wall = run_command(case.arguments, folder, f"bench {name}: ")
         measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine(), **threads()}
         write_atomically(folder / MEASURED, json.dumps(measured))
     config = yaml.safe_load((folder / CONFIG).read_text())
     return {
         "case": name,
         "title": case.title,
-        "command": "wrf-mi " + " ".join(arguments),
+        "command": f"wrf-mi {' '.join(case.arguments)} --out {folder}",
         **json.loads((folder / MEASURED).read_text()),
         "versions": config["versions"],
         "metrics": json.loads((folder / METRICS).read_text()),
     }
 
 
+def run_command(arguments: Sequence[str], folder: Path, where: str = "", resumes: bool = True) -> float | None:
+    """Run ``wrf-mi`` into a run folder, or resume it there.
+
+    Returns:
+        Elapsed seconds; None where the run was resumed.
+    """
+    resumed = resumes and (folder / CONFIG).exists()
+    call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
+    start = time.perf_counter()
+    status, message = run_module("wrf_mi.cli", call)
+    if status != 0:
+        raise BenchFailed(f"{where}`wrf-mi {' '.join(call)}` ended with status {status} {message}".rstrip())
+    return None if resumed else time.perf_counter() - start
+
+
 def _check(name: str, folder: Path) -> dict[str, Any]:
-    """The stored result of a check, measured now if there is none; in a process of its own, as it states its memory."""
+    """Stored result of a check, measured in a subprocess where there is none."""
     stored = folder / STORED_CHECK
     if CHECKS[name].resumes or not stored.exists():
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
-        status, said = run_module("wrf_mi_bench.check", [CHECKS[name].function, str(stored)])
+        status, message = run_module("wrf_mi_bench.check", [CHECKS[name].function, str(stored)])
         if status == REFUSED:
-            # A worker's process is quiet, and its last line comes back.
-            raise InputError(said.removeprefix("wrf-mi: ")) if said else CheckRefused(f"bench {name}: refused")
+            # The output of a worker's subprocess is captured.
+            raise InputError(message.removeprefix("wrf-mi: ")) if message else CheckRefused(f"bench {name}: refused")
         if status != 0:
-            raise BenchFailed(f"bench {name}: ended with status {status} {said}".rstrip())
+            raise BenchFailed(f"bench {name}: ended with status {status} {message}".rstrip())
         measured = json.loads(stored.read_text())
         where = {"date": time.strftime("%Y-%m-%d"), "machine": machine(), "versions": versions(), **threads()}
         measured = {"wall_seconds": time.perf_counter() - start, **where, "figures": measured}
@@ -299,13 +263,13 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
 
 
 def threads() -> dict[str, int]:
-    """What must be known of a measurement in a worker beside its machine."""
+    """Number of threads of a worker, where this process is one."""
     count = worker_threads()
     return {} if count is None else {"worker_threads": count}
 
 
 def machine() -> dict[str, Any]:
-    """What this machine is."""
+    """Processor, cores, memory and system of this machine."""
     return {
         "processor": versions()["device"],
         "cores": os.cpu_count(),
@@ -315,7 +279,7 @@ def machine() -> dict[str, Any]:
 
 
 def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """All stored results, those of `CASES` and those of `CHECKS`, each in their order."""
+    """Stored results of `CASES` and of `CHECKS`, in their order."""
 
     def stored(names: Mapping[str, Any]) -> list[dict[str, Any]]:
         return [json.loads(path.read_text()) for name in names if (path := out / f"{name}.json").exists()]
@@ -340,10 +304,11 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
     ]
     for result in results:
         m = result["metrics"]
-        own, blend = m["ssim"], m["reference"]["idw4"]["median"]
+        score, blend = m["ssim"], m["reference"]["idw4"]["median"]
         minutes = f"{m['train_seconds'] / 60:.1f} min"
+        quantiles = " | ".join(f"{score[key]:.3f}" for key in ("mean", "p10", "p90"))
         lines.append(
-            f"| {result['title']} | **{own['median']:.3f}** | {own['mean']:.3f} | {own['p10']:.3f} | {own['p90']:.3f} "
+            f"| {result['title']} | **{score['median']:.3f}** | {quantiles} "
             f"| {blend:.3f} | {m['steps']:,} | {minutes} | {m['ms_per_sample']:.1f} | {m['peak_memory_mb']:.0f} MB |"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Fields at several budgets: size with networks, time of a spectrum and SSIM, against the best field there is."""
+"""Fields at several budgets, compared with WRF-GS+ at its defaults: stored size, time of a spectrum and SSIM."""
 
 from __future__ import annotations
 
@@ -21,24 +21,20 @@ from wrf_mi.synthetic import load_record
 from wrf_mi.training.compress import Compression
 from wrf_mi.training.config import TrainConfig
 
+from .comparison import Row, line
+
 BEST = "WRF-GS+"
-"""The best field: the paper's network, all defaults. The others are compared with it."""
+"""Reference: the paper's network with default settings."""
 SCHEDULE = ("steps=15000",)
-"""Of every fit, the best field's too: small ones go on gaining after 9,000."""
+"""Settings of every fit; small fields improve beyond 9,000 steps."""
 REPEATS = 100
 MOST_LOSS, LEAST_FASTER, LEAST_SMALLER = 0.01, 5.0, 10.0
-"""What a small field is held to: median SSIM that it may lose, and how much faster and smaller it must be."""
+"""Bounds of a small field: loss of median SSIM, and factors of speed and size."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """A field at a budget.
-
-    Attributes:
-        settings: of its fit, beside the defaults.
-        how: what is done to it afterwards; None: nothing.
-        of: the budget by whose fit it starts; "": one of its own.
-    """
+    """Settings of a fit beside the defaults, compression after it, and another budget whose fit is compressed."""
 
     settings: tuple[str, ...]
     how: Compression | None
@@ -68,13 +64,6 @@ def budgets(
     record: Record, work: Path, schedule: Sequence[str] = (), seed: int = 0, given: Mapping[str, Budget] = BUDGETS
 ) -> dict[str, Any]:
     """Fit a field at each budget on the official split and measure them beside each other.
-
-    Args:
-        record: of spectra, with an official split.
-        work: folder for the runs; a finished one with the same key (`wrf_mi.runs.fit_key`) is used again.
-        schedule: settings of every fit.
-        seed: of every fit.
-        given: by name; the first is what the others are compared with. What another starts by stands before it.
 
     Returns:
         By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
@@ -106,17 +95,17 @@ def budgets(
     return found
 
 
-def rows_of(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+def rows_of(found: Mapping[str, Mapping[str, Any]]) -> list[Row]:
     """Rows of the benchmark's table from what `budgets` returns."""
     asked = f">= {LEAST_FASTER:.0f} times faster, >= {LEAST_SMALLER:.0f} times smaller, SSIM loss <= {MOST_LOSS}"
     rows = []
     for index, (name, one) in enumerate(found.items()):
         value = f"{one['ssim']['median']:.3f} SSIM, {one['bytes'] / 1e3:.0f} kB, {one['ms']:.2f} ms"
+        what = f"{name}, 8 bits a weight" if index else f"{name}, {one['gaussians']} Gaussians"
         if index:
             ratio, low, high = one["times_faster"]
             value += f": {ratio:.1f} times faster ({low:.1f} to {high:.1f}), {one['times_smaller']:.0f} times smaller"
-        what = f"{name}, 8 bits a weight" if index else f"{name}, {one['gaussians']} Gaussians"
-        rows.append({"what": what, "value": value, "asked": asked if index else ""})
+        rows.append(line(what, value, asked if index else ""))
     return rows
 
 

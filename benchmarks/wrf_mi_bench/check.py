@@ -1,4 +1,4 @@
-"""Runs one check of the benchmark in a process of its own: ``python -m wrf_mi_bench.check MODULE:FUNCTION FILE``."""
+"""A check in a subprocess: ``python -m wrf_mi_bench.check MODULE:FUNCTION FILE``."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import json
 import sys
 from pathlib import Path
 
+from wrf_mi.backend import init
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import resolve
 
 
 def main(function: str, out: str) -> int:
-    """Call ``function`` (``module:name``) and write what it returns as JSON.
+    """Call ``function`` (``module:name``) and write its result as JSON.
 
     Returns:
-        The exit status: 2 with one line where data are missing, 130 where it was interrupted.
+        Exit status: 2 with one line where data are missing, 130 where it was interrupted.
     """
+    init()
     try:
         figures = resolve(function)()
     except InputError as error:

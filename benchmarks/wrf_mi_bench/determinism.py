@@ -1,12 +1,8 @@
-"""What comes out the same again: bit for bit where it is promised, else how far results lie apart.
-
-Every result is computed in a process of its own.
-"""
+"""Repeatability: equality of all bits where it is guaranteed, and differences otherwise, between subprocesses."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,15 +13,16 @@ from wrf_mi.backend.probe import try_cuda, try_llvm
 from wrf_mi.datasets.registry import locate
 from wrf_mi.synthetic.laboratory import NAME as LABORATORY
 
-from .alone import Arrays, Job, alone
+from .comparison import Row, line
+from .subprocess_job import Arrays, Job, subprocess_job
 
 MEASURED = "rfid-lab"
 IMAGE = 1e-5
-"""Largest difference of one image, relative to its largest grey: sums of some tens of terms in float32."""
+"""Bound on the largest difference of an image, relative to its largest pixel."""
 GRADIENT = 1e-3
-"""Relative difference in norm of one step's gradient, worst group, as numbers under stress are held to."""
+"""Bound on the relative difference in norm of a step's gradient, worst group, as in the stress benchmark."""
 SCORE = 0.02
-"""Median SSIM after a short fit: a fit carries the last digits on until two fits differ as two seeds do."""
+"""Bound on the range of the median SSIM after a short fit: rounding makes fits differ as two seeds do."""
 REPEATS = 3
 BATCHES = (1, 4)
 SHORT = ("steps=1000", "holdout_steps_fraction=0", "validate_every=1000", "density.every=250")
@@ -34,24 +31,21 @@ SMALL = (
     *("checkpoint_every=100", "validate_every=200"),
 )
 STOP = 230
-"""Between two checkpoints and two rounds of density control."""
+"""Step between two checkpoints and two rounds of density control."""
 ROWS = 40
-
-Row = dict[str, str]
 
 
 def different(one: Arrays, other: Arrays) -> list[str]:
-    """Names of arrays that differ in any bit, or that one of the two alone has."""
+    """Names of arrays that differ in any bit, or that only one of the two has."""
 
-    def content(values: Any) -> tuple[Any, ...]:
-        return values.dtype, values.shape, values.tobytes()
+    def content(values: Any) -> Any:
+        return None if values is None else (values.dtype, values.shape, values.tobytes())
 
-    shared = set(one) & set(other)
-    return sorted({*(set(one) ^ set(other)), *(name for name in shared if content(one[name]) != content(other[name]))})
+    return sorted(name for name in {*one, *other} if content(one.get(name)) != content(other.get(name)))
 
 
 def distance(one: Arrays, other: Arrays) -> dict[str, float]:
-    """How far a step lies from another: ``image``, by the largest grey; ``gradient``, in norm, of the worst group."""
+    """Relative differences of two steps: ``image``, by its largest pixel; ``gradient``, in norm, of the worst group."""
     found = {"image": 0.0, "gradient": 0.0}
     for name, values in one.items():
         error = values.astype(float) - other[name]
@@ -65,19 +59,13 @@ def distance(one: Arrays, other: Arrays) -> dict[str, float]:
 def _bits_row(what: str, one: Arrays, *others: Arrays) -> Row:
     off = sorted({name for other in others for name in different(one, other)})
     size = sum(values.size for values in one.values())
-    value = f"differ: {', '.join(off)}" if off else f"{size:,} numbers, all bits equal"
-    return {"what": what, "value": value, "asked": "all bits equal"}
+    return line(what, f"differ: {', '.join(off)}" if off else f"{size:,} numbers, all bits equal", "all bits equal")
 
 
 def again(dataset: str) -> list[Row]:
-    """Everything that is promised bit for bit.
-
-    Args:
-        dataset: spectra that a field and a physics model are fitted to; other physics models where their data are on
-            this machine.
-    """
+    """Rows of all results whose bits are guaranteed to be equal."""
     field = Job("field", dataset, SMALL, deterministic=True)
-    whole, repeated, resumed = (alone(job) for job in (field, field, replace(field, stop=STOP)))
+    whole, repeated, resumed = (subprocess_job(job) for job in (field, field, replace(field, stop=STOP)))
     rows = [
         _bits_row("field, `--deterministic`: model, predictions, `predict`", whole, repeated),
         _bits_row("field, `--deterministic`, stopped and resumed in another process", whole, resumed),
@@ -93,59 +81,50 @@ def again(dataset: str) -> list[Row]:
         jobs["physics of channels, its mesh made anew"] = Job("channels", "newrf-conference", n_train=100)
     most = max(2, os.cpu_count() or 1)
     for name, job in jobs.items():
-        found = [alone(replace(job, threads=threads)) for threads in (1, most, most)]
+        found = [subprocess_job(replace(job, threads=threads)) for threads in (1, most, most)]
         rows.append(_bits_row(f"{name}, on 1 thread and twice on {most}", *found))
     return rows
 
 
-def apart(dataset: str, settings: Sequence[str] = SHORT, repeats: int = REPEATS) -> tuple[list[Row], dict[str, Any]]:
-    """How far results lie apart without ``--deterministic``.
-
-    Args:
-        dataset: spectra that fields are fitted to.
-        settings: of the short fit, its ``steps`` first.
-        repeats: on the same threads.
-
-    Returns:
-        Rows, and all scores by what they were computed with.
-    """
-    most, own = max(2, os.cpu_count() or 1), init()
-    fit = Job("field", dataset, tuple(settings))
-    ways: dict[str, tuple[Job, Any, int]] = {f"{most} threads": (replace(fit, threads=most), None, repeats)}
+def apart(dataset: str) -> tuple[list[Row], dict[str, Any]]:
+    """Rows of differences without ``--deterministic``, and all scores."""
+    most, version = max(2, os.cpu_count() or 1), init().llvm_version
+    fit = Job("field", dataset, SHORT)
+    ways: dict[str, tuple[Job, Any, int]] = {f"{most} threads": (replace(fit, threads=most), None, REPEATS)}
     ways |= {name: (replace(fit, threads=1), path, 1) for name, path in other_llvms().items()}
     if cuda_works():
-        ways["CUDA"] = (replace(fit, backend="cuda"), None, repeats)
+        ways["CUDA"] = (replace(fit, backend="cuda"), None, REPEATS)
     first = replace(fit, threads=1)
-    here = [alone(step) for step in _steps(first)]
-    scores = {"1 thread": [float(alone(first)["score"])]}
+    here = [subprocess_job(step) for step in _steps(first)]
+    scores = {"1 thread": [float(subprocess_job(first)["score"])]}
     rows = []
     for name, (job, llvm, runs) in ways.items():
-        pairs = [(one, alone(s, llvm)) for one, s in zip(here, _steps(job), strict=True) for _ in range(runs)]
-        against = f"{name} against 1 thread of LLVM {own.llvm_version}, {len(pairs)} cases"
+        pairs = [(one, subprocess_job(s, llvm)) for one, s in zip(here, _steps(job), strict=True) for _ in range(runs)]
+        against = f"{name} against 1 thread of LLVM {version}, {len(pairs)} cases"
         for what, bound in (("image", IMAGE), ("gradient", GRADIENT)):
             worst = max(distance(*pair)[what] for pair in pairs)
-            rows.append({"what": f"{what}, {against}", "value": f"worst {worst:.1e}", "asked": f"at most {bound:g}"})
-        scores[name] = [float(alone(job, llvm)["score"]) for _ in range(runs)]
-    of_all = [score for one in scores.values() for score in one]
+            rows.append(line(f"{what}, {against}", f"worst {worst:.1e}", f"at most {bound:g}"))
+        scores[name] = [float(subprocess_job(job, llvm)["score"]) for _ in range(runs)]
+    every = [score for one in scores.values() for score in one]
     listed = "; ".join(f"{name} {', '.join(f'{score:.4f}' for score in one)}" for name, one in scores.items())
-    steps = int(settings[0].removeprefix("steps="))
-    value = f"{max(of_all) - min(of_all):.4f} apart: {listed}"
-    row = {"what": f"median SSIM after {steps:,} steps, {dataset}", "value": value, "asked": f"at most {SCORE:g}"}
-    return [*rows, row], {"scores": scores}
+    steps = int(SHORT[0].removeprefix("steps="))
+    value = f"{max(every) - min(every):.4f} apart: {listed}"
+    rows.append(line(f"median SSIM after {steps:,} steps, {dataset}", value, f"at most {SCORE:g}"))
+    return rows, {"scores": scores}
 
 
 def _steps(fit: Job) -> list[Job]:
-    """Single steps as of a fit: of one image, and of several at once, which more threads share."""
+    """Single steps of a fit, with one image and with several."""
     return [replace(fit, kind="step", settings=(f"batch={count}",)) for count in BATCHES]
 
 
 def other_llvms() -> dict[str, Any]:
-    """Usable LLVMs of other major versions than this process computes with: name to file."""
-    own = (init().llvm_version or "").split(".")[0]
+    """Files of usable LLVM libraries of other major versions than this process uses, by name."""
+    major = (init().llvm_version or "").split(".")[0]
     found: dict[str, Any] = {}
     for library in find_llvm(ignore_variable=True):
         verdict = try_llvm(library)
-        if verdict.usable and verdict.version.split(".")[0] != own:
+        if verdict.usable and verdict.version.split(".")[0] != major:
             found.setdefault(f"LLVM {verdict.version}", library.path)
     return found
 
@@ -157,10 +136,7 @@ def cuda_works() -> bool:
 
 
 def main() -> dict[str, Any]:
-    """All of it: on measured spectra where they are on this machine, else on the laboratory's."""
+    """All rows, on measured spectra where they are on this machine, else on the laboratory's."""
     dataset = MEASURED if locate(MEASURED) else LABORATORY
     rows, scores = apart(dataset)
     return {"rows": [*again(dataset), *rows], **scores}
-
-
-__all__ = ["again", "apart", "cuda_works", "different", "distance", "main", "other_llvms"]

@@ -1,7 +1,7 @@
-"""Every way to predict a spectrum, made ready on one data set: what the Pareto plot of the benchmark compares.
+"""Methods of predicting spectra that the Pareto plot compares.
 
-A method is a name, a family and a function from a `Place` to a `Ready`. To have another one measured, append it to
-`METHODS`.
+A method is a name, a family and a function from a `MethodInput` to a `FittedMethod`. To compare another method, append
+it to `METHODS`.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from wrf_mi.training.config import TrainConfig
 from .stock import StockRenderer, rgb_variant
 
 Predict = Callable[[FloatArray], NDArray[Any]]
-"""From transmitter positions [m, 3] in metres to spectra [m, height, width]."""
+"""Function from transmitter positions [m, 3] in metres to spectra [m, height, width]."""
 
 STEPS = 3000
-"""Of every learned field: a third of the default schedule, so that all of them together take minutes."""
+"""Training steps of every learned field: a third of the default, so that all fits take minutes."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """What methods are given.
+class MethodInput:
+    """Data and schedule of the methods.
 
     Attributes:
         record: spectra of one receiver.
-        scene: mesh of the place.
-        folder: for runs; a finished one with the same key (`wrf_mi.runs.fit_key`) is used again.
+        scene: mesh of the scene.
+        folder: folder of runs; a finished run with the same key (`wrf_mi.runs.fit_key`) is used again.
         rows: number of training rows; None: all.
-        steps: of each learned field.
-        seed: of subset and fits.
+        steps: training steps of each learned field.
+        seed: seed of the subset and of fits.
     """
 
     record: Record
@@ -63,19 +63,19 @@ class Place:
 
     @property
     def split(self) -> Split:
-        """Rows that train and rows that score."""
+        """Training and test rows."""
         return make_splits(self.record, "official", self.seed, self.rows)[0]
 
 
 @dataclass(frozen=True)
 class FittedMethod:
-    """A method that can predict.
+    """A fitted method.
 
     Attributes:
-        predict: the method.
-        stored_mb: what has to be kept for it, MB.
-        train_seconds: that making it ready took.
-        context: what ``predict`` runs in where it is timed, see `wrf_mi.runs.timing.Within`; None: nothing.
+        predict: predictions.
+        stored_mb: size of its stored parameters, MB.
+        train_seconds: training time.
+        context: context of timed predictions, see `wrf_mi.runs.timing.Within`; None: none.
     """
 
     predict: Predict
@@ -84,25 +84,18 @@ class FittedMethod:
     context: Callable[[], AbstractContextManager[Any]] | None = None
 
     def call(self, tx_pos_m: FloatArray) -> Call:
-        """A prediction to be timed."""
-        own = partial(self.predict, tx_pos_m)
-        return own if self.context is None else Within(own, self.context)
+        """Prediction as a timed call."""
+        call = partial(self.predict, tx_pos_m)
+        return call if self.context is None else Within(call, self.context)
 
 
 @dataclass(frozen=True)
 class Method:
-    """One point of the plot.
-
-    Attributes:
-        name: for tables and labels.
-        family: methods of one family differ by a budget; they share a colour and a line.
-        make: makes it ready.
-        batches: whether it has something to gain from many transmitters at once.
-    """
+    """A point of the plot: name, family (colour and line), function that fits it, and whether it predicts batches."""
 
     name: str
     family: str
-    make: Callable[[Place], FittedMethod]
+    make: Callable[[MethodInput], FittedMethod]
     batches: bool = True
 
 
@@ -110,42 +103,42 @@ def _megabytes(arrays: Sequence[Any]) -> float:
     return sum(np.asarray(array).nbytes for array in arrays) / 1e6
 
 
-def _blend(place: Place) -> FittedMethod:
-    rows, record = place.split.all_train, place.record
+def _blend(given: MethodInput) -> FittedMethod:
+    rows, record = given.split.all_train, given.record
     fitted = InverseDistance().fit(record.tx_pos_m[rows], record.observation[0][rows])
     # Spectra are kept as the instrument writes them, 8 bits a pixel.
     return FittedMethod(fitted.predict, record.observation[0][rows].size / 1e6)
 
 
-def _kriging(place: Place) -> FittedMethod:
-    from .box_room import LENGTH_M, NOISE
+def _kriging(given: MethodInput) -> FittedMethod:
+    from .physics_room import LENGTH_M, NOISE
 
-    rows, record = place.split.all_train, place.record
+    rows, record = given.split.all_train, given.record
     fitted = Kriging(LENGTH_M, NOISE).fit(record.tx_pos_m[rows], record.observation[0][rows])
     return FittedMethod(fitted.predict, _megabytes([record.observation[0][rows].astype(np.float32)]))
 
 
-def field_run(place: Place, model: str, gaussians: int) -> Run:
-    """A field of a fixed number of Gaussians, trained with the place's short schedule or used again."""
-    settings = [f"model={model}", f"steps={place.steps}", f"initial.gaussians={gaussians}"]
-    settings += ["holdout_steps_fraction=0", "density.every=0", f"validate_every={place.steps}"]
-    config = with_settings(TrainConfig(seed=place.seed), settings)
-    folder = place.folder / f"{model}-{gaussians}-{fit_key(place.record, place.split, config)}"
-    fit_once(folder, lambda: train(place.record, folder, model, settings=config, n_train=place.rows))
-    return Run(folder, place.record)
+def field_run(given: MethodInput, model: str, gaussians: int) -> Run:
+    """Run of a field with a fixed number of Gaussians, trained or used again."""
+    settings = [f"model={model}", f"steps={given.steps}", f"initial.gaussians={gaussians}"]
+    settings += ["holdout_steps_fraction=0", "density.every=0", f"validate_every={given.steps}"]
+    config = with_settings(TrainConfig(seed=given.seed), settings)
+    folder = given.folder / f"{model}-{gaussians}-{fit_key(given.record, given.split, config)}"
+    fit_once(folder, lambda: train(given.record, folder, model, settings=config, n_train=given.rows))
+    return Run(folder, given.record)
 
 
-def _field(place: Place, model: str, gaussians: int) -> FittedMethod:
-    run = field_run(place, model, gaussians)
+def _field(given: MethodInput, model: str, gaussians: int) -> FittedMethod:
+    run = field_run(given, model, gaussians)
     return FittedMethod(run.predictor(), _megabytes(list(run.field.params.values())), run.metrics["train_seconds"])
 
 
-def _stock(place: Place, gaussians: int) -> FittedMethod:
-    """The same WRF-GS+, its Gaussians computed by us and rendered by Mitsuba's own integrator."""
-    run = field_run(place, "wrf-gs+", gaussians)
+def _stock(given: MethodInput, gaussians: int) -> FittedMethod:
+    """WRF-GS+ whose Gaussians are rendered by Mitsuba's ``volprim_rf_basic``."""
+    run = field_run(given, "wrf-gs+", gaussians)
     predictor = run.predictor()
-    height, width = place.record.observation.shape[-2:]
-    renderer = StockRenderer(place.record.receivers[0], height, width)
+    height, width = given.record.observation.shape[-2:]
+    renderer = StockRenderer(given.record.receivers[0], height, width)
 
     def predict(tx_pos_m: FloatArray) -> NDArray[Any]:
         with rgb_variant():
@@ -154,22 +147,22 @@ def _stock(place: Place, gaussians: int) -> FittedMethod:
     return FittedMethod(predict, _megabytes(list(run.field.params.values())), run.metrics["train_seconds"], rgb_variant)
 
 
-def _physics(place: Place) -> FittedMethod:
-    settings = kind_of(place.record, True).settings()
-    key = fit_key(place.record, place.split, scene_files(place.scene), settings, place.seed)
-    folder = place.folder / f"physics-{key}"
-    asked: dict[str, Any] = {"scene": place.scene, "n_train": place.rows, "seed": place.seed}
-    fit_once(folder, lambda: train(place.record, folder, "physics", **asked))
-    run = Run(folder, place.record)
+def _physics(given: MethodInput) -> FittedMethod:
+    settings = kind_of(given.record, True).settings()
+    key = fit_key(given.record, given.split, scene_files(given.scene), settings, given.seed)
+    folder = given.folder / f"physics-{key}"
+    asked: dict[str, Any] = {"scene": given.scene, "n_train": given.rows, "seed": given.seed}
+    fit_once(folder, lambda: train(given.record, folder, "physics", **asked))
+    run = Run(folder, given.record)
     size = (folder / FITTED).stat().st_size / 1e6
     return FittedMethod(lambda tx_pos_m: run.predict(tx_pos_m).mean, size, run.metrics["train_seconds"])
 
 
-def _tracer(place: Place, rays: int, depth: int) -> FittedMethod:
-    """The mesh as given, walls let through; what rays from the array find is kept from one prediction to the next."""
+def _tracer(given: MethodInput, rays: int, depth: int) -> FittedMethod:
+    """Ray tracing on the given mesh with transmission; rays of the array are kept between predictions."""
     options = TraceOptions(transmission=True, max_depth=depth, rays=rays)
-    tracer = RayTracer(place.scene, instrument_of(place.record), options)
-    size = sum(one.stat().st_size for one in Path(place.scene).rglob("*.ply")) / 1e6
+    tracer = RayTracer(given.scene, instrument_of(given.record), options)
+    size = sum(one.stat().st_size for one in Path(given.scene).rglob("*.ply")) / 1e6
     return FittedMethod(lambda tx_pos_m: tracer(tx_pos_m)[0], size)
 
 
@@ -194,4 +187,4 @@ METHODS: list[Method] = [
     *(_tracer_method(rays, 4) for rays in (8, 17)),
     Method("physics", "physics", _physics),
 ]
-"""All that is measured; numbers after a field's name are Gaussians, 2^17 rays the tracer's default."""
+"""All methods; the numbers after a field's name count Gaussians."""

@@ -1,4 +1,4 @@
-"""Prediction by operator against direct evaluation: time, memory and difference, and where networks take the time."""
+"""Prediction by operator compared with direct evaluation: time, memory and difference; times of networks."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.static_signals import FactorisedSignals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator
-from wrf_mi.runs.timing import Interval, bootstrap, interleaved, memory_mb, ratio
+from wrf_mi.runs.timing import bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
+from .comparison import Row, line
+from .stress_rows import relative
+
 GAUSSIANS, HEIGHT, WIDTH, BATCH = 10_000, 90, 360, 64
 SIZE_DEG = 3.0
-"""Standard deviation of each Gaussian as the receiver sees it: 115 weights a pixel."""
+"""Angular standard deviation of each Gaussian: 115 weights a pixel."""
 ELEMENTS, CARRIER_HZ = planar_array(4, 4, 0.16), 920e6
 SECTORS = (6, 4)
 SMALL = 270
-"""Gaussians of the default fit, at their default size."""
+"""Gaussians of the default fit."""
 REPEATS = 15
 RECEIVER = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
@@ -42,7 +45,7 @@ RECEIVER = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 def random_field(
     field: Any, count: int = GAUSSIANS, size_deg: float = SIZE_DEG, seed: int = 0
 ) -> dict[str, NDArray[np.float32]]:
-    """Parameters of a field of ``count`` needles and discs of any turn, at random around the receiver."""
+    """Parameters of a field of ``count`` Gaussians of random shapes and rotations around the receiver."""
     rng = np.random.default_rng(seed)
     params = field.init(random_gaussians([RECEIVER], count, rng, size_deg=size_deg), rng)
     params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
@@ -51,7 +54,7 @@ def random_field(
 
 
 def processor_ms(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Time of all processors in one call, median: what others do on the machine hardly counts."""
+    """Median processor time of a call, which depends little on other processes."""
     call()
     times = []
     for _ in range(repeats):
@@ -61,84 +64,67 @@ def processor_ms(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     return float(np.median(times))
 
 
-def relative(found: Any, expected: Any) -> float:
-    """Relative L2 difference."""
-    truth = np.asarray(expected).reshape(np.shape(found))
-    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
-
-
 class Direct:
-    """Direct evaluation of one transmitter, in two recorded halves.
-
-    Args:
-        field: the model.
-        params: its parameters.
-    """
+    """Direct evaluation of a field for one transmitter, as a recorded network and recorded splatting."""
 
     def __init__(self, field: Any, params: Mapping[str, NDArray[np.float32]]) -> None:
         self.params = {name: to_tensor(values) for name, values in params.items()}
         self.pose, self.plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
-        product = field.blending == "product"
+        self._product = field.blending == "product"
 
         @Recorded
         def network(params: Any, tx_pos: Any) -> Any:
             with dr.suspend_grad():
                 g = field.gaussians(params, tx_pos)
-                own = g.attenuation if product else [g.opacity]
-                return g.position, g.scale, g.rotation, g.signal, own
+                return g.position, g.scale, g.rotation, g.signal, g.attenuation if self._product else [g.opacity]
 
         @Recorded
         def splatted(parts: Any, pose: Any, plane: Any) -> Any:
             with dr.suspend_grad():
-                return splat(_gathered(parts, product), pose, plane)
+                return splat(self.gaussians(parts), pose, plane)
 
-        self.network, self._splatted, self._product = network, splatted, product
+        self._network, self._splatted = network, splatted
 
     def parts(self, tx_pos_m: NDArray[Any]) -> Any:
-        """Geometry, signals and attenuation at a transmitter [3], evaluated."""
-        return self.network(self.params, to_tensor(np.reshape(tx_pos_m, (3, 1))))
+        """Geometry, signals and attenuation for a transmitter [3]."""
+        return self._network(self.params, to_tensor(np.reshape(tx_pos_m, (3, 1))))
 
-    def gaussians(self, tx_pos_m: NDArray[Any]) -> Gaussians:
-        """The same as Gaussians."""
-        return _gathered(self.parts(tx_pos_m), self._product)
+    def gaussians(self, parts: Any) -> Gaussians:
+        """Gaussians of `parts`."""
+        position, scale, rotation, signal, last = (list(part) for part in parts)
+        alpha, delta = (None, last) if self._product else (last[0], None)
+        return Gaussians(position, scale, rotation, signal, alpha, delta, 1)
 
     def splat(self, parts: Any) -> Any:
-        """The complex field on the directions."""
+        """Complex field on the directions."""
         return self._splatted(parts, self.pose, self.plane)
 
     def pixels(self, tx_pos_m: NDArray[Any]) -> NDArray[Any]:
-        """Greys [pixels]."""
+        """Magnitudes [pixels]."""
         re, im = self.splat(self.parts(tx_pos_m))
         return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS).numpy()
 
 
-def _gathered(parts: Any, product: bool) -> Gaussians:
-    position, scale, rotation, signal, own = parts
-    alpha, delta = (None, list(own)) if product else (own[0], None)
-    return Gaussians(list(position), list(scale), list(rotation), list(signal), alpha, delta, 1)
-
-
 def differences(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m: NDArray[Any]) -> dict[str, float]:
-    """Relative L2 difference of all three operators from direct evaluation, for one transmitter; sectors in dB."""
+    """Relative L2 difference of the operators from direct evaluation for one transmitter; in dB for sectors."""
     direct = Direct(field, params)
-    gaussians = direct.gaussians(tx_pos_m)
+    gaussians = direct.gaussians(direct.parts(tx_pos_m))
     pose, plane = direct.pose, direct.plane
     signal = (gaussians.signal[0].numpy() + 1j * gaussians.signal[1].numpy())[None]
     array = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)(None, splat(gaussians, pose, plane)).numpy()
     power = PowerReceiver(HEIGHT, WIDTH, (CARRIER_HZ,))(None, learned_field(gaussians, pose, plane, True)).numpy()
-    own = ArrayOperator.of(gaussians, pose, plane, ELEMENTS, CARRIER_HZ)
+    spectrum = ArrayOperator.of(gaussians, pose, plane, ELEMENTS, CARRIER_HZ).spectrum(signal)[0]
+    magnitude = PixelOperator.of(gaussians, pose, plane).magnitude(signal, SQUARED_MAGNITUDE_EPS)[0]
+    pixels, power_db = direct.pixels(tx_pos_m), SectorOperator.of(gaussians, pose, plane).power_db(signal)
     return {
-        "array": relative(own.spectrum(signal)[0], array),
-        "pixels": relative(
-            PixelOperator.of(gaussians, pose, plane).magnitude(signal, SQUARED_MAGNITUDE_EPS)[0],
-            direct.pixels(tx_pos_m),
-        ),
-        "rssi_db": float(np.abs(SectorOperator.of(gaussians, pose, plane).power_db(signal) - power).max()),
+        "array": relative(spectrum.ravel() - array.ravel(), array),
+        "pixels": relative(magnitude.ravel() - pixels.ravel(), pixels),
+        "rssi_db": float(np.abs(power_db - power).max()),
     }
 
 
 def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
-    """Where the time of a network-driven prediction goes, ms: network, splatting, both, and by operator."""
+    """Times of a prediction, ms: network, splatting, both, and by operator."""
     found = {}
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     cases: dict[str, tuple[Any, int, float]] = {
@@ -166,13 +152,13 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
 
 
 def main() -> dict[str, Any]:
-    """All of it, with rows for the table."""
+    """Times, memory and differences, with rows for the table."""
     rng = np.random.default_rng(0)
     field = Factorised()
     params = random_field(field)
     direct = Direct(field, params)
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
-    gaussians = direct.gaussians(tx[0])
+    gaussians = direct.gaussians(direct.parts(tx[0]))
     pose, plane = direct.pose, direct.plane
     model = ArrayReceiver(HEIGHT, WIDTH, ELEMENTS, CARRIER_HZ)
     build: dict[str, Callable[[], Any]] = {
@@ -228,39 +214,21 @@ def main() -> dict[str, Any]:
         "pixels, composed": images.table.nbytes / 1e6,
         "sectors": sectors.matrix.nbytes / 1e6,
     }
-    rows = _rows(times, processor, gain, built, memory, size, apart, networks)
-    return {"rows": rows, "times_ms": {name: str(t) for name, t in times.items()}, "weights": int(pixels.weights.nnz)}
-
-
-def _rows(
-    times: Mapping[str, Interval],
-    processor: Mapping[str, float],
-    gain: Mapping[str, Interval],
-    built: Mapping[str, Interval],
-    memory: Mapping[str, float],
-    size: Mapping[str, float],
-    apart: Mapping[str, Mapping[str, float]],
-    networks: Mapping[str, Mapping[str, Interval]],
-) -> list[dict[str, str]]:
-    rows = []
-
-    def row(what: str, value: str, asked: str = "") -> None:
-        rows.append({"what": what, "value": value, "asked": asked})
-
     asked = {"array, 1": "1 ms", f"array, {BATCH}": "0.15 ms, aim 0.05"}
+    rows: list[Row] = []
     for name, found in times.items():
         kind, _, count = name.rpartition(", ")
         what = {"1": f"{kind}, one transmitter", str(BATCH): f"{kind}, each of {BATCH}"}.get(count, name)
-        row(what, f"{found} ms; processors {processor[name]:.3g} ms", asked.get(name, ""))
-    for name, interval in gain.items():
-        row(f"times faster than direct: {name}", str(interval))
-    for name, interval in built.items():
-        row(f"building: {name}", f"{interval} ms, {memory[name]:.0f} MB beside what it holds")
-    for name, megabytes in size.items():
-        row(f"size: {name}", f"{megabytes:.2g} MB")
-    for name, one in apart.items():
-        text = f"array {one['array']:.1e}, pixels {one['pixels']:.1e}, RSSI {one['rssi_db']:.1e} dB"
-        row(f"relative L2 difference from direct, {name}", text, "1e-4")
-    for name, split in networks.items():
-        row(f"ms of one spectrum, {name}", "; ".join(f"{key} {interval}" for key, interval in split.items()))
-    return rows
+        rows.append(line(what, f"{found} ms; processors {processor[name]:.3g} ms", asked.get(name, "")))
+    rows += [line(f"times faster than direct: {name}", str(interval)) for name, interval in gain.items()]
+    rows += [
+        line(f"building: {name}", f"{ms} ms, {memory[name]:.0f} MB beside its result") for name, ms in built.items()
+    ]
+    rows += [line(f"size: {name}", f"{megabytes:.2g} MB") for name, megabytes in size.items()]
+    for name, errors in apart.items():
+        text = f"array {errors['array']:.1e}, pixels {errors['pixels']:.1e}, RSSI {errors['rssi_db']:.1e} dB"
+        rows.append(line(f"relative L2 difference from direct, {name}", text, "1e-4"))
+    for name, shares in networks.items():
+        text = "; ".join(f"{key} {interval}" for key, interval in shares.items())
+        rows.append(line(f"ms of one spectrum, {name}", text))
+    return {"rows": rows, "times_ms": {name: str(t) for name, t in times.items()}, "weights": int(pixels.weights.nnz)}

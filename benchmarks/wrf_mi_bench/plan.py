@@ -1,9 +1,8 @@
-"""Walls found in a robot's map and LiDAR returns of a furnished flat, against the walls that were measured by hand."""
+"""Walls found in a robot's map and LiDAR returns of a furnished flat, compared with walls measured by hand."""
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ import shapely
 
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.datasets.registry import locate
 from wrf_mi.scene.plan import read_walls
 from wrf_mi.scene.plan_align import grid_from_scans
 from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_plan
@@ -19,23 +17,20 @@ from wrf_mi.scene.plan_walls import find_walls
 from wrf_mi.scene.register import register_walls
 from wrf_mi.scene.register_search import sample_walls
 
+from .comparison import data_folder, line
+
 NEAR_M = 0.2
-"""Walls agree within the blur of the robot's poses."""
+"""Distance within which walls agree: the blur of the robot's poses."""
 GRID_RESOLUTION_M = 0.04
-"""Of the SLAM map, whose file does not tell: ``size = 20, res = 0.04`` in the notebook of its author
-(github.com/marckolak/graphSLAM, examples/Mapping.ipynb), so 500 cells; registration to the layout finds the same."""
+"""Resolution of the SLAM map: ``size = 20, res = 0.04``, so 500 cells, in the notebook of its author
+(github.com/marckolak/graphSLAM, examples/Mapping.ipynb); registration to the layout finds the same."""
 GRID_ROW_0: Row0 = "top"
-"""Of the same map, which does not tell either: registration to the layout refuses its mirror image."""
+"""Side of the map's first row; registration to the layout refuses the mirror image."""
 ASKED = "0.85 and 0.85"
 
 
 def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_M) -> tuple[float, float]:
-    """How well made walls agree with true ones.
-
-    Args:
-        made_m: end points [n, 2, 2], metres.
-        true_m: end points [m, 2, 2], metres.
-        near_m: distance within which walls agree.
+    """Agreement of walls [n, 2, 2] made with true ones [m, 2, 2], end points in m.
 
     Returns:
         Share of the true walls' length that lies near a made wall, and the reverse.
@@ -46,24 +41,15 @@ def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_
     return float(found), float(right)
 
 
-def flat_plan(folder: str | Path | None = None) -> dict[str, Any]:
-    """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv`` and compared.
+def flat_plan() -> dict[str, Any]:
+    """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv``.
 
-    Beside it stands what no method can exceed that puts walls only where something was seen: the share of the layout
-    within reach of any occupied cell.
-
-    Args:
-        folder: of flat-ble; by default the known data set's.
+    An upper bound for any method is the share of the layout near an occupied cell.
 
     Returns:
         ``rows`` for the table, and per source: shares, what can be seen, walls, scale of the registration, seconds.
-
-    Raises:
-        InputError: the data are not there, or the registration is refused.
     """
-    home = Path(folder) if folder is not None else locate("flat-ble")
-    if home is None:
-        raise InputError("flat-ble: not on this machine; fetch it or name its folder in WRF_MI_DATA")
+    home = data_folder("flat-ble")
     true = read_walls(home / "layout.csv")
     lidar = home / "lidar"
     grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0), read_plan(lidar / "points.npz")
@@ -79,11 +65,11 @@ def flat_plan(folder: str | Path | None = None) -> dict[str, Any]:
         "points without alignment": _measured(grid_from_points(returns.xy_m), true, register=False),
     }
     rows = [
-        {
-            "what": f"{name}: layout within {NEAR_M} m of a wall made, and the reverse",
-            "value": f"{f['layout_found']:.2f} and {f['walls_right']:.2f} (seen at all: {f['layout_seen']:.2f})",
-            "asked": ASKED if name == "gridmap" else "-",
-        }
+        line(
+            f"{name}: layout within {NEAR_M} m of a wall made, and the reverse",
+            f"{f['layout_found']:.2f} and {f['walls_right']:.2f} (seen at all: {f['layout_seen']:.2f})",
+            ASKED if name == "gridmap" else "-",
+        )
         for name, f in figures.items()
     ]
     return {"rows": rows, **figures}

@@ -1,10 +1,8 @@
-"""The quick benchmark: ratios of interleaved pairs of calls, held against stored ones.
+"""Quick benchmark: ratios of the times of interleaved pairs of calls, compared with stored ratios.
 
-Absolute times depend on the machine and on what else it does; the ratio of two calls that take turns in one process
-does so much less. On a CPU it is one of processor times on one thread, which others on the machine hardly change: with
-times on the clock and two threads the same ratios moved up to nine times. A ratio here is of what the package does over
-what it would do without the part that is measured, so that a larger one is worse. `wrf-mi bench --quick` fails where
-the whole 95 % interval of a ratio lies above `WORSE` times the stored one.
+Ratios depend less on the machine and its load than times. On a CPU they are ratios of processor times on one thread,
+as those of elapsed times on two threads varied nine times more. A larger ratio is worse. `wrf-mi bench --quick` fails
+where the whole 95 % interval of a ratio lies above `WORSE` times the stored one.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,45 +21,35 @@ import mitsuba as mi
 import numpy as np
 
 from wrf_mi.backend import init
-from wrf_mi.backend.device import to_float, to_tensor
-from wrf_mi.core import InputError, Record
-from wrf_mi.core.arrays import planar_array
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.runs.folder import versions
 from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
-from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
-from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.step import CompiledPredictor, device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, machine
 from .stock import StockRenderer, rgb_variant
-from .traced import random_field, scene_of
+from .workloads import HEIGHT, WIDTH, field, integrator, physics, record, splatting, tracer
 
 FILE = "quick.json"
 WORSE = 2.0
-"""Times the stored ratio; below that a slower machine or a busy one would fail."""
-HEIGHT, WIDTH = 90, 360
+"""Allowed ratio of a measured to a stored ratio; machines and their load change ratios by less."""
 REPEATS, MOST_S = 15, 5.0
-"""Pairs of each kind; no further one begins after so many seconds."""
+"""Rounds of a pair, and seconds after which no further round begins."""
+OPTIONS = TraceOptions(rays=1 << 14)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two calls whose times are compared.
-
-    Attributes:
-        name: of the ratio, in the stored file.
-        title: for the table: what over what.
-        make: gives both calls, ready: ours and the other.
-    """
+    """Two calls whose times are compared: name in the stored file, title in the table, and maker of both calls."""
 
     name: str
     title: str
@@ -69,26 +57,18 @@ class Pair:
 
 
 def _splatting() -> tuple[Call, Call]:
-    gaussians, receiver = random_field(0, "alpha", 500, 5.0, opacity=0.3)
-    pose, plane = device_pose(receiver), perception_plane(HEIGHT, WIDTH, mi.Float)
-    return lambda: splat(gaussians, pose, plane), Within(_stock(gaussians, receiver).render, rgb_variant)
+    given = field(500, 5.0, opacity=0.3)
+    return splatting(*given), Within(_stock(*given).render, rgb_variant)
 
 
 def _integrator() -> tuple[Call, Call]:
-    gaussians, receiver = random_field(0, "alpha", 500, 5.0, opacity=0.3)
-    scene = scene_of(gaussians, receiver)
-    params, data = mi.traverse(scene), mi.traverse(scene)["gaussians.data"].numpy().copy()
+    gaussians, receiver = field(500, 5.0, opacity=0.3)
     stock = _stock(gaussians, receiver)
 
-    def ours() -> Any:
-        params["gaussians.data"] = to_float(data)
-        params.update()
-        return mi.render(scene)
-
-    def theirs() -> Any:
+    def theirs() -> None:
         stock.field(gaussians)
 
-    return ours, Within(theirs, rgb_variant)
+    return integrator(gaussians, receiver), Within(theirs, rgb_variant)
 
 
 def _stock(gaussians: Any, receiver: Any) -> StockRenderer:
@@ -97,29 +77,10 @@ def _stock(gaussians: Any, receiver: Any) -> StockRenderer:
     return stock
 
 
-def _record(rows: int) -> Record:
-    """Made-up spectra: what is measured does not depend on what they show."""
-    rng = np.random.default_rng(0)
-    return Record(
-        name="made-up",
-        task="spectrum",
-        tx_pos_m=transmitter_path(rows),
-        receivers=(RECEIVER,),
-        observation=rng.random((1, rows, HEIGHT, WIDTH)).astype(np.float32),
-    )
-
-
 def _training() -> tuple[Call, Call]:
-    record = _record(20)
-    settings = (
-        "steps=100000",
-        "density.every=0",
-        "log_every=100000",
-        "validate_every=100000",
-        "holdout_steps_fraction=0",
-    )
-    config = with_settings(TrainConfig(), settings)
-    frozen, fresh = (Trainer(record, make_splits(record, "random")[0], config) for _ in range(2))
+    never = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
+    config, split = with_settings(TrainConfig(), ["steps=100000", *never]), make_splits(record(20), "random")[0]
+    frozen, fresh = (Trainer(record(20), split, config) for _ in range(2))
 
     def ours() -> None:
         frozen.run(stop=lambda: True)  # asked after each step: one is taken
@@ -133,12 +94,11 @@ def _training() -> tuple[Call, Call]:
 
 def _batch() -> tuple[Call, Call]:
     count, rng = 16, np.random.default_rng(0)
-    trainer = Trainer(_record(count), make_splits(_record(count), "random")[0], TrainConfig())
+    trainer = Trainer(record(count), make_splits(record(count), "random")[0], TrainConfig())
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
-    field, pose = trainer.field, device_pose(RECEIVER)
-    plane, positions = perception_plane(HEIGHT, WIDTH, mi.Float), transmitter_path(count)
-    positions = positions[rng.permutation(count)]
-    together, alone = CompiledPredictor(field), CompiledPredictor(field)
+    pose, plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
+    positions = transmitter_path(count)[rng.permutation(count)]
+    together, alone = CompiledPredictor(trainer.field), CompiledPredictor(trainer.field)
     dr.eval(params)
 
     def ours() -> Any:
@@ -150,49 +110,30 @@ def _batch() -> tuple[Call, Call]:
     return ours, theirs
 
 
-def _tracer() -> RayTracer:
-    array_m = planar_array(4, 4, SPACING_M)
-    receivers = (replace(RECEIVER, array_m=array_m),)
-    instrument = SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
-    return RayTracer("laboratory", instrument, TraceOptions(rays=1 << 14))
-
-
 def _kept_rays() -> tuple[Call, Call]:
-    tracer, one = _tracer(), transmitter_path(1)
-    return lambda: tracer(one), lambda: _tracer_anew(tracer, one)
+    kept, tx_pos_m = tracer(OPTIONS), transmitter_path(1)
 
+    def theirs() -> Any:
+        paths = trace_paths(kept.scene, tx_pos_m, kept.instrument.receivers, kept.options).paths
+        return kept.instrument.observe(paths)
 
-def _tracer_anew(tracer: RayTracer, tx_pos_m: Any) -> Any:
-    paths = trace_paths(tracer.scene, tx_pos_m, tracer.instrument.receivers, tracer.options).paths
-    return tracer.instrument.observe(paths)
+    return lambda: kept(tx_pos_m), theirs
 
 
 def _gains() -> tuple[Call, Call]:
-    scene, tx, options = open_scene("laboratory", FREQUENCY_HZ), transmitter_path(64), TraceOptions(rays=1 << 14)
-    traced = trace_paths(scene, tx, RECEIVER, options)
-    return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, options)
+    scene, tx = open_scene("laboratory", FREQUENCY_HZ), transmitter_path(64)
+    traced = trace_paths(scene, tx, RECEIVER, OPTIONS)
+    return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, OPTIONS)
 
 
 def _physics() -> tuple[Call, Call]:
-    """The physics model of a room without a measurement evaluates the paths that the tracer finds, in NumPy."""
-    from wrf_mi.models.physics.selection import kind_of
-
-    tracer, one = _tracer(), transmitter_path(1)
-    kind = kind_of(_record(20), True)
-    receivers, carrier_hz = tracer.instrument.receivers, np.array([FREQUENCY_HZ])
-    record = Record("made-up", "spectrum", one, receivers, _record(1).observation, frequencies_hz=carrier_hz)
-    model = kind.fit(record, np.zeros(0, np.int64), tracer.scene, kind.settings(), 0, lambda what, share: None)
-    return lambda: model.predict(one, 0).mean, lambda: tracer(one)
-
-
-def on_cpu() -> bool:
-    """Whether kernels run on processors, whose time this process knows."""
-    return init().name != "cuda"
+    traced, tx_pos_m = tracer(OPTIONS), transmitter_path(1)
+    return physics(1), lambda: traced(tx_pos_m)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Dr.Jit's kernels on one thread."""
+    """Context with Dr.Jit's kernels on one thread."""
     before = dr.thread_count()
     init(threads=1)
     try:
@@ -210,7 +151,7 @@ PAIRS: list[Pair] = [
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
     Pair("physics", "a physics model's prediction over the ray tracer's, one transmitter", _physics),
 ]
-"""All that is compared."""
+"""All pairs, ours and the other call."""
 
 
 def measure_pairs(
@@ -221,10 +162,11 @@ def measure_pairs(
     for pair in pairs:
         ours, theirs = pair.make()
         with one_thread():
-            times = interleaved({"ours": ours, "theirs": theirs}, repeats, most_s=most_s, processor=on_cpu())
-        own = ratio(times["ours"], times["theirs"])
-        found[pair.name] = vars(own) | {f"{name}_ms": float(np.median(ms)) for name, ms in times.items()}
-        print(f"{pair.title}: {own}", file=sys.stderr)
+            calls, processor = {"ours": ours, "theirs": theirs}, init().name != "cuda"
+            times = interleaved(calls, repeats, most_s=most_s, processor=processor)
+        interval = ratio(times["ours"], times["theirs"])
+        found[pair.name] = vars(interval) | {f"{name}_ms": float(np.median(ms)) for name, ms in times.items()}
+        print(f"{pair.title}: {interval}", file=sys.stderr)
     return found
 
 
@@ -239,20 +181,7 @@ def worse(measured: Mapping[str, Mapping[str, float]], stored: Mapping[str, Mapp
 
 
 def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, Any]:
-    """Measure all pairs, and store them or hold them against what is stored.
-
-    Args:
-        out: folder of the stored ratios, see `file_of`.
-        store: write it.
-        pairs: to measure.
-
-    Returns:
-        What is (or would be) stored.
-
-    Raises:
-        InputError: nothing is stored, or what is cannot be read or comes from another kind of device.
-        BenchFailed: a ratio is worse.
-    """
+    """Ratios of all pairs, stored in ``out`` or else compared with stored ones (`BenchFailed` where one is worse)."""
     file = file_of(out)
     stored = None if store else read_stored(file)
     start = time.perf_counter()
@@ -277,16 +206,12 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
 
 
 def file_of(out: Path) -> Path:
-    """Stored ratios of the backend that this process computes with: ``quick.json``, or ``quick-cuda.json``."""
-    return out / (FILE if (own := init().name) == "llvm" else FILE.replace(".", f"-{own}."))
+    """File of this backend's stored ratios: ``quick.json``, or ``quick-cuda.json``."""
+    return out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
 
 
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
-    """Stored ratios.
-
-    Raises:
-        InputError: no such file, not such a file, or one from another backend, where other ratios are right.
-    """
+    """Stored ratios."""
     try:
         content = json.loads(file.read_text())
         ratios: dict[str, dict[str, float]] = content["figures"]["ratios"]
@@ -295,8 +220,8 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
         raise InputError(f"{file}: no stored ratios; measure them with `wrf-mi bench --quick --store`") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: not readable ({one_line(error)}); restore it") from None
-    if backend != (own := init().name):
-        raise InputError(f"{file}: ratios of the backend {backend}; store those of {own} in another folder with --out")
+    if backend != (name := init().name):
+        raise InputError(f"{file}: ratios of the backend {backend}; store those of {name} in another folder with --out")
     return ratios
 
 

@@ -1,37 +1,174 @@
-"""Cost against work: times and memory of `wrf_mi_bench.scaling_axes.AXES`, and the exponents of their growth."""
+"""Growth of time and memory with the size of the work, and exponents of the growth."""
 
 from __future__ import annotations
 
 import gc
 import logging
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from wrf_mi_scenes.divided import cluttered_room, divided_room
 
-from wrf_mi.runs.timing import Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
+from wrf_mi.backend.device import to_tensor
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import FIELDS, InitialGaussians, random_gaussians
+from wrf_mi.gaussians.chunks import gaussians_in_parts
+from wrf_mi.receivers import bartlett_spectrum, element_signals
+from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
+from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.training.config import TrainConfig
+from wrf_mi.training.fields import make_field
+from wrf_mi.training.predictor import Predictor
 
-from .scaling_axes import AXES, Axis
+from .comparison import line
+from .workloads import HEIGHT, WIDTH, field, integrator, physics, size_deg, splatting, tracer
 
 logger = logging.getLogger(__name__)
 
 REPEATS, MOST_S = 7, 8.0
-"""Timed calls of each size; after so many seconds no further one begins, three are timed in any case."""
+"""Timed calls of each size, and seconds after which no further call begins; three are timed in any case."""
 CALL_S = 100.0
-"""A size is left out when, growing as n^1.1, its call would take longer than that; the row says so."""
+"""Expected seconds of a call, at growth as n^1.1, beyond which a size is skipped."""
 SLOW_MS, FEW = 4000.0, 2
-"""Calls that take longer than that are timed so often, without a further warm-up."""
+"""Milliseconds of a slow call, and timed calls of a slow one, without warm-up."""
+GAUSSIANS, ELEMENTS = 1000, 16
+"""Numbers where another size grows."""
+SMALL = 90
+"""Gaussians of the field that predicts for thousands of transmitters."""
+OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A call whose cost is measured while a size grows.
+
+    Attributes:
+        name: name for JSON.
+        title: what is called, for the table.
+        work: what the size counts.
+        sizes: ascending sizes.
+        make: makes the call of a size; its time does not count.
+    """
+
+    name: str
+    title: str
+    work: str
+    sizes: tuple[int, ...]
+    make: Callable[[int], Call]
+
+
+def _splat(count: int, height: int = HEIGHT, width: int = WIDTH) -> Call:
+    gaussians, receiver = field(count)
+    return splatting(gaussians, receiver, height, width)
+
+
+def _integrator(count: int) -> Call:
+    return integrator(*field(count))
+
+
+def _directions(make: Callable[..., Call], count: int, directions: int) -> Call:
+    finer = round(np.sqrt(directions / (HEIGHT * WIDTH)))
+    return make(count, HEIGHT * finer, WIDTH * finer)
+
+
+def _start(count: int) -> InitialGaussians:
+    return random_gaussians([RECEIVER], count, np.random.default_rng(0), size_deg=size_deg(count))
+
+
+def _networks(count: int) -> Call:
+    """Geometry and signals of WRF-GS+ for one transmitter."""
+    field = FIELDS["wrf-gs+"]()
+    params = {k: to_tensor(v) for k, v in field.init(_start(count), np.random.default_rng(0)).items()}
+    tx = to_tensor(transmitter_path(1).T)
+    return lambda: vars(gaussians_in_parts(field, params, tx))
+
+
+def _field(transmitters: int) -> Call:
+    tx = transmitter_path(transmitters)
+    field = make_field(TrainConfig().resolved(tx))
+    predictor = Predictor(field, field.init(_start(SMALL), np.random.default_rng(0)), [RECEIVER], HEIGHT, WIDTH)
+    return lambda: predictor(tx)
+
+
+def _tracer(transmitters: int) -> Call:
+    return partial(tracer(OPTIONS), transmitter_path(transmitters))
+
+
+def _array(elements: int) -> Any:
+    side = int(np.sqrt(elements))
+    return planar_array(side, side, SPACING_M)
+
+
+@cache
+def _paths() -> Any:
+    scene = open_scene("laboratory", FREQUENCY_HZ)
+    return trace_paths(scene, transmitter_path(64), RECEIVER, OPTIONS).paths
+
+
+def _antennas_of_paths(elements: int) -> Call:
+    array_m = _array(elements)
+    return lambda: element_signals(_paths(), RECEIVER, array_m, FREQUENCY_HZ)
+
+
+def _bartlett(elements: int, height: int = HEIGHT, width: int = WIDTH) -> Call:
+    rng, array_m = np.random.default_rng(0), _array(elements)
+    signals = rng.standard_normal((8, elements)) + 1j * rng.standard_normal((8, elements))
+    return lambda: bartlett_spectrum(signals, array_m, FREQUENCY_HZ, height, width)
+
+
+def _opened(kind: str, triangles: int) -> Any:
+    near = np.concatenate([transmitter_path(1), RECEIVER.position_m[None]])
+    mesh = divided_room(triangles) if kind == "walls" else cluttered_room(triangles, near)
+    with tempfile.TemporaryDirectory() as work:
+        file = Path(work) / "room.ply"
+        mesh.export(file, vertex_normal=False)
+        return open_scene(file, FREQUENCY_HZ, material="concrete")
+
+
+def _trace(kind: str, triangles: int) -> Call:
+    """One transmitter in an opened mesh: its planes, rays, paths and gains."""
+    scene, tx = _opened(kind, triangles), transmitter_path(1)
+    return lambda: len(trace_paths(scene, tx, RECEIVER, OPTIONS).paths)
+
+
+def _planes(kind: str, triangles: int) -> Call:
+    scene = _opened(kind, triangles)
+    return lambda: len(scene_surfaces(scene).normal)
+
+
+TENS, HALF_TENS = (10**3, 10**4, 10**5, 300_000, 10**6), (1000, 3000, 10_000, 30_000, 100_000)
+DIRECTIONS = tuple(HEIGHT * WIDTH * k for k in (1, 4, 9, 16))
+ANTENNAS, TRANSMITTERS = (16, 64, 256, 1024), (1, 16, 256, 4096)
+TRIANGLES = (10**2, 10**3, 10**4, 10**5, 10**6)
+
+AXES: list[Axis] = [
+    Axis("gaussians-splat", "splatting", "Gaussians", TENS, _splat),
+    Axis("gaussians-integrator", "Mitsuba integrator, geometry new", "Gaussians", HALF_TENS, _integrator),
+    Axis("gaussians-networks", "networks of WRF-GS+", "Gaussians", HALF_TENS, _networks),
+    Axis("directions-splat", "splatting", "directions", DIRECTIONS, partial(_directions, _splat, GAUSSIANS)),
+    Axis("directions-array", "Bartlett spectrum", "directions", DIRECTIONS, partial(_directions, _bartlett, ELEMENTS)),
+    Axis("antennas-paths", "paths", "antennas", ANTENNAS, _antennas_of_paths),
+    Axis("antennas-spectrum", "Bartlett spectrum", "antennas", ANTENNAS, _bartlett),
+    Axis("transmitters-field", "WRF-GS+ of 90 Gaussians", "transmitters", TRANSMITTERS, _field),
+    Axis("transmitters-physics", "physics", "transmitters", TRANSMITTERS, physics),
+    Axis("transmitters-tracer", "ray tracer", "transmitters", TRANSMITTERS, _tracer),
+    Axis("triangles-planes", "finding planes, divided walls", "triangles", TRIANGLES, partial(_planes, "walls")),
+    Axis("triangles-walls", "one trace, divided walls", "triangles", TRIANGLES, partial(_trace, "walls")),
+    Axis("triangles-clutter", "one trace, clutter", "triangles", TRIANGLES, partial(_trace, "clutter")),
+]
+"""All axes. Networks and integrator end at 1e5 Gaussians, as ten times as many take gigabytes."""
 
 
 def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: float = CALL_S) -> dict[str, Any]:
     """Times and memory of one call at each size.
-
-    Args:
-        axis: what grows.
-        repeats: timed calls.
-        most_s: bound of the timed calls of one size, seconds; three (of slow ones `FEW`) are timed in any case.
-        call_s: see `CALL_S`.
 
     Returns:
         ``sizes`` that were measured, ``left_out``, ``ms`` and ``memory_mb`` of each, and the ``exponent`` of time with
@@ -61,7 +198,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         "work": axis.work,
         "sizes": sizes,
         "left_out": list(axis.sizes[len(sizes) :]),
-        "ms": [float(np.median(own)) for own in times],
+        "ms": [float(np.median(ms)) for ms in times],
         "memory_mb": memory,
         "exponent": vars(found),
         "limit": n_log_n(sizes),
@@ -69,7 +206,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
 
 
 def verdict(found: Interval, limit: float) -> str:
-    """Whether growth is at most that of the limit: only what lies above it with its whole interval is not."""
+    """Whether growth is at most that of the limit; it fails only where its whole interval lies above."""
     if found.low > limit:
         return "does not hold"
     return "holds" if found.high <= limit else "holds within its interval"
@@ -84,13 +221,13 @@ def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
         missing = f", {one['left_out'][0]:,} left out: too slow" if one["left_out"] else ""
         growth = [f"{ms:.3g} ms" for ms in one["ms"]]
         memory = [f"{mb:.0f}" for mb in one["memory_mb"]]
+        value = f"exponent {found.value:.2f} ({found.low:.2f} to {found.high:.2f}) from {kept[0]:,}"
         made.append(
-            {
-                "what": f"{sizes[0]:,} to {sizes[-1]:,} {one['work']}, {one['title']}{missing}",
-                "value": f"exponent {found.value:.2f} ({found.low:.2f} to {found.high:.2f}) from {kept[0]:,}; "
-                f"{', '.join(growth)}; {', '.join(memory)} MB",
-                "asked": f"at most n log n ({one['limit']:.2f}): {verdict(found, one['limit'])}",
-            }
+            line(
+                f"{sizes[0]:,} to {sizes[-1]:,} {one['work']}, {one['title']}{missing}",
+                f"{value}; {', '.join(growth)}; {', '.join(memory)} MB",
+                f"at most n log n ({one['limit']:.2f}): {verdict(found, one['limit'])}",
+            )
         )
     return made
 

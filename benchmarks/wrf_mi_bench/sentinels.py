@@ -1,7 +1,6 @@
-"""Sentinels: stored figures of every task and family of models, measured again and compared with what is stored.
+"""Sentinels: figures of every task and family of models, measured again and compared with stored ones.
 
-They show within three quarters of an hour on two cores whether a change of the code made a figure worse; the tables
-take many hours. Each figure has an interval in which a second measurement counts as equal:
+They take three quarters of an hour on two cores, the tables many hours. Each figure has an interval of equality:
 
 | figures | interval |
 | --- | --- |
@@ -9,8 +8,8 @@ take many hours. Each figure has an interval in which a second measurement count
 | paths that MATLAB's image method has, found again | 95 % Wilson interval of the stored share over these paths |
 | worst errors of `stress` and of the Mitsuba integrator, fewer of the same cases | up to the bound of that benchmark |
 
-Results are kept by the content of this package's files (`wrf_mi.runs.fit_key.source_files`): a call that was stopped
-goes on, and changed code is measured anew.
+Results are kept by the content of this package's files (`wrf_mi.runs.fit_key.source_files`): a stopped call is resumed,
+and changed code is measured again.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from wrf_mi.runs.fit_key import dataset_files, fit_key, source_files
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, OFFICE, RFID, BenchFailed
-from .stress_summary import stages
+from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure
 
@@ -45,7 +44,7 @@ TABLE_ROWS = (
     *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "physics", "wrf-gs+")),
     *(f"csi-{OFFICE}-official-{name}" for name in ("physics", "wrf-gs")),
 )
-"""Rows of the tables that take at most five minutes each, at all training rows and seed 0."""
+"""Rows of the tables with all training rows and seed 0, of at most five minutes each."""
 CONFIDENCE = 0.95
 FIELDS = 5
 """Random fields of the integrator's comparison with splatting, of the 20 that are stored."""
@@ -54,15 +53,7 @@ EQUAL, BETTER, WORSE, FAILED, ABSENT = "equal", "better", "worse", "failed", "no
 
 @dataclass(frozen=True)
 class Figure:
-    """A stored figure.
-
-    Attributes:
-        name: what it is, with its unit.
-        stored: its value.
-        low: lower end of the interval in which a second measurement counts as equal.
-        high: upper end.
-        higher_is_better: whether it is an accuracy or an error.
-    """
+    """A stored figure: name with its unit, value, ends of its interval of equality, and whether higher is better."""
 
     name: str
     stored: float
@@ -71,19 +62,13 @@ class Figure:
     higher_is_better: bool
 
     def verdict(self, measured: float) -> str:
-        """``equal`` inside the interval, else ``better`` or ``worse``; what is not a number is worse."""
+        """``equal`` inside the interval, else ``better`` or ``worse``; NaN is worse."""
         if self.low <= measured <= self.high:
             return EQUAL
         return BETTER if (measured > self.high if self.higher_is_better else measured < self.low) else WORSE
 
     def row(self, measured: float | None, verdict: str, why: str = "") -> dict[str, Any]:
-        """As a row of the benchmark's table.
-
-        Args:
-            measured: None where it was not.
-            verdict: of it.
-            why: it was not measured.
-        """
+        """Row of the table; ``measured`` is None where the measurement failed, for the reason ``why``."""
         value = verdict if measured is None else f"{measured:.4g}, {verdict}"
         return {
             "what": self.name,
@@ -98,10 +83,10 @@ class Group:
     """Figures that are measured together.
 
     Attributes:
-        name: for files and progress.
-        figures: with what is stored of them.
-        measure: takes the folder for runs and gives the figures' values in their order.
-        present: whether the data are on this machine or are made here.
+        name: name for files and progress.
+        figures: stored figures.
+        measure: function from the folder of runs to the figures' values.
+        present: whether the data are on this machine or can be made here.
     """
 
     name: str
@@ -111,11 +96,7 @@ class Group:
 
 
 def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float]:
-    """Distribution-free 95 % interval of a median over test rows.
-
-    Args:
-        quantiles: of the rows' scores, equally spaced shares from 0 to 1.
-        rows: number of test rows.
+    """Distribution-free 95 % interval of a median over test rows, from equally spaced quantiles of their scores.
 
     Source: order statistics and the binomial distribution, Conover, "Practical Nonparametric Statistics" (1999),
     section 3.2; `scipy.stats.quantile_test`.
@@ -144,7 +125,7 @@ def _of_table(row: Row) -> Group:
     def again(runs: Path) -> list[float]:
         found = measure(runs, row)
         if found["data"] != stored.get("data", found["data"]):
-            raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it anew")
+            raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it again")
         return [found["score"]["median"]]
 
     return Group(row.name, (figure,), again, available(row.part))
@@ -154,10 +135,10 @@ def _stress() -> Group:
     def again(_: Path) -> list[float]:
         from .stress import QUICK
 
-        return [one.worst for one in stages([row for part in QUICK for row in part()])]
+        return [worst for _, _, worst, _ in stages([row for part in QUICK for row in part()])]
 
     known = stages(_stored("stress")["figures"]["rows"])
-    figures = [Figure(f"stress, {one.name}: worst error", one.worst, 0.0, one.bound, False) for one in known]
+    figures = [Figure(f"stress, {name}: worst error", worst, 0.0, bound, False) for name, _, worst, bound in known]
     return Group("stress", tuple(figures), again)
 
 
@@ -188,11 +169,7 @@ def _image_method(room: str, stored: Mapping[str, Any]) -> Group:
 
 
 def groups() -> list[Group]:
-    """All sentinels, with what is stored of them.
-
-    Raises:
-        InputError: a stored figure that is missing, or that the tables plan otherwise by now.
-    """
+    """All sentinels, with their stored figures."""
     planned = {row.name: row for row in plan()}
     if gone := [name for name in TABLE_ROWS if f"{name}-100-seed0" not in planned]:
         raise InputError(f"sentinel {gone[0]}: no row of the tables any more; choose another")
@@ -206,15 +183,11 @@ def groups() -> list[Group]:
 
 
 def main() -> dict[str, Any]:
-    """Measure all sentinels whose data are on this machine, but for those that this code was measured with before.
+    """Measure all sentinels whose data are on this machine, unless this code was measured before.
 
     Returns:
-        ``rows``: of each figure ``what``, ``stored``, ``low`` and ``high`` of its interval, ``measured`` (None where it
-        was not), ``verdict``, and ``date`` and ``seconds`` of the measurement, the seconds those of all figures that
-        are measured together; ``failed``: a line, where a figure got worse or could not be measured.
-
-    Raises:
-        InputError: stored figures are not on this machine.
+        ``rows``: of each figure ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and
+        ``date`` and ``seconds`` of its group; ``failed``: a line, where a figure got worse or was not measured.
     """
     known = groups()
     place = RUNS / fit_key(source_files())
@@ -232,7 +205,7 @@ def main() -> dict[str, Any]:
 
 
 def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
-    """Rows of a group, measured unless they were before."""
+    """Rows of a group, measured or read."""
     if not group.present:
         return [figure.row(None, ABSENT) for figure in group.figures]
     kept = place / f"{group.name}.json"

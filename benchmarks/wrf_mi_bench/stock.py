@@ -1,12 +1,12 @@
-"""Mitsuba's own integrator of Gaussians, ``volprim_rf_basic``, for our receivers: what there is without this package.
+"""Mitsuba's integrator of Gaussians, ``volprim_rf_basic``, for receivers of this package.
 
-It fails in the variants with polarisation that Sionna RT needs, so it runs in the rgb variant of the same backend, one
-ray for each direction. Its colours cannot be negative, so complex signals go through its three channels as
+It fails in the polarised variants that Sionna RT needs, so it runs in the rgb variant, one ray for each direction.
+Colours cannot be negative, so a complex signal S with largest magnitude a is rendered as the channels
 
-    1/2 + Re S / 2a,   1/2 + Im S / 2a,   1/2,   a the largest magnitude,
+    1/2 + Re S / 2a,   1/2 + Im S / 2a,   1/2
 
-and come back by subtracting the third from the others: the blending is linear. Left as they are: it stops at 1 %
-transmittance and after 64 Gaussians, lets at most 0.9999 be absorbed, and makes ellipsoids of low opacity smaller.
+and recovered by subtracting the third, as the blending is linear. The integrator stops at 1 % transmittance and after
+64 Gaussians, absorbs at most 0.9999, and makes ellipsoids of low opacity smaller.
 """
 
 from __future__ import annotations
@@ -32,31 +32,23 @@ DEGREE_0 = 0.28209479177387814
 
 @contextmanager
 def rgb_variant() -> Iterator[None]:
-    """Mitsuba's rgb variant of the present backend, for a while.
+    """Context in Mitsuba's rgb variant of the present backend.
 
-    Changing it takes a quarter of a second, as Mitsuba then defines its Python integrators anew: whoever times calls of
-    `StockRenderer` enters this context before (`wrf_mi.runs.timing.Within`).
+    Entering takes a quarter of a second, so timed calls are in it already (`wrf_mi.runs.timing.Within`).
     """
-    own: Any = mi.variant()
-    other = own.replace("mono_polarized", "rgb")
-    if own == other:
-        yield
-        return
-    mi.set_variant(other)
+    before: Any = mi.variant()
+    rgb = before.replace("mono_polarized", "rgb")
     try:
+        if rgb != before:
+            mi.set_variant(rgb)
         yield
     finally:
-        mi.set_variant(own)
+        if rgb != before:
+            mi.set_variant(before)
 
 
 class StockRenderer:
-    """Renders Gaussians from a receiver's place.
-
-    Args:
-        receiver: whose directions are seen.
-        height: of the spectrum.
-        width: of the spectrum.
-    """
+    """Renderer of Gaussians for a receiver and a size of the spectrum."""
 
     def __init__(self, receiver: Receiver, height: int, width: int) -> None:
         self.receiver, self.height, self.width = receiver, height, width
@@ -64,13 +56,7 @@ class StockRenderer:
         self._count = -1
 
     def load(self, data: Floats, opacity: Floats, colour: Floats) -> None:
-        """Put Gaussians into the scene, whose acceleration structure is then built anew.
-
-        Args:
-            data: centre, standard deviations (metres) and quaternion x, y, z, w of each, [n, 10].
-            opacity: alpha at the centre, [n].
-            colour: coefficients of degree 0, [n, 3].
-        """
+        """Load centres, standard deviations (m) and quaternions (x, y, z, w) [n, 10], opacity [n] and colour [n, 3]."""
         with rgb_variant():
             if len(opacity) != self._count:
                 self._scene, self._count = self._build(data, opacity, colour), len(opacity)
@@ -82,12 +68,12 @@ class StockRenderer:
             self._params.update()
 
     def render(self) -> Any:
-        """The three channels, a tensor [height, width, 3]."""
+        """Channels, a tensor [height, width, 3]."""
         with rgb_variant():
             return mi.render(self._scene, spp=1)
 
     def field(self, gaussians: Gaussians) -> NDArray[np.complex64]:
-        """The complex field [height, width] of Gaussians with opacities (alpha blending), for one transmitter."""
+        """Complex field [height, width] of Gaussians of one transmitter with opacities (alpha blending)."""
         if gaussians.opacity is None or gaussians.batch != 1:
             raise ValueError("volprim_rf_basic blends by opacity, and Gaussians of one transmitter; give such")
         columns = [*gaussians.position, *gaussians.scale, *_normalised(gaussians.rotation)]
@@ -108,7 +94,7 @@ class StockRenderer:
         origin = mi.Point3f(*self.receiver.position_m.tolist())
 
         class Rays(mi.Sensor):
-            """Sensors are classes of one variant, so this one needs its own."""
+            """Rays of the receiver; sensor classes belong to a variant."""
 
             def sample_ray_differential(
                 self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True

@@ -1,4 +1,4 @@
-"""Errors of float32 against what makes them: how long, how deep, how far, how flat."""
+"""Errors of float32 against the quantity that causes them: axis ratio, layers, distance, path length and contrast."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.constants import speed_of_light
@@ -16,92 +15,75 @@ from wrf_mi.backend.device import to_float
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.tasks.ssim import ssim as similarity
 
-from .stress_fields import BLENDINGS, RECEIVER, Field, gradient, image, made, placed, reference
+from .stress_fields import SIZE, SMALL, Field, Rng, cases, gradient, image, layers, made, placed, reference
+from .stress_rows import DOUBLE, relative
 
-SEEDS = range(5)
-SIZE = (30, 60)
+SEEDS = 5
 COUNT = 30
 FREQUENCIES_HZ = (915e6, 28e9)
 Curves = dict[str, dict[str, list[float]]]
 
 
 def curves() -> Curves:
-    """By stage: ``x`` and the median error of some seeds and both blendings, by name."""
-    ratios, distances = np.logspace(0, 6, 7), np.logspace(0, 5, 6)
+    """Abscissa ``x`` and median error over seeds and blendings of each stage, by name."""
+    ratios, distances, counts = np.logspace(0, 6, 7), np.logspace(0, 5, 6), np.logspace(1, 4, 4)
     lengths, contrasts = np.logspace(0, 5, 11), np.logspace(-6, 0, 7)
-    found: Curves = {
-        "ratio": {"x": ratios.tolist()},
+    phases = {
+        f"{hz / 1e9:g} GHz, {name}": [float(np.pi * hz / speed_of_light * np.spacing(kind(x))) for x in lengths]
+        for hz in FREQUENCIES_HZ
+        for name, kind in (("float32", np.float32), ("float64", np.float64))
+    }
+    return {
+        "ratio": {
+            "x": ratios.tolist(),
+            "image": _medians(ratios, _needles, _image),
+            "derivative": _medians(ratios, _needles, _derivative),
+        },
         "distance": {"x": distances.tolist(), "image": _medians(distances, _away, _image)},
-        "layers": {"x": [10.0, 100.0, 1000.0, 10_000.0]},
-        "length": {"x": lengths.tolist()},
+        "layers": {"x": counts.tolist(), "image": _medians(counts, _layered, _image)},
+        # Half a unit in the last digit of a path's length.
+        "length": {"x": lengths.tolist()} | phases,
         "contrast": {"x": contrasts.tolist(), "similarity": [_similarity(c) for c in contrasts]},
     }
-    for name, error in (("image", _image), ("derivative", _derivative)):
-        found["ratio"][name] = _medians(ratios, _needles, error)
-    found["layers"]["image"] = _medians(found["layers"]["x"], _layered, _image)
-    for frequency in FREQUENCIES_HZ:
-        found["length"][f"{frequency / 1e9:g} GHz, float32"] = [_phase(x, frequency, np.float32) for x in lengths]
-        found["length"][f"{frequency / 1e9:g} GHz, float64"] = [_phase(x, frequency, np.float64) for x in lengths]
-    return found
 
 
-def _needles(ratio: float, rng: np.random.Generator) -> Field:
+def _needles(ratio: float, rng: Rng) -> Field:
     return made(COUNT, rng, scale_m=np.tile([1.0, 1 / ratio, 1 / ratio], (COUNT, 1)))
 
 
-def _away(distance_m: float, rng: np.random.Generator) -> Field:
-    place = placed(
-        rng.uniform(0, 2 * np.pi, COUNT), rng.uniform(0, 1.5, COUNT), rng, (0.5 * distance_m, 1.5 * distance_m)
-    )
-    return made(COUNT, rng, position_m=place, scale_m=0.1 * distance_m * rng.uniform(0.5, 2, (COUNT, 3)))
+def _away(distance_m: float, rng: Rng) -> Field:
+    azimuth, elevation = rng.uniform(0, 2 * np.pi, COUNT), rng.uniform(0, 1.5, COUNT)
+    position_m = placed(azimuth, elevation, rng, (0.5 * distance_m, 1.5 * distance_m))
+    return made(COUNT, rng, position_m=position_m, scale_m=0.1 * distance_m * rng.uniform(0.5, 2, (COUNT, 3)))
 
 
-def _layered(count: float, rng: np.random.Generator) -> Field:
-    n = int(count)
-    place = placed(rng.normal(1, 0.005, n), rng.normal(0.7, 0.005, n), rng)
-    distance = np.linalg.norm(place - RECEIVER.position_m, axis=1)
-    return made(n, rng, position_m=place, scale_m=np.tile(0.1 * distance[:, None], 3), opacity=np.full(n, 3 / n))
+def _layered(count: float, rng: Rng) -> Field:
+    return layers(rng, int(count), opacity=np.full(int(count), 3 / count))
 
 
 def _image(field: Field, blending: str, seed: int) -> float:
-    size = SIZE if len(field.signal) < 1000 else (8, 16)
+    size = SIZE if len(field.signal) < 1000 else SMALL
     truth, clear = reference(field, blending, size)
-    return float(np.linalg.norm((image(field, blending, size) - truth)[clear]) / np.linalg.norm(truth))
+    return relative((image(field, blending, size) - truth)[clear], truth)
 
 
 def _derivative(field: Field, blending: str, seed: int) -> float:
-    single = gradient(field, blending, SIZE, mi.Float, seed)["position"]
-    double = gradient(field, blending, SIZE, dr.float64_array_t(mi.Float), seed)["position"]
-    return float(np.linalg.norm(single - double) / np.linalg.norm(double))
+    single, double = (gradient(field, blending, kind, seed)["position"] for kind in (mi.Float, DOUBLE))
+    return relative(single - double, double)
 
 
 def _medians(
     values: Sequence[float] | FloatArray,
-    family: Callable[[float, np.random.Generator], Field],
+    family: Callable[[float, Rng], Field],
     error: Callable[[Field, str, int], float],
 ) -> list[float]:
-    return [
-        float(
-            np.median(
-                [
-                    error(family(float(x), np.random.default_rng(seed)), blend, seed)
-                    for seed in SEEDS
-                    for blend in BLENDINGS
-                ]
-            )
-        )
-        for x in values
-    ]
-
-
-def _phase(length_m: float, frequency_hz: float, kind: Any) -> float:
-    """Largest error of a phase whose length is stored as ``kind``, rad: half a unit in its last digit."""
-    return float(np.pi * frequency_hz / speed_of_light * np.spacing(kind(length_m)))
+    families: list[Any] = [{"": lambda rng, x=x: family(float(x), rng)} for x in values]
+    return [float(np.median([error(*case[1:]) for case in cases(given, SEEDS)])) for given in families]
 
 
 def _similarity(contrast: float) -> float:
     errors = []
-    for seed in SEEDS:
+    for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
         one, other = (((1 - contrast) * 0.7 + contrast * rng.uniform(size=SIZE)).astype(np.float32) for _ in range(2))
         truth = structural_similarity(one.astype(float), other.astype(float), data_range=1)
@@ -110,7 +92,7 @@ def _similarity(contrast: float) -> float:
 
 
 def draw(found: Curves, out: Path) -> None:
-    """One panel a stage, with its bound as a dashed line."""
+    """Write a picture with a panel for each stage and its bound as a dashed line."""
     from matplotlib.figure import Figure
 
     panels = (

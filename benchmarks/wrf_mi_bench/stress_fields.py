@@ -1,11 +1,12 @@
-"""Fields that are hard on float32, and their images and derivatives by the fast code and by float64.
+"""Random and ill-conditioned fields of Gaussians, their images and derivatives in float32 and float64, and rows of
+comparisons.
 
-Every number of a field is one that float32 holds exactly, so that what differs is the arithmetic alone.
+All parameters are exactly representable in float32, so that differences come from the arithmetic alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,27 +25,26 @@ from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
+from .stress_rows import DOUBLE, IMAGE, GradientWorst, Row, Worst, relative
+
 ComplexArray = NDArray[np.complex128]
+Size = tuple[int, int]
 BLENDINGS = ("alpha", "product")
+Rng = np.random.Generator
+Family = Callable[[Rng], "Field"]
 RECEIVER = Receiver(
     "receiver", np.array([5.0, 0.25, 0.125]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
+SIZE, SMALL = (30, 60), (8, 16)
+"""Rows and columns of an image; of one with tens of thousands of layers."""
 ON_THE_EDGE = 1e-3
-"""A footprint ends with a jump of 0.011; pixels so near to it, in shares of its radius, may fall to either side."""
-LAYERS = 50_000
+"""Relative distance to a footprint's edge, where it jumps by 0.011, within which pixels are not compared."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """Gaussians, n of them, in float64 arrays of float32 numbers.
-
-    Attributes:
-        position_m, scale_m: [n, 3].
-        rotation: quaternions (x, y, z, w), any length, [n, 4].
-        signal: complex [n].
-        opacity: alpha blending's, [n].
-        attenuation: product blending's, complex [n].
-    """
+    """Positions and scales [n, 3] in m, quaternions (x, y, z, w) of any length [n, 4], complex signals [n], opacity of
+    alpha blending [n] and complex attenuation of product blending [n] of n Gaussians."""
 
     position_m: FloatArray
     scale_m: FloatArray
@@ -54,18 +54,17 @@ class Field:
     attenuation: ComplexArray
 
     def groups(self, blending: str) -> dict[str, FloatArray]:
-        """Parameters that a blending has, real, by name, [n, k]."""
+        """Real parameters [n, k] of a blending by name."""
+        name, last = ("opacity", self.opacity) if blending == "alpha" else ("attenuation", self.attenuation)
+        pairs = {
+            key: np.stack([z.real, z.imag] if np.iscomplexobj(z) else [z], axis=1)
+            for key, z in (("signal", self.signal), (name, last))
+        }
+        return {"position": self.position_m, "scale": self.scale_m, "rotation": self.rotation} | pairs
 
-        def pair(z: ComplexArray) -> FloatArray:
-            return np.stack([z.real, z.imag], axis=1)
 
-        last = {"opacity": self.opacity[:, None]} if blending == "alpha" else {"attenuation": pair(self.attenuation)}
-        own = {"position": self.position_m, "scale": self.scale_m, "rotation": self.rotation}
-        return own | {"signal": pair(self.signal)} | last
-
-
-def made(count: int, rng: np.random.Generator, **own: Any) -> Field:
-    """An ordinary random field around `RECEIVER`, with ``own`` arrays in place of what is drawn."""
+def made(count: int, rng: Rng, **given: Any) -> Field:
+    """Random field around `RECEIVER`; ``given`` arrays replace drawn ones."""
     values: dict[str, Any] = {
         "position_m": placed(rng.uniform(0, 2 * np.pi, count), np.arcsin(rng.uniform(-0.1, 1, count)), rng),
         "scale_m": np.exp(rng.normal(np.log(0.4), 0.5, (count, 3))),
@@ -74,13 +73,18 @@ def made(count: int, rng: np.random.Generator, **own: Any) -> Field:
         "opacity": rng.uniform(0, 1, count),
         "attenuation": np.sqrt(rng.uniform(0, 1, count)) * np.exp(2j * np.pi * rng.uniform(0, 1, count)),
     }
-    return Field(**{name: _held_by_float32(value) for name, value in (values | own).items()})
+    return Field(**{name: _held_by_float32(value) for name, value in (values | given).items()})
+
+
+def ordinary(rng: Rng) -> Field:
+    """Random field of 1 to 99 Gaussians."""
+    return made(int(rng.integers(1, 100)), rng)
 
 
 def placed(
-    azimuth: FloatArray, elevation: FloatArray, rng: np.random.Generator, distance_m: tuple[float, float] = (1.0, 8.0)
+    azimuth: FloatArray, elevation: FloatArray, rng: Rng, distance_m: tuple[float, float] = (1.0, 8.0)
 ) -> FloatArray:
-    """Positions [n, 3] in directions of the receiver's frame, rad, at random distances."""
+    """Positions [n, 3] at random distances in directions of the receiver's frame (rad)."""
     away = unit_vectors(azimuth, elevation) * rng.uniform(*distance_m, (len(azimuth), 1))
     return np.asarray(RECEIVER.position_m + away @ RECEIVER.to_world.T)
 
@@ -93,8 +97,7 @@ def _held_by_float32(value: Any) -> Any:
 
 
 N = 40
-Rng = np.random.Generator
-HARD: Mapping[str, Callable[[Rng], Field]] = {
+HARD: Mapping[str, Family] = {
     "sizes of 1e-6 to 1e3 m in one field": lambda r: made(N, r, scale_m=10 ** r.uniform(-6, 3, (N, 1)) * np.ones(3)),
     "each axis of 1e-6 to 1e3 m": lambda r: made(N, r, scale_m=10 ** r.uniform(-6, 3, (N, 3))),
     "needles, 1e6 to 1": lambda r: made(N, r, scale_m=np.tile([1, 1e-6, 1e-6], (N, 1))),
@@ -127,42 +130,35 @@ HARD: Mapping[str, Callable[[Rng], Field]] = {
     "one Gaussian": lambda r: made(1, r),
     "none": lambda r: made(0, r),
 }
-"""Families of fields by name."""
+"""Families of ill-conditioned fields."""
+HARDEST = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in depth", "opacity 0, 1 and 1 - 1e-7")
+"""Families whose derivatives the quick form compares."""
 
 
-def layers(rng: Rng) -> Field:
-    """`LAYERS` Gaussians behind each other: transmittance falls below every float32."""
-    place = placed(rng.normal(1, 0.005, LAYERS), rng.normal(0.7, 0.005, LAYERS), rng)
-    distance = np.linalg.norm(place - RECEIVER.position_m, axis=1)
-    return made(LAYERS, rng, position_m=place, scale_m=np.tile(0.1 * distance[:, None], 3))
+def layers(rng: Rng, count: int = 50_000, **given: Any) -> Field:
+    """Gaussians behind each other, whose transmittance underflows in float32."""
+    position_m = placed(rng.normal(1, 0.005, count), rng.normal(0.7, 0.005, count), rng)
+    distance = np.linalg.norm(position_m - RECEIVER.position_m, axis=1)
+    return made(count, rng, position_m=position_m, scale_m=np.tile(0.1 * distance[:, None], 3), **given)
 
 
-def image(field: Field, blending: str, size: tuple[int, int]) -> ComplexArray:
-    """By the fast code in float32, [height, width]."""
+def image(field: Field, blending: str, size: Size) -> ComplexArray:
+    """Image [height, width] splatted in float32."""
     plane = perception_plane(*size, mi.Float)
     re, im = splat(on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
     return (re.numpy().astype(float) + 1j * im.numpy()).reshape(size)
 
 
-def reference(
-    field: Field, blending: str, size: tuple[int, int], sphere: bool = False
-) -> tuple[ComplexArray, NDArray[np.bool_]]:
-    """By `wrf_mi.gaussians.oracle` in float64, and which pixels lie on no edge of a footprint.
+def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """Image [height, width] by `wrf_mi.gaussians.oracle` in float64, and a mask of pixels off all footprints' edges.
 
-    Args:
-        field: what is seen.
-        blending: one of `BLENDINGS`.
-        size: rows and columns of a hemisphere.
-        sphere: the lower hemisphere too, below the upper one.
-
-    Returns:
-        Both [height, width], or [2 * height, width].
+    With ``sphere`` the lower hemisphere is appended: [2 * height, width].
     """
     directions = pixel_directions(*size)
     if sphere:
         directions = np.concatenate([directions, directions * [1, -1, -1]])
     parts = (field.position_m, field.scale_m, field.rotation)
-    own = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
+    last = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
     seen = oracle.project(*parts, RECEIVER)
     clear = np.ones(directions.shape[:2], bool)
     for i in seen.order:
@@ -171,33 +167,27 @@ def reference(
         reach = np.sqrt(np.einsum("...i,ij,...j->...", point, np.linalg.inv(seen.covariance[i]), point))
         clear &= (np.abs(reach - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
         clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
-    return oracle.render(*parts, field.signal, RECEIVER, directions, **own), clear
+    return oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 
 Report = Callable[[Gaussians, Pose], Sequence[Any]]
-"""What is made of a field: real arrays, differentiable."""
+"""Differentiable real arrays computed from a field."""
+Slope = Callable[["Field", str, int], dict[str, FloatArray]]
+"""Derivatives by group of parameters for a field, a blending and a seed."""
 
 
 def gradient(
-    field: Field, blending: str, size: tuple[int, int], float_type: Any, seed: int, report: Report | None = None
+    field: Field, blending: str, float_type: Any, seed: int, report: Report | None = None
 ) -> dict[str, FloatArray]:
-    """Derivative of a random linear functional of the image by each group of parameters, [n, k].
+    """Derivative [n, k] of a random linear functional of a report by each group of parameters.
 
-    Args:
-        field: what is seen.
-        blending: one of `BLENDINGS`.
-        size: rows and columns of the image.
-        float_type: in which all is computed.
-        seed: of the functional.
-        report: what it is a functional of; None: of the image's real and imaginary part.
+    The default report is the real and imaginary part of the image.
     """
     gaussians, parts = on_device(field, blending, float_type)
     for array in (a for part in parts.values() for a in part):
         dr.enable_grad(array)
-    if report is None:
-        reported: Sequence[Any] = splat(gaussians, pose(float_type), perception_plane(*size, float_type))
-    else:
-        reported = report(gaussians, pose(float_type))
+    of = report or (lambda gaussians, pose: splat(gaussians, pose, perception_plane(*SIZE, float_type)))
+    reported = of(gaussians, pose(float_type))
     rng = np.random.default_rng(seed)
     weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in reported]
     total: Any = 0
@@ -208,13 +198,13 @@ def gradient(
 
 
 def felt_values(field: Field, blending: str) -> dict[str, FloatArray]:
-    """Parameters by group as derivatives are multiplied with: positions count from the receiver."""
+    """Factors of the derivatives by group: the parameters, with positions relative to the receiver."""
     values = field.groups(blending)
     return values | {"position": values["position"] - RECEIVER.position_m}
 
 
 def pose(float_type: Any) -> Pose:
-    """Of `RECEIVER`, in numbers that float32 holds."""
+    """Pose of `RECEIVER`, rounded to float32."""
     return Pose(
         [float_type(float(np.float32(x))) for x in RECEIVER.position_m],
         [[float_type(float(np.float32(x))) for x in row] for row in RECEIVER.to_world],
@@ -222,19 +212,64 @@ def pose(float_type: Any) -> Pose:
 
 
 def on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
-    """The field's Gaussians, and the arrays that they are made of by group of parameters."""
-    parts = {
-        name: [to_device(column, float_type) for column in values.T] for name, values in field.groups(blending).items()
-    }
-    return (
-        Gaussians(
-            position=parts["position"],
-            scale=parts["scale"],
-            rotation=parts["rotation"],
-            signal=parts["signal"],
-            opacity=parts["opacity"][0] if blending == "alpha" else None,
-            attenuation=parts["attenuation"] if blending == "product" else None,
-            batch=1,
-        ),
-        parts,
-    )
+    """The field's Gaussians, and their arrays by group of parameters."""
+    groups = field.groups(blending).items()
+    parts = {name: [to_device(column, float_type) for column in values.T] for name, values in groups}
+    geometry = {name: parts[name] for name in ("position", "scale", "rotation", "signal")}
+    opacity = parts["opacity"][0] if blending == "alpha" else None
+    return Gaussians(**geometry, opacity=opacity, attenuation=parts.get("attenuation"), batch=1), parts
+
+
+def cases(families: Mapping[str, Family], count: int) -> Iterator[tuple[str, Field, str, int]]:
+    """Family, field, blending and seed of each case: ``count`` fields of each family."""
+    for name, family in families.items():
+        for seed in range(count):
+            field = family(np.random.default_rng(seed))
+            for blending in BLENDINGS:
+                yield name, field, blending, seed
+
+
+def image_row(
+    what: str,
+    families: Mapping[str, Family],
+    count: int,
+    size: Size = SIZE,
+    render: Callable[[Field, str, Size], ComplexArray] = image,
+    truth: Callable[[Field, str, Size], tuple[ComplexArray, NDArray[np.bool_]]] = reference,
+) -> Row:
+    """Row of float32 images of ``count`` fields of each family, compared with float64 off the footprints' edges."""
+    worst, edge, pixels, number = Worst(), 0, 0, 0
+    for name, field, blending, _ in cases(families, count):
+        expected, clear = truth(field, blending, size)
+        found = render(field, blending, size)
+        error = relative((found - expected)[clear], expected) if np.isfinite(found).all() else np.nan
+        worst.add(error, name)
+        number, edge, pixels = number + 1, edge + int((~clear).sum()), pixels + clear.size
+    more = f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out"
+    return worst.row(f"{what}, {number} cases", IMAGE, more)
+
+
+def gradient_row(
+    what: str,
+    given: Iterable[tuple[str, Field, str, int]],
+    report: Report | None = None,
+    single: Slope | None = None,
+    least: int = 1,
+) -> Row:
+    """Row of derivatives in float32 compared with float64.
+
+    Args:
+        what: beginning of the row.
+        given: cases.
+        report: differentiated arrays, see `gradient`.
+        single: derivatives in float32; None: `gradient`.
+        least: number of Gaussians below which a case is skipped.
+    """
+    worst, number = GradientWorst(), 0
+    for name, field, blending, seed in given:
+        if len(field.signal) >= least:
+            found = single(field, blending, seed) if single else gradient(field, blending, mi.Float, seed, report)
+            double = gradient(field, blending, DOUBLE, seed, report)
+            worst.add(found, double, felt_values(field, blending), name)
+            number += 1
+    return worst.row(f"{what}, {number} cases")

@@ -1,20 +1,16 @@
-"""The joint graph of paths and Gaussians under stress, values and derivatives, float32 against float64.
+"""Joint graph of paths and Gaussians, values and derivatives, float32 compared with float64.
 
-What is compared is what a receiver reports of both sides with float32 parameters, and the derivatives of a random
-functional of it by every parameter. The reference is float64: paths by `stress_oracle` in NumPy, the Gaussians by the
-same code in float64; derivatives by what moves paths (the pose, which both sides see, included) are differences of the
-reference, those by the Gaussians its own.
-
-Errors of RSSI and CSI are counted in shares of the sum of the waves' magnitudes, those of spectra in shares of their
-norm (`stress_receivers`). Derivatives are weighed by a natural step of each parameter: 1 / k for metres, 1 for rad and
-logarithms.
+Reports and derivatives of a random functional by every parameter are compared. The reference for paths is
+`stress_oracle` in NumPy with central differences, that for Gaussians the same code in float64. Errors of RSSI and CSI
+are relative to the sum of the waves' magnitudes, those of spectra to their norm. Derivatives are weighed by a natural
+step of each parameter: 1 / k for metres, 1 for rad and logarithms.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +31,16 @@ from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.receivers import array_response, bartlett_spectrum
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.pose import receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
-from .stress_oracle import TracedOracle, Values, slopes
-from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
-from .stress_traced import box_sheets
+from .stress_oracle import OraclePaths, TracedOracle, Values, slopes
+from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
+from .stress_traced import ROOM, box_sheets
 
-DOUBLE: Any = dr.float64_array_t(mi.Float)
 HZ = 920e6
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
@@ -56,131 +51,107 @@ MODELS: Mapping[str, Any] = {
     "RSSI": PowerReceiver(*SIZE, (HZ,)),
     "CSI": CsiReceiver(*SIZE, (HZ, 1.01 * HZ)),
 }
-ROOM = (6.0, 5.0, 3.0)
 KINDS = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_metal")
 THICKNESS_M = {"itu_concrete": 0.3, "itu_metal": 0.1, **dict.fromkeys(KINDS[1:5], 0.02), "itu_chipboard": 0.02}
 GRAZING_M = 1e-3
-"""Height of both antennas over the floor: 4e-4 rad at 5 m."""
+"""Height of both antennas above the floor: 4e-4 rad at 5 m."""
 LEFT = 0.01
-"""Share of the traced side that is left where the learned one cancels it; float32 has 6e-8 of what it cancels."""
+"""Remaining share of the traced side where the learned side cancels it."""
 MANY = 160
 """Transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths."""
 STEP = 1e-5
-"""Of differences of the paths, in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away, and
-1e-1 rad where all but a hundredth is cancelled."""
+"""Step of differences of the paths in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away."""
 PLACE = Receiver(
     "array",
     np.array([4.2, 2.9, 0.4]),
     Rotation.from_euler("zyx", (30, 20, 10), degrees=True).as_quat(),
     Antenna(frame="array"),
 )
-"""Turned with its array, so that reports depend on how it is turned."""
+"""Receiver whose antenna turns with its array, so that reports depend on the rotation."""
 NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
 """Two transmitters."""
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 
+TWO_BOUNCES = TraceOptions(max_depth=2, rays=1 << 13)
 Parts = dict[str, tuple[str, Mesh]]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A hard geometry.
-
-    Attributes:
-        parts: the scene.
-        receiver: where it is searched from.
-        tx_pos_m: transmitters [n, 3].
-        options: what is traced.
-        values: parameters that are set, by name.
-        cancels: the traced side's gain is set so that it cancels the learned one at the first transmitter.
-        moved: planes are shifted by millimetres and tilted by a hundredth; else as the scene states them.
-    """
-
-    parts: Parts
-    receiver: Receiver
-    tx_pos_m: FloatArray
-    options: TraceOptions
-    values: Mapping[str, FloatArray]
-    cancels: bool = False
-    moved: bool = True
 
 
 def _room() -> Parts:
     return {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
 
 
-def _coplanar() -> Case:
-    """A door and a panel that lie in a wall's plane, and a partition of two layers 2 cm apart that paths go through."""
-    parts = _room() | {
-        "door": ("itu_wood", sheet(0, 0.0, (1.0, 3.5), (0.0, 2.1))),
-        "panel": ("itu_metal", sheet(1, ROOM[1], (1.5, 4.5), (0.2, 2.0))),
-        "partition": ("itu_chipboard", sheet(0, 3.1, (0.0, 2.6), (0.0, 2.0))),
-        "layer": ("itu_plasterboard", sheet(0, 3.12, (0.0, 2.6), (0.0, 2.0))),
-    }
-    return Case(parts, PLACE, NEAR_M, TraceOptions(max_depth=3, max_reflections=2, transmission=True, rays=1 << 13), {})
+@dataclass(frozen=True)
+class Case:
+    """An ill-conditioned geometry.
+
+    Attributes:
+        parts: parts of the scene beside the room.
+        receiver: receiver from which paths are searched.
+        tx_pos_m: positions of transmitters [n, 3].
+        options: options of the search.
+        values: given parameters by name.
+        cancels: whether the traced side's gain cancels the learned side at the first transmitter.
+        moved: whether planes are shifted by millimetres and tilted by 0.01 rad.
+    """
+
+    parts: Parts = field(default_factory=dict)
+    receiver: Receiver = PLACE
+    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)
+    options: TraceOptions = TWO_BOUNCES
+    values: Mapping[str, FloatArray] = field(default_factory=dict)
+    cancels: bool = False
+    moved: bool = True
 
 
-def _grazing() -> Case:
-    """Both antennas a millimetre above the floor: line of sight and reflection cancel to a thousandth."""
-    low = replace(PLACE, position_m=np.array([5.6, 2.9, GRAZING_M]))
-    tx = np.array([[0.6, 1.8, GRAZING_M], [0.5, 2.9, 2 * GRAZING_M]])
-    return Case(_room(), low, tx, TraceOptions(max_depth=2, rays=1 << 13), {}, moved=False)
-
-
-def _mounted() -> Case:
-    """Searched 2 cm before a wall, evaluated on it: the reflection there coincides with the direct path."""
-    before = replace(PLACE, position_m=np.array([ROOM[0] - 0.02, 2.9, 1.4]))
-    onto = {"receiver.array.position": np.array([np.float32(0.02), 0.0, 0.0])}
-    return Case(_room(), before, NEAR_M, TraceOptions(max_depth=2, rays=1 << 13), onto, moved=False)
-
-
-def _cancelling() -> Case:
-    return Case(_room(), PLACE, NEAR_M[:1], TraceOptions(max_depth=2, rays=1 << 13), {}, cancels=True)
-
-
-def _many(count: int) -> Case:
-    tx = np.random.default_rng(5).uniform(0.15, 0.85, (count, 3)) * ROOM
-    return Case(_room(), PLACE, tx, TraceOptions(max_depth=3, rays=1 << 15), {})
-
-
-def cases(many: int = MANY) -> dict[str, Callable[[], Case]]:
-    """All by name; ``many``: transmitters of the last."""
-    return {
-        COPLANAR: _coplanar,
-        "grazing paths": _grazing,
-        "antenna on a wall": _mounted,
-        CANCELLING: _cancelling,
-        "many paths": lambda: _many(many),
-    }
+CASES: Mapping[str, Case] = {
+    # A door and a panel in a wall's plane, and a partition of two layers 2 cm apart with transmission.
+    COPLANAR: Case(
+        {
+            "door": ("itu_wood", sheet(0, 0.0, (1.0, 3.5), (0.0, 2.1))),
+            "panel": ("itu_metal", sheet(1, ROOM[1], (1.5, 4.5), (0.2, 2.0))),
+            "partition": ("itu_chipboard", sheet(0, 3.1, (0.0, 2.6), (0.0, 2.0))),
+            "layer": ("itu_plasterboard", sheet(0, 3.12, (0.0, 2.6), (0.0, 2.0))),
+        },
+        options=TraceOptions(max_depth=3, max_reflections=2, transmission=True, rays=1 << 13),
+    ),
+    # Line of sight and reflection cancel to a thousandth.
+    "grazing paths": Case(
+        receiver=replace(PLACE, position_m=np.array([5.6, 2.9, GRAZING_M])),
+        tx_pos_m=np.array([[0.6, 1.8, GRAZING_M], [0.5, 2.9, 2 * GRAZING_M]]),
+        moved=False,
+    ),
+    # Searched 2 cm in front of a wall and evaluated on it, where its reflection and the direct path coincide.
+    "antenna on a wall": Case(
+        receiver=replace(PLACE, position_m=np.array([ROOM[0] - 0.02, 2.9, 1.4])),
+        values={"receiver.array.position": np.array([np.float32(0.02), 0.0, 0.0])},
+        moved=False,
+    ),
+    CANCELLING: Case(tx_pos_m=NEAR_M[:1], cancels=True),
+}
 
 
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
-    """Rows of every case: values and derivatives, the worst of the receiver models.
-
-    Args:
-        many: transmitters of the case of many paths.
-        names: of `cases`; None: all.
-        models: of `MODELS`.
-    """
-    chosen = cases(many)
+    """Values and derivatives of `CASES` and of ``many`` transmitters, the worst of the receiver models."""
+    tx_pos_m = np.random.default_rng(5).uniform(0.15, 0.85, (many, 3)) * ROOM
+    cases = {**CASES, "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(max_depth=3, rays=1 << 15))}
     rows = []
-    for name in chosen if names is None else names:
+    for name in cases if names is None else names:
         with tempfile.TemporaryDirectory() as work:
-            rows += _Joint(chosen[name](), Path(work)).rows(name, models)
+            rows += _Joint(cases[name], Path(work)).rows(name, models)
     return rows
 
 
 class _Joint:
-    """Both sides of a case, and their parameters as float32 holds them."""
+    """Both sides of a case, and their parameters rounded to float32."""
 
     def __init__(self, case: Case, work: Path) -> None:
         self._case, rng = case, np.random.default_rng(7)
-        scene = open_scene(write_scene(work, case.parts, "Stress"), HZ, THICKNESS_M)
+        scene = open_scene(write_scene(work, _room() | case.parts, "Stress"), HZ, THICKNESS_M)
         options = TracedOptions(case.options, 2, gain=100.0, materials="surface", planes=True)
         self._traced = TracedField(scene, case.tx_pos_m, case.receiver, options)
         self._oracle = TracedOracle(self._traced)
-        # Encoded positions are detached, so the functional must hardly depend on them.
+        # Encoded positions are detached, so the functional may hardly depend on them.
         encoding = Encoding(position_octaves=1, position_scale_m=1e6, tx_octaves=2)
         self._field = WrfGsPlus(encoding=encoding, layers=2, width=16, skip=1)
         start = self._field.init(random_gaussians([case.receiver], 25, rng, opacity=0.4, signal=0.5), rng)
@@ -209,26 +180,32 @@ class _Joint:
 
     def rows(self, name: str, models: Iterable[str]) -> list[Row]:
         """Values and derivatives of the receiver models."""
-        value, slope, count = Worst(), GradientWorst(), 0
-        paths = int(self._traced.exists.sum())
-        for kind in models:
-            model, count = MODELS[kind], count + 1
-            size = len(self._traced) * int(np.prod(model.shape))
-            weight = np.random.default_rng(3).normal(size=size).astype(np.float32)
-            found, single = self._by_graph(model, weight, mi.Float)
-            _, double = self._by_graph(model, weight, DOUBLE, learned_alone=True)
-            reference = _Reference(self, model)
-            value.add(reference.error(found), kind)
-            steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
-            of_paths = slopes(reference, self._values, steps, weight.astype(float))
-            truth = {key: part + of_paths.get(key, 0) for key, part in double.items()}
-            felt = {key: self._felt(key) for key in truth}
-            slope.add(single, truth, felt, kind)
-        what = f"{name}, {paths} paths, {count} cases"
+        value, slope = Worst(), GradientWorst()
+        references = {kind: _Reference(self, MODELS[kind]) for kind in models}
+        weights = {
+            kind: np.random.default_rng(3).normal(size=len(self._traced) * int(np.prod(MODELS[kind].shape)))
+            for kind in references
+        }
+        weights = {kind: weight.astype(np.float32) for kind, weight in weights.items()}
+
+        def functionals(values: Values) -> FloatArray:
+            paths = self._oracle(values)
+            return np.array([references[kind].report(paths) @ weights[kind].astype(float) for kind in references])
+
+        paths = self._oracle(self._values)
+        steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
+        of_paths = slopes(functionals, self._values, steps)
+        for number, (kind, reference) in enumerate(references.items()):
+            found, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
+            _, double = self._by_graph(MODELS[kind], weights[kind], DOUBLE, learned_alone=True)
+            value.add(reference.error(found, paths), kind)
+            truth = {key: part + (of_paths[key][number] if key in steps else 0) for key, part in double.items()}
+            slope.add(single, truth, {key: self._felt(key) for key in truth}, kind)
+        what = f"{name}, {int(self._traced.exists.sum())} paths, {len(references)} cases"
         return [value.row(f"joint: {what}", IMAGE), slope.row(f"joint: derivatives, {what}", GRADIENT)]
 
     def _felt(self, name: str) -> FloatArray:
-        """What a parameter's derivatives are multiplied with to be compared with those of others."""
+        """Factors of a parameter's derivatives that make them comparable."""
         if name.startswith("field."):
             values = self._values[name]
             return values - self._case.receiver.position_m[:, None] if name == "field.position" else values
@@ -238,15 +215,15 @@ class _Joint:
         return self._learned_of(model, {name: _tensor(value, kind) for name, value in values.items()}, kind)
 
     def _learned_of(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
-        own = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
-        gaussians = self._field.gaussians(own, _tensor(self._case.tx_pos_m.T, kind))
+        weights = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
+        gaussians = self._field.gaussians(weights, _tensor(self._case.tx_pos_m.T, kind))
         pose = receiver_pose(self._case.receiver, params, kind)
         return learned_field(gaussians, pose, perception_plane(*SIZE, kind), model.sphere)
 
     def _by_graph(
         self, model: Any, weight: Any, kind: Any, learned_alone: bool = False
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Report, and derivatives of its weighted sum: of both sides, or with the paths held."""
+        """Report, and derivatives of its weighted sum, by both sides or with constant paths."""
         params = {name: _tensor(value, kind) for name, value in self._values.items()}
         dr.enable_grad(params)
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
@@ -257,35 +234,34 @@ class _Joint:
 
 
 class _Reference:
-    """A report in NumPy as a function of what moves paths, the learned side held; that is Dr.Jit's in float64."""
+    """Report in NumPy as a function of the paths, with the learned side of Dr.Jit's float64."""
 
     def __init__(self, joint: _Joint, model: Any) -> None:
-        self._joint, self._model = joint, model
+        self._model = model
         re, im = joint._learned(model, joint._values, DOUBLE)
         there = (re.numpy() + 1j * im.numpy()).reshape(len(joint._case.tx_pos_m), -1)
         if isinstance(model, CsiReceiver):
             there = np.repeat(there @ _solid(model)[:, None], len(model.frequencies_hz), axis=1)
         self._there = there
 
-    def __call__(self, values: Values) -> FloatArray:
-        return self._report(self._here(values), self._there)
+    def report(self, paths: OraclePaths) -> FloatArray:
+        """Flat report."""
+        return self._report(self._here(paths), self._there)
 
-    def error(self, found: FloatArray) -> float:
-        """Of a report with the joint's own parameters."""
-        joint, model = self._joint, self._model
-        here, there = self._here(joint._values), self._there
+    def error(self, found: FloatArray, paths: OraclePaths) -> float:
+        """Error of a report."""
+        model, here, there = self._model, self._here(paths), self._there
         truth = self._report(here, there)
         if not isinstance(model, CsiReceiver):
             return relative(found - truth, truth)
-        paths = joint._oracle(joint._values)
         waves = np.abs(paths.gain).reshape(len(here), -1).sum(axis=1) + np.abs(there).max(axis=1)
         if isinstance(model, PowerReceiver):
             return float((np.abs(10 ** (found / 20) - 10 ** (truth / 20)) / waves).max())
         return float((np.abs((found - truth).reshape(len(here), -1)) / waves[:, None]).max())
 
-    def _here(self, values: Values) -> NDArray[np.complex128]:
+    def _here(self, paths: OraclePaths) -> NDArray[np.complex128]:
         """Traced signals [n, ports]."""
-        model, paths = self._model, self._joint._oracle(values)
+        model = self._model
         if isinstance(model, CsiReceiver):
             return paths.at(np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz))
         return paths.at(ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))

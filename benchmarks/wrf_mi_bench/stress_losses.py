@@ -1,4 +1,4 @@
-"""Losses under stress: in float32 against float64, forwards and backwards, and against what others compute."""
+"""Losses in float32 against float64, scikit-image and NumPy, values and derivatives."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.physics.spectrum_loss import Grid
 from wrf_mi.tasks.losses import SSIM_WEIGHT, absolute_error, spectrum_loss
 
-from .stress_rows import EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst
+from .stress_fields import SIZE, Rng
+from .stress_rows import DOUBLE, EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst
 
-SIZE = (30, 60)
-DOUBLE: Any = dr.float64_array_t(mi.Float)
 UNFELT_SLOPE = UNFELT / np.sqrt(SIZE[0] * SIZE[1])
-"""Derivatives below a thousandth of the mean absolute error's, in norm, count as that large."""
+"""Floor of a derivative's norm: a thousandth of the mean absolute error's."""
 Pair = tuple[FloatArray, FloatArray]
-Rng = np.random.Generator
 LARGEST = 1e15
-"""Of a pixel; squares of its squares must not overflow float32."""
+"""Largest pixel whose fourth power does not overflow float32."""
 
 
 def _around(rng: Rng, contrast: float, shift: float = 0.0) -> Pair:
@@ -47,11 +45,11 @@ KINDS: Mapping[str, Callable[[Rng], Pair]] = {
     "of 0 to 1000": lambda r: (1e3 * r.uniform(size=SIZE), 1e3 * r.uniform(size=SIZE)),
     "of 0 to 1e15 against 0 to 1": lambda r: (LARGEST * r.uniform(size=SIZE), r.uniform(size=SIZE)),
 }
-"""Prediction and truth."""
+"""Prediction and truth of each kind of case."""
 
 
 def losses(count: int) -> list[Row]:
-    """All losses, ``count`` cases of each kind of images."""
+    """Rows of all losses, ``count`` cases of each kind of images."""
     cases = f"{count * len(KINDS)} cases"
     likeness, loss, received = Worst(), Worst(), Worst()
     slope, alone = GradientWorst(), GradientWorst()
@@ -90,7 +88,7 @@ def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[fl
 
 
 def _absolute(one: FloatArray, other: FloatArray, rng: Rng) -> float:
-    """Error of the absolute error and of its derivatives, with a third of the rows not received."""
+    """Error of the mean absolute error and its derivatives, with a third of the values NaN."""
     known = rng.random(one.size) > 1 / 3
     prediction = to_float(one)
     dr.enable_grad(prediction)
@@ -110,8 +108,8 @@ def _differences(count: int) -> Row:
         one, other = rng.uniform(size=SIZE), rng.uniform(size=SIZE)
         way = rng.normal(size=SIZE)
         slope = float(-_both(DOUBLE, one, other, 1.0)[2]["prediction"] @ way.ravel())
-        ends = [structural_similarity(other, one + s * step * way, data_range=1) for s in (1, -1)]
-        difference = (ends[0] - ends[1]) / (2 * step)
+        up, down = (structural_similarity(other, one + s * way, data_range=1) for s in (step, -step))
+        difference = (up - down) / (2 * step)
         errors.append(abs(slope - difference) / abs(difference))
     worst = Worst()
     worst.add(np.median(errors))
@@ -119,7 +117,7 @@ def _differences(count: int) -> Row:
 
 
 def _searches(count: int) -> Row:
-    """The loss of the physics model's searches, NumPy in float64, and its derivative, against central differences."""
+    """Derivative of the loss of the physics model's searches, in NumPy, against central differences."""
     of = Grid.of(30, 60, planar_array(4, 4, 0.16), 920e6)
     worst, cases = Worst(), 0
     for size in (1e-12, 1.0, 1e12):
@@ -130,9 +128,9 @@ def _searches(count: int) -> Row:
             parts = size * rng.normal(size=(4, 3, 16))
             h, way = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
             slope = 2 * (of.loss(h, shapes)[1].conj() * way).sum(axis=1).real
-            ends = [of.loss(h + s * 1e-6 * way, shapes)[0] for s in (1, -1)]
-            difference = (ends[0] - ends[1]) / 2e-6
-            # The last of the three spectra is dark: nothing is like it, whatever is predicted.
+            up, down = (of.loss(h + s * way, shapes)[0] for s in (1e-6, -1e-6))
+            difference = (up - down) / 2e-6
+            # The last of the three spectra is dark, so its loss is constant.
             errors.append(np.abs(slope - difference) / np.maximum(np.abs(difference), 1.0))
             cases += 3
         worst.add(np.median(np.array(errors).max(axis=1)), f"signals of {size:g}")

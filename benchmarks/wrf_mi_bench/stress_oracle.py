@@ -1,10 +1,7 @@
-"""The traced side of the joint graph in NumPy, complex128: what the stress rows compare
-`wrf_mi.tracing.field_calculator` with.
+"""Traced side of the joint graph in NumPy, complex128: the reference of `wrf_mi.tracing.field_calculator`.
 
-It shares the chains of planes and the stated constants with the graph, no device code: planes move by `Walls.moved`,
-antennas are `wrf_mi.core.Antenna`. The receiver is mirrored backwards as the transmitter is forwards, so each leg's
-direction is that from an image of the one to an image of the other; slabs are sums of multiple reflections between two
-Fresnel interfaces, patterns are SciPy's spherical harmonics.
+It shares the chains of planes and constants with the graph, but no device code. The direction of a leg is that from an
+image of the transmitter to an image of the receiver; slabs are Airy sums, patterns SciPy's spherical harmonics.
 """
 
 from __future__ import annotations
@@ -27,18 +24,15 @@ from wrf_mi.tracing.walls import Walls, walls_of
 ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
 ACROSS = 1e-6
-"""Sine of the angle to a wall's normal below which any direction across the wave will do."""
+"""Sine of the angle to a wall's normal below which the polarisation basis is arbitrary."""
 
 
 @dataclass(frozen=True)
 class OraclePaths:
-    """p paths of a batch of transmitters, the transmitter's number slowest.
+    """p paths of a batch of transmitters, ordered by transmitter, ``each`` paths per transmitter.
 
-    Attributes:
-        gain: without the phase exp(-j k length), 0 for a place holder, [p].
-        length_m: [p].
-        arrival: unit vectors towards where waves come from, receiver's frame, [p, 3].
-        each: paths of each transmitter.
+    Gains [p] have no phase exp(-j k length) and are 0 for padding; arrival [p, 3] points towards the source in the
+    receiver's frame.
     """
 
     gain: ComplexArray
@@ -47,7 +41,7 @@ class OraclePaths:
     each: int
 
     def at(self, offset_m: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
-        """Sums [batch, m] of the paths at ports [m, 3], each at its own frequency [m]; see `combine.path_sum`."""
+        """Sums [batch, m] of the paths at ports [m, 3] with frequencies [m]; see `combine.path_sum`."""
         away = (self.arrival * self.length_m[:, None])[:, None] - offset_m
         distance = np.linalg.norm(away, axis=-1)
         wave = np.exp(-2j * np.pi / speed_of_light * frequency_hz * distance)
@@ -56,11 +50,7 @@ class OraclePaths:
 
 
 class TracedOracle:
-    """The paths of a traced side as a function of its parameters.
-
-    Args:
-        traced: whose chains are followed.
-    """
+    """Paths of a traced field as a function of its parameters."""
 
     def __init__(self, traced: TracedField) -> None:
         self._traced, self._walls = traced, walls_of(traced.surfaces)
@@ -74,7 +64,7 @@ class TracedOracle:
         ]
 
     def __call__(self, values: Values) -> OraclePaths:
-        """Paths with parameters ``values``; what is missing stays as stated."""
+        """Paths with parameters ``values``; missing parameters keep their stated values."""
         traced, walls = self._traced, self._moved(values)
         receiver = traced.receiver
         turn = values.get(f"receiver.{receiver.name}.turn", np.zeros(3))
@@ -96,8 +86,8 @@ class TracedOracle:
         sent = np.einsum("ijp,pi->pj", turned, traced.options.tx_antenna.field(departure)).astype(complex)
         for level, before, after in zip(self._levels, ways, ways[1:], strict=False):
             sent = self._interact(walls, level, before, after, sent, values)
-        own = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
-        taken = receiver.antenna.field(-ways[-1] @ own) @ own.T
+        antenna = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
+        taken = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
         loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
         gain = (taken * sent).sum(axis=-1) * loss
         amplitude, phase = values.get(traced.gain_name, np.array([np.log(traced.options.gain), 0.0]))
@@ -120,7 +110,7 @@ class TracedOracle:
             return stated if whole is None else least + np.exp(whole)
         entries = [values.get(name_of(name, quantity)) for name in slabs.names]
         return np.array(
-            [s if own is None else least + np.exp(own[0]) for s, own in zip(stated, entries, strict=True)], float
+            [s if entry is None else least + np.exp(entry[0]) for s, entry in zip(stated, entries, strict=True)], float
         )
 
     def _interact(
@@ -185,23 +175,17 @@ def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
     return np.exp(series)
 
 
-def slopes(
-    of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float], weight: FloatArray
-) -> dict[str, FloatArray]:
-    """Derivatives of ``weight . of(values)`` by every number of the parameters in ``steps``, by central differences.
-
-    Two steps, h and h / 2, make them of the fourth order.
-    """
+def slopes(of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float]) -> dict[str, FloatArray]:
+    """Derivatives [m, ...] of functionals [m] by the parameters in ``steps``, by fourth-order central differences."""
     found = {}
     for name, step in steps.items():
-        slope = np.zeros(values[name].shape)
-        for k in np.ndindex(*slope.shape):
-            way = np.zeros(slope.shape)
-            way[k] = 1
+        shape = values[name].shape
+        columns = []
+        for way in np.eye(int(np.prod(shape))).reshape(-1, *shape):
             near, far = (
                 (of({**values, name: values[name] + h * way}) - of({**values, name: values[name] - h * way})) / (2 * h)
                 for h in (step / 2, step)
             )
-            slope[k] = ((4 * near - far) / 3) @ weight
-        found[name] = slope
+            columns.append((4 * near - far) / 3)
+        found[name] = np.transpose(columns).reshape(-1, *shape)
     return found

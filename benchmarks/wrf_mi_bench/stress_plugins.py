@@ -1,13 +1,12 @@
-"""The plugin integrator under stress: ``mi.render`` against the definition in float64, forwards and backwards.
+"""Plugin integrator: ``mi.render`` compared with its definition in float64, values and derivatives.
 
-The footprint here is the largest response on a ray; splatting takes the one in the tangent plane
-(`wrf_mi.gaussians.ray_response`). Both are the same in the limit of small angles alone, so each is held against its
-own definition in NumPy.
+The footprint here is the largest response on a ray; splatting takes the response in the tangent plane
+(`wrf_mi.gaussians.ray_response`). Both agree in the limit of small angles only, so each has a definition in NumPy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -28,68 +27,55 @@ from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.ray_response import ray_footprints
 
 from .stress_fields import (
-    BLENDINGS,
     HARD,
     ON_THE_EDGE,
     RECEIVER,
+    SIZE,
+    SMALL,
     ComplexArray,
+    Family,
     Field,
-    felt_values,
-    gradient,
+    Size,
+    cases,
+    gradient_row,
+    image_row,
     layers,
     made,
     on_device,
+    ordinary,
 )
-from .stress_rows import IMAGE, GradientWorst, Row, Worst, relative
+from .stress_rows import Row, Worst
 from .traced import scene_of
 
-SIZE = (30, 60)
-SMALL = (8, 16)
-DOUBLE: Any = dr.float64_array_t(mi.Float)
-Family = Callable[[np.random.Generator], Field]
-
-
-def _ordinary(rng: np.random.Generator) -> Field:
-    return made(int(rng.integers(1, 100)), rng)
+FORWARD = 1e-3
+"""Bound on the relative difference of forward from reverse mode."""
 
 
 def plugin_images(random: int, of_each: int, many: int = 1) -> list[Row]:
-    """Renders of random and of hard fields, of one pixel and of 50,000 layers."""
-    rows = [_images("random fields", [_ordinary], random, SIZE)]
-    hard = [family for name, family in HARD.items() if name != "none"]
-    rows.append(_images(f"{len(hard)} kinds of hard fields", hard, of_each, SIZE, tuple(HARD)))
-    rows.append(_images("one pixel", [_ordinary], max(of_each, 5), (1, 1)))
-    return [*rows, _images("50,000 layers", [layers], many, SMALL)] if many else rows
+    """Renders of random and of ill-conditioned fields, of one pixel and of 50,000 layers."""
+    hard = {name: family for name, family in HARD.items() if name != "none"}
+    rows = [
+        plugin_row("random fields", {"random": ordinary}, random),
+        plugin_row(f"{len(hard)} kinds of hard fields", hard, of_each),
+        plugin_row("one pixel", {"random": ordinary}, max(of_each, 5), (1, 1)),
+    ]
+    return [*rows, plugin_row("50,000 layers", {"layers": layers}, many, SMALL)] if many else rows
 
 
-def _images(
-    what: str, families: Iterable[Family], count: int, size: tuple[int, int], names: tuple[str, ...] = ()
-) -> Row:
-    worst, edge, pixels, cases = Worst(), 0, 0, 0
-    for number, family in enumerate(families):
-        for seed in range(count):
-            field = family(np.random.default_rng(seed))
-            responses, order, clear = _responses(field, size)
-            for blending in BLENDINGS:
-                truth = _blended(field, blending, responses, order)
-                found = rendered(field, blending, size)
-                where = names[number] if names else ""
-                error = relative((found - truth)[clear], truth) if np.isfinite(found).all() else np.nan
-                worst.add(error, where)
-                cases, edge, pixels = cases + 1, edge + int((~clear).sum()), pixels + truth.size
-    more = f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out"
-    return worst.row(f"plugin: image, {what}, {cases} cases", IMAGE, more)
+def plugin_row(what: str, families: Mapping[str, Family], count: int, size: Size = SIZE) -> Row:
+    """Row of renders of ``count`` fields of each family."""
+    return image_row(f"plugin: image, {what}", families, count, size, rendered, defined)
 
 
-def rendered(field: Field, blending: str, size: tuple[int, int]) -> ComplexArray:
-    """By ``mi.render``, [height, width]."""
+def rendered(field: Field, blending: str, size: Size) -> ComplexArray:
+    """Image [height, width] by ``mi.render``."""
     scene = scene_of(on_device(field, blending, mi.Float)[0], RECEIVER, *size)
     parts = np.asarray(mi.render(scene).numpy(), float)
     return np.asarray(parts[..., 0] + 1j * parts[..., 1])
 
 
-def _responses(field: Field, size: tuple[int, int]) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """By the definition: of each Gaussian, near to far, the largest response on each ray; and rays on no edge."""
+def defined(field: Field, blending: str, size: Size) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """Image [height, width] of each Gaussian's largest response on a ray, and a mask of rays off all edges."""
     offset = field.position_m - RECEIVER.position_m
     depth = np.linalg.norm(offset, axis=1)
     x, y, z = field.position_m.T
@@ -108,53 +94,39 @@ def _responses(field: Field, size: tuple[int, int]) -> tuple[FloatArray, NDArray
         responses[row] = np.where((square < CUTOFF**2) & (cosine > MIN_COSINE), np.exp(-square / 2), 0)
         clear &= (np.abs(np.sqrt(square) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
         clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
-    return responses, order, clear
-
-
-def _blended(field: Field, blending: str, responses: FloatArray, order: NDArray[np.int64]) -> ComplexArray:
     if blending == "alpha":
-        return oracle.blend_alpha(responses, field.signal[order], field.opacity[order])
-    return oracle.blend_product(responses, field.signal[order], field.attenuation[order])
+        return oracle.blend_alpha(responses, field.signal[order], field.opacity[order]), clear
+    return oracle.blend_product(responses, field.signal[order], field.attenuation[order]), clear
 
 
 def plugin_gradients(of_each: int, names: Iterable[str] = tuple(HARD)) -> list[Row]:
-    """Derivatives through ``mi.render`` against those of the same sum in float64; its forward mode is the reverse's."""
-    worst, forward, cases = GradientWorst(), Worst(), 0
+    """Derivatives through ``mi.render`` compared with the same sum in float64, and forward with reverse mode."""
     families: dict[str, Family] = {"random": lambda rng: made(60, rng), **{name: HARD[name] for name in names}}
-    for name, family in families.items():
-        for seed in range(of_each):
-            field = family(np.random.default_rng(seed))
-            if not len(field.signal):
-                continue
-            for blending in BLENDINGS:
-                cases += 1
-                single, apart = _through_render(field, blending, seed)
-                worst.add(
-                    single, gradient(field, blending, SIZE, DOUBLE, seed, _summed), felt_values(field, blending), name
-                )
-                forward.add(apart, name)
-    return [
-        worst.row(f"plugin: derivatives, {cases} cases"),
-        forward.row(f"plugin: derivatives forward against backward, {cases} cases", 1e-3),
-    ]
+    forward = Worst()
+
+    def single(field: Field, blending: str, seed: int) -> dict[str, FloatArray]:
+        found, error = _through_render(field, blending, seed)
+        forward.add(error)
+        return found
+
+    row = gradient_row("plugin: derivatives", cases(families, of_each), _summed, single)
+    count = row["what"].rpartition(", ")[2]
+    return [row, forward.row(f"plugin: derivatives forward against backward, {count}", FORWARD)]
 
 
 def _summed(gaussians: Gaussians, pose: Pose) -> list[Any]:
-    """Every ray meets every Gaussian: no lists that could lack one."""
+    """Image as the sum of all Gaussians on each ray, without lists."""
     kind: Any = type(gaussians.position[0])
     directions = pixel_directions(*SIZE).reshape(-1, 3)
     bundles = ray_bundles([to_device(column, kind) for column in directions.T], *SIZE)
     footprints = ray_footprints(gaussians, pose)
     lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
-    parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.opacity, gaussians.attenuation)
+    parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending)
     return list(parts)
 
 
 def _through_render(field: Field, blending: str, seed: int) -> tuple[dict[str, FloatArray], float]:
-    """Derivatives by group of parameters, and by how much forward mode along a random step is off.
-
-    The shape's quaternions are of length one; derivatives are by the field's own.
-    """
+    """Derivatives by group of parameters, and the relative error of forward mode along a random step."""
     from wrf_mi_plugins.shape import shape_parameters
 
     gaussians, parts = on_device(field, blending, mi.Float)
@@ -170,22 +142,25 @@ def _through_render(field: Field, blending: str, seed: int) -> tuple[dict[str, F
         params.update()
         return mi.render(scene, params)
 
+    def gradients() -> dict[str, FloatArray]:
+        return {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], 1) for name, part in parts.items()}
+
     leaves = [a for part in parts.values() for a in part]
     for array in leaves:
         dr.enable_grad(array)
     dr.backward(dr.sum(render() * weights, axis=None))
-    slopes = {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], 1) for name, part in parts.items()}
+    slopes = gradients()
 
     for array in leaves:
         dr.clear_grad(array)
-        # Each parameter by a share of itself: sizes of 1e-6 and 1e3 cannot take one step.
-        own = np.abs(dr.detach(array).numpy().astype(float))
-        dr.set_grad(array, to_float(own * rng.normal(size=own.shape)))
-    steps = {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], 1) for name, part in parts.items()}
+        # Steps are relative, as sizes span nine decades.
+        size = np.abs(dr.detach(array).numpy().astype(float))
+        dr.set_grad(array, to_float(size * rng.normal(size=size.shape)))
+    steps = gradients()
     tangent = np.asarray(dr.forward_to(render(), flags=dr.ADFlag.ClearEdges).numpy(), float)
     terms = [float((slopes[name] * steps[name]).sum()) for name in slopes]
-    size = max(float(np.linalg.norm(slopes[name] * steps[name])) for name in slopes)
+    largest = max(float(np.linalg.norm(slopes[name] * steps[name])) for name in slopes)
     along = float((tangent * np.stack(weight, axis=-1)).sum())
     if not np.isfinite(tangent).all():
         return slopes, float("nan")
-    return slopes, abs(along - sum(terms)) / (size or 1.0)
+    return slopes, abs(along - sum(terms)) / (largest or 1.0)

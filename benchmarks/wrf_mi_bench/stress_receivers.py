@@ -1,15 +1,13 @@
-"""Receivers under stress: what they report of random and of hard fields, float32 against NumPy in float64.
+"""Reports of receivers for random and ill-conditioned fields, float32 compared with NumPy in float64.
 
-Pixels on the edge of a footprint are left out on both sides, see `stress_fields.ON_THE_EDGE`.
-
-Waves that cancel leave the roundings of what they cancelled. Where a receiver reports a single sum over directions
-(RSSI and CSI) its error is therefore counted in shares of the sum of the waves' magnitudes; that of element signals and
-spectra, which are many such sums, in shares of their own norm.
+Pixels on the edge of a footprint are set to zero on both sides (`stress_fields.ON_THE_EDGE`). The error of a single sum
+over directions (RSSI, CSI) is relative to the sum of magnitudes, as waves may cancel; that of element signals and
+spectra is relative to their norm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -26,16 +24,27 @@ from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import hemisphere_pair, learned_field
+from wrf_mi.graph.evaluations import hemisphere_pair, learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers import array_response, bartlett_spectrum, csi, element_signals, minmax_scale
 from wrf_mi.tracing.traced_field import TracedPaths
 
-from .stress_fields import BLENDINGS, HARD, ComplexArray, Field, felt_values, gradient, made, on_device, pose, reference
-from .stress_rows import GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
+from .stress_fields import (
+    HARD,
+    SIZE,
+    ComplexArray,
+    Family,
+    Field,
+    cases,
+    gradient_row,
+    on_device,
+    ordinary,
+    pose,
+    reference,
+)
+from .stress_rows import DOUBLE, IMAGE, Row, Worst, relative
 
-SIZE = (30, 60)
 CARRIER_HZ = 920e6
 TONES_HZ = (CARRIER_HZ, 1.02 * CARRIER_HZ)
 ELEMENTS_M = planar_array(4, 4, 0.16)
@@ -46,44 +55,25 @@ MODELS: dict[str, Any] = {
     "RSSI": PowerReceiver(*SIZE, TONES_HZ),
     "CSI": CsiReceiver(*SIZE, TONES_HZ),
 }
-"""Of the physics model, in Dr.Jit: the ones that are trained through."""
-DOUBLE: Any = dr.float64_array_t(mi.Float)
+"""Differentiable receiver models."""
+TITLES = {"pixels": "pixels", "spectrum": "Bartlett spectrum", "scaled spectrum": "Bartlett spectrum, scaled"}
+FAMILIES: Mapping[str, Family] = {"random": ordinary, **HARD}
 
 
-def _ordinary(rng: np.random.Generator) -> Field:
-    return made(int(rng.integers(1, 100)), rng)
-
-
-def _fields(random: int, of_each: int) -> Iterable[tuple[str, Field, str, int]]:
-    """Family, field, blending and seed of each case."""
-    for name, family, count in [("random", _ordinary, random), *((n, f, of_each) for n, f in HARD.items())]:
-        for seed in range(count):
-            field = family(np.random.default_rng(seed))
-            for blending in BLENDINGS:
-                yield name, field, blending, seed
-
-
-def of_fields(random: int, of_each: int, families: Iterable[str] | None = None) -> list[Row]:
-    """What each receiver reports of an image, float32 against float64.
-
-    Args:
-        random: ordinary fields.
-        of_each: fields of each hard family.
-        families: ``random`` and names of `HARD`; None: all.
-    """
-    chosen = None if families is None else set(families)
+def of_fields(random: int, of_each: int, families: Iterable[str] = FAMILIES) -> list[Row]:
+    """Reports of ``random`` random fields and ``of_each`` fields of each ill-conditioned family of `FAMILIES`."""
     worst: dict[str, Worst] = {}
-    cases = 0
-    for name, field, blending, _ in _fields(random, of_each):
-        if chosen is not None and name not in chosen:
-            continue
-        cases += 1
-        truth, clear = reference(field, blending, SIZE, sphere=True)
-        seen = (truth * clear).reshape(-1)
-        gaussians = on_device(field, blending, mi.Float)[0]
-        for what, error in {**_by_model(gaussians, clear, seen), **_by_operator(gaussians, clear, seen, field)}.items():
-            worst.setdefault(what, Worst()).add(error, name)
-    return [one.row(f"receiver: {what}, {cases} cases", IMAGE) for what, one in worst.items()]
+    number = 0
+    for family in families:
+        for name, field, blending, _ in cases({family: FAMILIES[family]}, random if family == "random" else of_each):
+            number += 1
+            truth, clear = reference(field, blending, SIZE, sphere=True)
+            seen = (truth * clear).reshape(-1)
+            gaussians = on_device(field, blending, mi.Float)[0]
+            errors = _by_model(gaussians, clear, seen) | _by_operator(gaussians, clear, seen, field)
+            for what, error in errors.items():
+                worst.setdefault(what, Worst()).add(error, name)
+    return [one.row(f"receiver: {what}, {number} cases", IMAGE) for what, one in worst.items()]
 
 
 def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray) -> dict[str, float]:
@@ -101,21 +91,20 @@ def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray
     spectrum = np.sqrt(bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE) ** 2 + SQUARED_MAGNITUDE_EPS)
     channel = np.tile([wave.real, wave.imag], len(TONES_HZ))
     amplitude = np.sqrt(np.abs(wave) ** 2 + LEAST_POWER)
-    return {
-        "pixels": relative(
-            found["pixels"] - (pixels := np.sqrt(np.abs(seen[:half]) ** 2 + SQUARED_MAGNITUDE_EPS)), pixels
-        ),
-        "Bartlett spectrum": relative(found["spectrum"] - spectrum.ravel(), spectrum),
-        "Bartlett spectrum, scaled": relative(
-            found["scaled spectrum"] - (scaled := minmax_scale(spectrum).ravel()), scaled
-        ),
+    expected = {
+        "pixels": np.sqrt(np.abs(seen[:half]) ** 2 + SQUARED_MAGNITUDE_EPS),
+        "spectrum": spectrum.ravel(),
+        "scaled spectrum": minmax_scale(spectrum).ravel(),
+    }
+    errors = {TITLES[name]: relative(found[name] - truth, truth) for name, truth in expected.items()}
+    return errors | {
         "RSSI": abs(float(10 ** (found["RSSI"][0] / 20)) - amplitude) / max(waves, amplitude),
         "CSI": float(np.abs(found["CSI"] - channel).max()) / waves,
     }
 
 
 def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray, field: Field) -> dict[str, float]:
-    """Errors of the operators, built once and applied to the signals."""
+    """Errors of the operators."""
     plane, half = perception_plane(*SIZE, mi.Float), seen.size // 2
     directions, weight = hemisphere_pair(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
     ports = array_response(ELEMENTS_M, directions[:half], CARRIER_HZ).T * weight[:half]
@@ -134,39 +123,26 @@ def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexAr
     }
 
 
-def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: Iterable[str] | None = None) -> list[Row]:
-    """Derivatives of what receivers report by the Gaussians, float32 against float64.
-
-    Args:
-        of_each: fields of each family.
-        names: of `MODELS`.
-        families: ``random`` and names of `HARD`; None: all.
-    """
-    chosen = None if families is None else set(families)
+def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: Iterable[str] = FAMILIES) -> list[Row]:
+    """Derivatives of the reports of `MODELS` by the Gaussians, for ``of_each`` fields of each family of `FAMILIES`."""
     rows = []
     for name in names:
-        worst, cases, model = GradientWorst(), 0, MODELS[name]
+        model = MODELS[name]
 
         def report(gaussians: Gaussians, at: Pose, model: Any = model) -> list[Any]:
             kind: Any = type(gaussians.position[0])
             plane = perception_plane(*SIZE, kind)
             return [model(None, learned_field(gaussians, at, plane, model.sphere))]
 
-        for family, field, blending, seed in _fields(of_each, of_each):
-            if chosen is not None and family not in chosen:
-                continue
-            # Scaling takes out nearly all that the parameters of a single Gaussian do; what is left is rounding.
-            if len(field.signal) <= (name == "scaled spectrum"):
-                continue
-            single, double = (gradient(field, blending, SIZE, kind, seed, report) for kind in (mi.Float, DOUBLE))
-            worst.add(single, double, felt_values(field, blending), family)
-            cases += 1
-        rows.append(worst.row(f"receiver: derivatives of {name}, {cases} cases", GRADIENT))
+        # Instrument scaling cancels nearly all derivatives of a single Gaussian; rounding would remain.
+        least = 2 if name == "scaled spectrum" else 1
+        given = cases({family: FAMILIES[family] for family in families}, of_each)
+        rows.append(gradient_row(f"receiver: derivatives of {name}", given, report, least=least))
     return rows
 
 
 def of_paths(count: int, each: int = 50) -> Row:
-    """Element signals and CSI of paths of 1 m to 100 km at 28 GHz, Dr.Jit against NumPy, both with float64 phases."""
+    """Row of element signals and CSI of paths of 1 m to 100 km at 28 GHz, Dr.Jit compared with NumPy in float64."""
     worst, carrier_hz = Worst(), 28e9
     here = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     elements, tones = planar_array(4, 4, 0.005), carrier_hz * np.linspace(0.98, 1.02, 16)

@@ -1,63 +1,85 @@
-"""Rows of the stress benchmark: how many cases ran, the worst of them, and its bound."""
+"""Rows of the stress benchmark: number of cases, worst error and bound; and their summary for the README."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from wrf_mi.backend import init
 from wrf_mi.core.angles import FloatArray
 
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
 Row = dict[str, str]
+DOUBLE: Any = dr.float64_array_t(mi.Float)
 
 IMAGE = 1e-4
-"""Relative L2 error of what float32 renders or reports."""
+"""Bound on the relative L2 error of float32 images and reports."""
 GRADIENT = 1e-3
-"""Relative error, in norm, of a derivative in float32."""
+"""Bound on the relative error, in norm, of a derivative in float32."""
 EXACT = 1e-5
-"""Median relative error of a derivative in float64 against central differences."""
+"""Bound on the median relative error of a derivative in float64 against central differences."""
 PHASE = 1e-3
-"""Radians."""
+"""Bound on the error of a phase, rad."""
 UNFELT = 1e-3
-"""A group whose derivatives, times its parameters, are below this share of the largest group's counts as that large."""
+"""Floor of the norm of a group's derivatives times parameters, as a share of the largest group's."""
 PLAIN = 1e-3
-"""Signs are compared of derivatives that are at least this share of their group's largest."""
+"""Share of a group's largest derivative above which signs are compared."""
+NEITHER = "0 neither"
+"""Bound of the row on fits: no fit with values that are not finite and no message."""
+FITS = "fits with random bad"
+
+STAGES = (
+    ("images of random and hard fields", r"image,"),
+    ("derivatives of images, float32 against float64", r"derivatives, "),
+    ("derivatives of all models in float64, against differences", r"derivatives of (wrf|factorised)"),
+    ("receivers: spectra, RSSI, CSI, operators", r"receiver: (?!derivatives)"),
+    ("derivatives of receivers", r"receiver: derivatives"),
+    ("losses", r"loss: (?!.*differences)"),
+    ("phase of paths to 10 km, rad", r"phase"),
+    ("derivatives of the tracer, against differences", r"derivatives of (Sionna|the traced)"),
+    ("paths and Gaussians together", r"joint: (?!derivatives)"),
+    ("derivatives of paths and Gaussians together, against float64", r"joint: derivatives"),
+    ("Mitsuba plugins: images", r"plugin: image"),
+    ("Mitsuba plugins: derivatives", r"plugin: derivatives"),
+)
+"""Title of each stage and pattern of the beginning of its rows."""
 
 
 class Worst:
-    """The largest of many errors and where it was. What is not a number is larger than any.
-
-    Attributes:
-        error: 0 before the first.
-        where: of the largest.
-    """
+    """The largest of many errors and its case; NaN counts as infinite."""
 
     def __init__(self) -> None:
         self.error, self.where = 0.0, ""
 
     def add(self, error: Any, where: str = "") -> None:
-        """One more."""
+        """Include an error."""
         value = float(error) if np.isfinite(error) else float("inf")
         if value > self.error:
             self.error, self.where = value, where
 
     def row(self, what: str, bound: float, more: str = "") -> Row:
-        """As a row of the table."""
+        """Row of the table."""
         return row(what, self.error, bound, f"{f' ({self.where})' if self.where else ''}{more}")
 
 
 @dataclass
 class GradientWorst:
-    """How far derivatives in float32 are from those in float64, group by group, each times its parameters.
+    """Largest differences of derivatives in float32 from float64, by group, each times its parameters.
 
     Attributes:
         error: norm of the difference over the norm.
-        cosine: largest 1 - cosine of the angle between them.
-        norm: largest difference of their norms' ratio from 1.
-        signs: how many of those that are not small, see `PLAIN`, have another sign.
-        compared: how many have been compared for that.
+        cosine: 1 - cosine of the angle between both.
+        norm: difference of the ratio of their norms from 1.
+        signs: number of wrong signs among derivatives above `PLAIN`.
+        compared: number of signs compared.
     """
 
     error: Worst = field(default_factory=Worst)
@@ -74,38 +96,30 @@ class GradientWorst:
         where: str = "",
         least: float = 0.0,
     ) -> None:
-        """One more field.
-
-        Args:
-            single: derivatives in float32 by group.
-            double: the same in float64.
-            values: of the parameters.
-            where: it is.
-            least: a group's norm below which it counts as that large; see also `UNFELT`.
-        """
+        """Include the derivatives of a case; ``least`` and `UNFELT` are floors of a group's norm."""
         felt = {key: float(np.linalg.norm(double[key] * values[key])) for key in double}
         least = max(least, UNFELT * max(felt.values(), default=0.0))
         for key in double:
             name = f"{key}, {where}" if where else key
-            mine, truth = single[key] * values[key], double[key] * values[key]
-            if not np.isfinite(mine).all():
+            found, truth = single[key] * values[key], double[key] * values[key]
+            if not np.isfinite(found).all():
                 self.error.add(np.nan, name)
                 continue
-            # Without any derivative at all what float32 finds counts as it is.
-            self.error.add(np.linalg.norm(mine - truth) / (max(felt[key], least) or 1.0), name)
+            # Where the true derivative is zero the error is absolute.
+            self.error.add(np.linalg.norm(found - truth) / (max(felt[key], least) or 1.0), name)
             if felt[key] <= least or not felt[key]:
                 continue
-            size = float(np.linalg.norm(mine))
+            size = float(np.linalg.norm(found))
             # 1 - cosine of nearly equal vectors from their difference: the scalar product has no digits left for it.
-            unlike = np.linalg.norm(mine / size - truth / felt[key]) ** 2 / 2 if size else 1.0
+            unlike = np.linalg.norm(found / size - truth / felt[key]) ** 2 / 2 if size else 1.0
             self.cosine.add(unlike, name)
             self.norm.add(abs(size / felt[key] - 1), name)
             plain = np.abs(truth) > PLAIN * np.abs(truth).max()
-            self.signs += int((np.sign(mine) != np.sign(truth))[plain].sum())
+            self.signs += int((np.sign(found) != np.sign(truth))[plain].sum())
             self.compared += int(plain.sum())
 
     def row(self, what: str, bound: float = GRADIENT) -> Row:
-        """As a row of the table."""
+        """Row of the table."""
         more = f"; cosine 1 - {self.cosine.error:.0e}, norm 1 ± {self.norm.error:.0e}"
         if self.compared:
             more += f", {self.signs} of {self.compared} signs wrong"
@@ -113,17 +127,48 @@ class GradientWorst:
 
 
 def row(what: str, worst: float, bound: float, more: str = "") -> Row:
-    """A row of the table."""
+    """Row of the table."""
     return {"what": what, "value": f"worst {worst:.1e}{more}", "asked": f"at most {bound:g}"}
 
 
 def worst_of(row: Mapping[str, str]) -> tuple[float, float]:
-    """The worst case of a row and its bound."""
+    """Worst error of a row and its bound."""
     return float(row["value"].split()[1].rstrip(";")), float(row["asked"].split()[2])
 
 
+def held(row: Row) -> bool:
+    """Whether a row keeps its bound."""
+    if row["asked"] == NEITHER:
+        return row["value"].endswith(" 0 did neither")
+    worst, bound = worst_of(row)
+    return worst <= bound
+
+
 def relative(error: Any, truth: Any) -> float:
-    """Norm of an error over that of the truth; of the error alone where that is 0."""
-    size = float(np.linalg.norm(truth))
-    off = float(np.linalg.norm(error))
-    return off / size if size else off
+    """Norm of an error relative to the truth's, or absolute where that is 0."""
+    return float(np.linalg.norm(error)) / (float(np.linalg.norm(truth)) or 1.0)
+
+
+def stages(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, int, float, float]]:
+    """Title, number of cases, worst error and widest bound of each of `STAGES`; NaN for a stage without rows."""
+    found = []
+    for title, begins in STAGES:
+        members = [row for row in rows if re.match(begins, row["what"])]
+        # Where a row states paths and cases, the cases come last.
+        counts = [re.findall(r"(\d+) (?:cases|paths)", row["what"]) for row in members]
+        worst, bound = zip(*map(worst_of, members), strict=True) if members else ((float("nan"),), (float("nan"),))
+        found.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
+    return found
+
+
+def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Markdown table of the worst error of each stage and its bound, and of the outcome of the fits."""
+    lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
+    lines += [
+        f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |" for title, cases, worst, bound in stages(rows)
+    ]
+    for row in rows:
+        if row["what"].startswith(FITS):
+            what, _, count = row["what"].rpartition(", ")
+            lines.append(f"| {what} | {count.removesuffix(' cases')} | **{row['value']}** | {row['asked']} |")
+    return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The tracer under stress: phases and delays against mirror images, derivatives against differences in float32."""
+"""Ray tracing: phases and delays compared with mirror images, derivatives with central differences in float32."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,9 @@ from .stress_fields import RECEIVER
 from .stress_rows import PHASE, Row, Worst, row
 
 TRACED_GRADIENT = 1e-2
-"""Relative error of a derivative through the tracer against central differences in float32."""
+"""Bound on the relative error of a derivative through ray tracing against central differences in float32."""
 DELAY = 1e-6
-"""Relative error of Sionna RT's delays: 17 roundings of float32, those of mirrored corners, their sums and roots."""
+"""Bound on the relative error of Sionna RT's delays: 17 roundings of float32."""
 HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
     (28e9, (100.0, 60.0, 12.0)),
     (915e6, (10_000.0, 4_000.0, 300.0)),
@@ -45,11 +45,11 @@ HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
 ROOM = (6.0, 5.0, 3.0)
 CARRIER_HZ = 2.4e9
 LEAST_SLOPE = 0.05
-"""Of the median slope: a smaller one, a metal's, is compared with that; roundings would drown it."""
+"""Floor of a slope relative to the median slope; those of metals are below rounding."""
 
 
 def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
-    """The six sides of a box."""
+    """Meshes of the six sides of a box."""
     spans = [(0.0, side) for side in size_m]
     return {
         f"{axis}{at:g}": sheet(axis, at, *(span for other, span in enumerate(spans) if other != axis))
@@ -59,12 +59,12 @@ def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
 
 
 def phases(count: int = 30) -> list[Row]:
-    """Phases of traced paths against mirror images in closed form, and Sionna RT's own delays, which are float32."""
+    """Rows of traced phases and of Sionna RT's float32 delays, compared with mirror images in closed form."""
     return [row for frequency_hz, size_m in HALLS for row in _phases(frequency_hz, size_m, count)]
 
 
 def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int) -> list[Row]:
-    """Halls of metal, up to two reflections."""
+    """Rows of a metal hall with up to two reflections."""
     rng = np.random.default_rng(0)
     tx, rx = rng.uniform(0.1, 0.9, (count, 3)) * size_m, rng.uniform(0.1, 0.9, 3) * size_m
     with tempfile.TemporaryDirectory() as work:
@@ -73,18 +73,18 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
         options = TraceOptions(max_depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
         delays_s = _sionna_delays(scene, tx, rx)
-    worst, single, own = Worst(), Worst(), Worst()
+    worst, single, delay = Worst(), Worst(), Worst()
     metres, counted = 0.0, 0
-    for index, place in enumerate(tx):
-        found, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(place, rx, np.array(size_m))
+    for index, position_m in enumerate(tx):
+        found, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(position_m, rx, np.array(size_m))
         theirs = speed_of_light * delays_s[index]
         for lengths, errors in ((found, worst), (found.astype(np.float32), single)):
             errors.add(np.abs(lengths - exact).max() if len(lengths) == len(exact) else np.inf)
-        # In large halls it finds some paths two or three times, by the two triangles of a wall.
+        # Sionna RT finds some paths of large halls two or three times, by both triangles of a wall.
         off = np.abs(theirs[:, None] - exact) if len(theirs) else np.full((1, len(exact)), np.inf)
         counted += len(theirs)
         metres = max(metres, float(off.min(axis=0).max()), float(off.min(axis=1).max()))
-        own.add(max((off.min(axis=0) / exact).max(), (off / exact).min(axis=1).max()))
+        delay.add(max((off.min(axis=0) / exact).max(), (off / exact).min(axis=1).max()))
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
     where = f"{frequency_hz / 1e9:g} GHz in {size_m[0]:g} m"
     more = f" rad; with lengths in float32 {wavenumber * single.error:.0e} rad"
@@ -92,7 +92,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
         row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more),
         row(
             f"Sionna RT's own delays at {where}, {counted} paths",
-            own.error,
+            delay.error,
             DELAY,
             f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad",
         ),
@@ -128,11 +128,7 @@ def _mirror_images(tx: FloatArray, rx: FloatArray, size: FloatArray, depth: int 
 
 
 def traced_gradients(count: int = 6) -> list[Row]:
-    """Derivatives of what is traced in a room against central differences, the paths kept.
-
-    Args:
-        count: of transmitters.
-    """
+    """Rows of derivatives in a room with constant paths, compared with central differences."""
     with tempfile.TemporaryDirectory() as work:
         kinds = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_concrete")
         parts = {n: (kind, wall) for kind, (n, wall) in zip(kinds, box_sheets(ROOM).items(), strict=True)}
@@ -141,14 +137,15 @@ def traced_gradients(count: int = 6) -> list[Row]:
         scene = open_scene(write_scene(Path(work), parts, "Room"), CARRIER_HZ, thickness)
     rng = np.random.default_rng(0)
     tx = np.array([1.9, 1.8, 1.3]) + rng.uniform(-0.3, 0.3, (count, 3))
-    # Turned with its array, so that reports depend on how it is turned.
+    # The antenna turns with its array, so that reports depend on the rotation.
     receiver = Receiver("array", np.array([4.2, 2.9, 0.4]), np.array([0.0, 0.0, 0.0, 1.0]), Antenna(frame="array"))
     options = TraceOptions(max_depth=2, transmission=True, rays=1 << 12)
     traced = trace_paths(scene, tx, receiver, options)
     return [_solver_gradients(scene, traced), *_physics_gradients(scene, traced, receiver, options)]
 
 
-Reported = Callable[[Mapping[str, Any]], Any]
+Reports = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""Flat differentiable reports by name, from parameters as tensors."""
 
 
 def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
@@ -167,25 +164,25 @@ def _solver_gradients(scene: Any, traced: TraceResult) -> Row:
         constants = {
             n: (1 + dr.exp(given[f"permittivity {n}"].array), dr.exp(given[f"conductivity {n}"].array)) for n in names
         }
-        # The calculator is asked again in the reverse pass, when the materials have to be these.
+        # The reverse pass evaluates the field again and needs these materials.
         kept.enter_context(with_materials(scene, constants))
         return field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
 
+    def reports(given: Mapping[str, Any]) -> Mapping[str, Any]:
+        parts = field(given)
+        # Power relative to what was traced, as dB in float32 are too coarse for differences.
+        power = sum(dr.square(part) for part in parts) * scale
+        return {"gains": dr.concat([part * 1e3 for part in parts]), "power": power}
+
     kept = ExitStack()
-    reports: dict[str, Reported] = {
-        "gains": lambda given: dr.concat([part * 1e3 for part in field(given)]),
-        # In shares of what was traced: dB in float32 are too coarse for differences.
-        "power": lambda given: sum(dr.square(part) for part in field(given)) * scale,
-    }
     worst = Worst()
-    for report, of in reports.items():
-        _against_differences(of, values, {}, 0.2, worst, report, kept.close)
+    for name, found in _against_differences(reports, values, {}, 0.2, kept.close).items():
+        worst.add(found.error, f"{found.where}, {name}")
     return worst.row(f"derivatives of Sionna RT's fields by {len(values)} constants of materials", TRACED_GRADIENT)
 
 
 def _physics_gradients(scene: Any, traced: TraceResult, receiver: Receiver, options: TraceOptions) -> list[Row]:
-    """What the receivers of the physics model report of its traced side, in float32, by materials, pose, gain and
-    patterns."""
+    """Rows of reports of the traced side in float32 by materials, pose, gain and patterns."""
     field = TracedField(scene, traced.tx_pos_m, receiver, TracedOptions(options, 2, gain=300.0), traced=traced)
     rng, elements = np.random.default_rng(1), planar_array(3, 3, 0.06)
     values = {name: value.astype(float) for name, value in field.parameters().items()}
@@ -199,80 +196,79 @@ def _physics_gradients(scene: Any, traced: TraceResult, receiver: Receiver, opti
         "rssi": PowerReceiver(12, 40, (CARRIER_HZ,)),
         "csi": CsiReceiver(12, 40, (CARRIER_HZ, 1.01 * CARRIER_HZ)),
     }
-    rows = []
-    for name, model in models.items():
-        worst = Worst()
-        _against_differences(_reporter(model, field), values, steps, 0.02, worst)
-        what = f"derivatives of the traced side, {name}, by {len(values)} parameters"
-        rows.append(worst.row(what, TRACED_GRADIENT))
-    return rows
 
+    def reports(given: Mapping[str, Any]) -> Mapping[str, Any]:
+        paths = field(given)
+        return {name: model(paths, None) for name, model in models.items()}
 
-def _reporter(model: Any, field: TracedField) -> Reported:
-    return lambda given: model(field(given), None)
+    found = _against_differences(reports, values, steps, 0.02)
+    by = f"by {len(values)} parameters"
+    return [w.row(f"derivatives of the traced side, {name}, {by}", TRACED_GRADIENT) for name, w in found.items()]
 
 
 def _against_differences(
-    of: Reported,
+    of: Reports,
     values: Mapping[str, FloatArray],
     steps: Mapping[str, float],
     step: float,
-    worst: Worst,
-    where: str = "",
     done: Callable[[], None] = lambda: None,
-) -> None:
-    """Compare derivatives of a random functional of a float32 report with central differences of float32 reports.
+) -> dict[str, Worst]:
+    """Errors of derivatives of random functionals of float32 reports, relative to central differences.
 
-    Sums over a report are NumPy's, in float64: what is tested is the report.
+    Sums over a report are NumPy's, in float64, so that only the report is tested.
 
     Args:
-        of: the report, a flat array, of parameters as tensors.
-        values: of the parameters.
-        steps: the longest step of some, see `_slope`.
-        step: of the others.
-        worst: takes the errors, each relative to the difference.
-        where: said with the worst.
-        done: called after each report when it is no longer needed.
+        of: reports of parameters.
+        values: parameters.
+        steps: longest steps of some parameters, see `_slope`.
+        step: longest step of the others.
+        done: called when reports and their derivatives are no longer needed.
+
+    Returns:
+        Worst error and parameter of each report.
     """
-    rng = np.random.default_rng(3)
-    tensors = {name: to_tensor(value) for name, value in values.items()}
-    dr.enable_grad(tensors)
-    report = of(tensors)
-    weight = rng.normal(size=dr.width(report))
-    dr.backward(dr.sum(report * on_device(weight, type(report))))
-    slopes = {name: np.asarray(dr.grad(value).numpy(), float) for name, value in tensors.items()}
-    done()
+    weights: dict[str, FloatArray] = {}
+    slopes: dict[str, dict[str, FloatArray]] = {}
     fixed = {name: to_tensor(value) for name, value in values.items()}
+    with dr.suspend_grad():
+        for name, report in of(fixed).items():
+            weights[name] = np.random.default_rng(3).normal(size=dr.width(report))
+    done()
+    for name, weight in weights.items():
+        tensors = {key: to_tensor(value) for key, value in values.items()}
+        dr.enable_grad(tensors)
+        report = of(tensors)[name]
+        dr.backward(dr.sum(report * on_device(weight, type(report))))
+        slopes[name] = {key: np.asarray(dr.grad(value).numpy(), float) for key, value in tensors.items()}
+        done()
 
-    def along(name: str, way: FloatArray) -> Callable[[float], float]:
-        def moved(by: float) -> float:
-            with dr.suspend_grad():
-                found = of(fixed | {name: to_tensor(values[name] + by * way)}).numpy().astype(float)
-            done()
-            return float(found @ weight)
+    def along(key: str, way: FloatArray, by: float) -> FloatArray:
+        with dr.suspend_grad():
+            reports = of(fixed | {key: to_tensor(values[key] + by * way)})
+            found = [reports[name].numpy().astype(float) @ weight for name, weight in weights.items()]
+        done()
+        return np.array(found)
 
-        return moved
+    rng = np.random.default_rng(4)
+    ways = {key: rng.normal(size=v.shape) if v.size > 1 else np.ones(v.shape) for key, v in values.items()}
+    sizes = {key: _slope(partial(along, key, way), steps.get(key, step)) for key, way in ways.items()}
+    worst = {name: Worst() for name in weights}
+    for number, name in enumerate(weights):
+        least = LEAST_SLOPE * float(np.median([abs(size[number]) for size in sizes.values()]))
+        for key, way in ways.items():
+            size = float(sizes[key][number])
+            worst[name].add(abs(size - float((slopes[name][key] * way).sum())) / max(abs(size), least), key)
+    return worst
 
-    errors, sizes = {}, {}
-    for name, value in values.items():
-        way = rng.normal(size=value.shape) if value.size > 1 else np.ones(value.shape)
-        sizes[name] = _slope(along(name, way), steps.get(name, step))
-        errors[name] = abs(sizes[name] - float((slopes[name] * way).sum()))
-    least = LEAST_SLOPE * float(np.median(np.abs(list(sizes.values()))))
-    for name, error in errors.items():
-        worst.add(error / max(abs(sizes[name]), least), f"{name}, {where}" if where else name)
 
-
-def _slope(of: Callable[[float], float], longest: float, halvings: int = 4) -> float:
-    """Derivative at 0 by central differences of the fourth order: of steps halved, the two that agree best.
-
-    Long steps feel the curvature, short ones the roundings; where neither matters the estimates agree.
+def _slope(of: Callable[[float], FloatArray], longest: float, halvings: int = 4) -> FloatArray:
+    """Derivatives at 0 by fourth-order central differences of halved steps: the two estimates that agree best.
 
     Source: Ridders, "Accurate computation of F'(x)" (1982), for choosing the step by the estimates alone.
     """
     steps = longest * 0.5 ** np.arange(halvings + 1)
-    second = [(of(h) - of(-h)) / (2 * h) for h in steps]
-    fourth = [(4 * near - far) / 3 for far, near in pairwise(second)]
-    apart = [abs(a - b) for a, b in pairwise(fourth)]
-    best = int(np.argmin(apart))
-    return (fourth[best] + fourth[best + 1]) / 2
+    second = np.array([(of(h) - of(-h)) / (2 * h) for h in steps])
+    fourth = (4 * second[1:] - second[:-1]) / 3
+    best = np.abs(np.diff(fourth, axis=0)).argmin(axis=0)
+    each = np.arange(fourth.shape[1])
+    return np.asarray((fourth[best, each] + fourth[best + 1, each]) / 2)

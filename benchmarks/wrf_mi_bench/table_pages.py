@@ -1,4 +1,4 @@
-"""Pages and pictures of the tables of all methods, from the rows that are stored."""
+"""Pages and pictures of the tables of all methods, from stored rows."""
 
 from __future__ import annotations
 
@@ -18,11 +18,7 @@ from .table_plan import PARTS, SHARES, Part, Row, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
-    """All rows stored in a folder.
-
-    Raises:
-        InputError: a file that is no JSON.
-    """
+    """All rows stored in a folder."""
     rows = []
     for path in sorted(place.glob("*-seed*.json")):
         try:
@@ -33,19 +29,19 @@ def read_rows(place: Path) -> list[dict[str, Any]]:
 
 
 def write_tables(place: Path, quick: bool = False) -> None:
-    """Tables as Markdown in ``README.md`` and a picture of the distributions of each part, from what is stored."""
+    """Write tables in Markdown to ``README.md`` and a picture of the score distributions of each part."""
     stored = {row["row"]: row for row in read_rows(place)}
     text = ["# Every method, task by task", NOTE]
     for name, heading in OVERVIEWS.items():
         if shown := overview(name, stored, quick):
             text += [f"## {heading.capitalize()}: medians", shown]
     for part in PARTS:
-        own = [row for row in plan(quick) if row.part == part and row.name in stored]
-        if not own:
+        rows = [row for row in plan(quick) if row.part == part and row.name in stored]
+        if not rows:
             continue
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, own, stored)]
-        whole = [row for row in own if row.share == max(row.share for row in own) and row.seed == 0]
+        text += [f"## {title}", part_table(part, rows, stored)]
+        whole = [row for row in rows if row.share == max(row.share for row in rows) and row.seed == 0]
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
             {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
@@ -80,11 +76,6 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
-
-    Args:
-        name: of `OVERVIEWS`.
-        stored: rows by name.
-        quick: of the small version.
     """
     found: dict[Part, dict[str, list[float]]] = {}
     for row in plan(quick):
@@ -93,26 +84,33 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     if not found:
         return ""
     columns = {part: {key: float(np.mean(each)) for key, each in methods.items()} for part, methods in found.items()}
-    task = next(iter(columns)).task
-    sign = -1 if TASKS[task].higher_is_better else 1
+    task = TASKS[next(iter(columns)).task]
+    sign = -1 if task.higher_is_better else 1
     ranks: dict[str, list[float]] = {}
     for medians in columns.values():
-        ordered = sorted(medians, key=lambda method: sign * medians[method])
-        for place, method in enumerate(ordered):
-            ranks.setdefault(method, []).append(place / max(len(ordered) - 1, 1))
+        for rank, method in enumerate(sorted(medians, key=lambda method: sign * medians[method])):
+            ranks.setdefault(method, []).append(rank / max(len(medians) - 1, 1))
     entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
-    heads = [TASKS[task].label, *(_title(part) for part in columns), "paper, other data"]
-    lines = ["| " + " | ".join(heads) + " |", "| " + " | ".join(["---"] * len(heads)) + " |"]
-    digits = TASKS[task].digits
+    lines = _head([task.label, *(_title(part) for part in columns), "paper, other data"])
+    best = {part: min(medians.values(), key=lambda median: sign * median) for part, medians in columns.items()}
     for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
-        cells = [f"{medians[method]:.{digits}f}" if method in medians else "" for medians in columns.values()]
-        best = [method == min(medians, key=lambda name: sign * medians[name]) for medians in columns.values()]
-        cells = [f"**{cell}**" if first else cell for cell, first in zip(cells, best, strict=True)]
-        # What a method is given may differ from column to column: then its plain name stands for all.
+        cells = []
+        for part, medians in columns.items():
+            cell = f"{medians[method]:.{task.digits}f}" if method in medians else ""
+            cells.append(f"**{cell}**" if cell and medians[method] == best[part] else cell)
+        # Where labels differ between columns, as the inputs do, the plain name is shown.
         labels = {entry.label for entry in entries[method]}
         label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
-        lines.append("| " + " | ".join([label, *cells, entries[method][0].published]) + " |")
+        lines.append(_cells([label, *cells, entries[method][0].published]))
     return "\n".join(lines)
+
+
+def _cells(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _head(cells: Sequence[str]) -> list[str]:
+    return [_cells(cells), _cells(["---"] * len(cells))]
 
 
 def _title(part: Part) -> str:
@@ -120,7 +118,7 @@ def _title(part: Part) -> str:
 
 
 def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown table of one data set under one split: best median first, fewer rows below."""
+    """Markdown table of a data set and split: best median first, fewer rows below."""
     task = TASKS[part.task]
     sign = -1 if task.higher_is_better else 1
     groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
@@ -131,8 +129,8 @@ def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str
         return float(np.mean([one["score"]["median"] for one in groups[key]]))
 
     heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
-    lines = ["| " + " | ".join([*heads, "paper, other data"]) + " |", "| " + " | ".join(["---"] * 10) + " |"]
-    digits = TASKS[part.task].digits
+    lines = _head([*heads, "paper, other data"])
+    digits = task.digits
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
         found = groups[share, method]
         each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
@@ -148,17 +146,17 @@ def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str
             f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
             part.entries[method].published if share == max(row.share for row in rows) else "",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(_cells(cells))
     lines += _reference_rows(part, groups)
     return "\n".join(lines)
 
 
 def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
-    """What every run is held against where no row of its own measures it."""
+    """Lines of the references that every run states, where the part has no row of interpolation."""
     if "idw" in part.entries:
         return []
     digits, share = 2, max(share for share, _ in groups)
-    one = next(rows[0] for (own, _), rows in groups.items() if own == share)
+    one = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
     words, lines = TASKS[part.task].references, []
     for key, block in one["reference"].items():
         scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))

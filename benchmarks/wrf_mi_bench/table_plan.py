@@ -1,4 +1,4 @@
-"""Which runs the tables of all methods are made of: tasks, data sets, splits, methods, shares of the rows, seeds."""
+"""Runs of the tables of all methods: tasks, data sets, splits, methods, shares of the training rows, seeds."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from wrf_mi.datasets.registry import locate
 SEEDS = (0, 1, 2)
 ONE = SEEDS[:1]
 SHARES = (1.0, 0.3, 0.1)
-"""Of the training rows; less than all for the methods of `FEW` alone, on the official split."""
+"""Shares of the training rows; less than all only for the methods of `FEW` on the official split."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A method as a table has it.
+    """A method of a table.
 
     Attributes:
-        label: for the table.
-        arguments: of ``wrf-mi train`` beside data set, split, rows and seed.
-        quick: the same of a small version that takes half a minute.
-        seeds: more than one where a run takes less than three minutes on two cores and something is drawn.
-        few_seeds: the same with fewer rows, which are drawn themselves.
-        published: median (and what else is known) that the paper states, on other data; "" for none.
+        label: label in the table.
+        arguments: arguments of ``wrf-mi train`` except data set, split, rows and seed.
+        quick: further arguments of the small version, which takes half a minute.
+        seeds: seeds; several for random methods of less than three minutes.
+        few_seeds: seeds with fewer rows, which are random themselves.
+        published: figures of the paper, on other data; "": none.
     """
 
     label: str
@@ -43,18 +43,18 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
 
 
 NAMED = "{scene}"
-"""In arguments: in whose place a scene's come."""
+"""Argument that is replaced by the arguments of a scene."""
 IN_A_FLAT = (
     *("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2"),
     *("--calibrate", "gain,patterns"),
 )
-"""Walls are two surfaces each and let waves through; strengths are not calibrated."""
+"""Transmission through walls of two surfaces each, and calibration of uncalibrated strengths."""
 ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
-"""As the channels were traced, but for what the rough surfaces scatter, which no mesh tells."""
+"""Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
-"""Of every network in the small version; of those with long steps."""
+"""Schedules of the small version: networks, and networks with slow steps."""
 SHORT = _set("steps=400", "validate_every=200")
-"""Of every field of Gaussians in the small version."""
+"""Schedule of fields of Gaussians in the small version."""
 SPECTRUM: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
@@ -67,7 +67,7 @@ SPECTRUM: Mapping[str, Entry] = {
     "idw": Entry("blend", _model("idw")),
 }
 ROOM = _set("steps=18000")
-"""Where transmitters are anywhere in a room: 0.770 on validation rows, 0.754 after a third of the steps."""
+"""Schedule for transmitters anywhere in a room: SSIM 0.770 on validation rows, 0.754 after a third of the steps."""
 FURNISHED = {
     **SPECTRUM,
     "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
@@ -83,7 +83,7 @@ UNSEEN = {
         published="0.38, p90 0.61",
     ),
 }
-"""Where nobody has a mesh: all that can be traced is the direct path."""
+"""Methods without a mesh, where only the direct path can be traced."""
 RSSI: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
@@ -121,24 +121,24 @@ UPLINK: Mapping[str, Entry] = {
     ),
 }
 CHEAP = ("physics", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
-"""Measured first: seconds to a minute each."""
+"""Methods measured first: seconds to a minute each."""
 FEW = ("wrf-gs+", "physics", "nerf2", "linear", "kriging", "idw", "ray-tracing")
-"""Measured with fewer rows too."""
+"""Methods measured with fewer rows too."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One data set under one split.
+    """A data set with a split.
 
     Attributes:
-        task: of the data set.
-        table: which overview it belongs to: the task, or what channels are predicted from.
-        dataset: name.
-        split: name.
-        entries: methods.
+        task: task of the data set.
+        table: overview: the task, or the input from which channels are predicted.
+        dataset: name of the data set.
+        split: name of the split.
+        entries: methods by name.
         few: whether fewer rows are measured too.
-        scene: name of what `wrf_mi_bench.tables.scene_of` makes; "" where no method needs one.
-        once: methods whose run takes more than three minutes here on one thread: one seed.
+        scene: scene that `wrf_mi_bench.tables.scene_of` makes; "": none.
+        once: methods of more than three minutes on one thread, with one seed.
     """
 
     task: str
@@ -175,20 +175,12 @@ BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("spectrum", "dcgan"): _set("steps=750", "validate_every=75"),
     ("spectrum", "nerf2"): _set("steps=2500", "validate_every=250"),
 }
-"""Of the five folds of a blocked split, by task and method: they are fitted in turn, ten minutes for all of them."""
+"""Settings of blocked splits by task and method: five folds are fitted in ten minutes."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One run of the tables.
-
-    Attributes:
-        part: where.
-        method: key of the part's entries.
-        share: of the training rows.
-        seed: of subset and fit.
-        quick: the small version.
-    """
+    """A run of the tables: part, method, share of the training rows, seed of subset and fit, and small version."""
 
     part: Part
     method: str
@@ -198,32 +190,25 @@ class Row:
 
     @property
     def entry(self) -> Entry:
-        """The method."""
+        """Method."""
         return self.part.entries[self.method]
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name of its file."""
         p = self.part
         return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
 
     @property
     def command(self) -> str:
-        """What makes it, whatever the scene's place on a machine: a row that another one made is an old row."""
+        """Command with a placeholder for the scene, the same on every machine."""
         return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}}}"])])
 
     def arguments(self, scene: Sequence[str]) -> list[str]:
-        """Of ``wrf-mi``, without ``--out``.
-
-        Args:
-            scene: arguments that take the place of ``--scene {scene}``.
-        """
-        words: list[str] = []
-        for word in self.entry.arguments:
-            if word == NAMED:
-                words[-1:] = scene
-            else:
-                words.append(word)
+        """Arguments of ``wrf-mi`` without ``--out``; ``scene`` replaces ``--scene {scene}``."""
+        words = list(self.entry.arguments)
+        if NAMED in words:
+            words[words.index(NAMED) - 1 : words.index(NAMED) + 1] = scene
         if self.quick:
             words += self.entry.quick
         elif self.part.split == "blocked":
@@ -233,10 +218,7 @@ class Row:
 
 
 def plan(quick: bool = False) -> list[Row]:
-    """All rows: first one seed of every method at all rows, cheap ones first, then fewer rows, then other seeds.
-
-    So tables are whole early, and what an interruption leaves out is what is least needed.
-    """
+    """All rows: a seed of every method with all training rows, cheap methods first, then fewer rows, then seeds."""
     if quick:
         return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
     first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
@@ -261,5 +243,5 @@ def plan(quick: bool = False) -> list[Row]:
 
 
 def available(part: Part) -> bool:
-    """Whether the data of a part are on this machine or are made here."""
+    """Whether the data of a part are on this machine or can be made here."""
     return part.dataset.startswith("traced-") or locate(part.dataset) is not None

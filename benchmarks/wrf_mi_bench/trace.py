@@ -1,8 +1,10 @@
-"""The ray tracer against another one: MATLAB's image method in two CAD rooms (the NeWRF data)."""
+"""Ray tracing compared with MATLAB's image method in two CAD rooms (the NeWRF data)."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,47 +16,39 @@ from scipy.constants import speed_of_light
 from scipy.optimize import linear_sum_assignment
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
-from wrf_mi.core import InputError, Paths, Receiver
+from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
-from wrf_mi.datasets.registry import locate
 from wrf_mi.receivers import csi
+from wrf_mi.tasks.scores import summary
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.surfaces import scene_surfaces
+
+from .comparison import line, room_file
 
 ROOMS = ("conference", "office")
 SAME_LENGTH_M = 1e-3
 SAME_POINT_M = 1e-2
-"""The same path: as long to 1 mm, and its last interaction point within 1 cm."""
+"""Tolerances of equal paths: length, and last interaction point."""
 ON_SURFACE_M = 1e-4
-"""Crossings so close to a path's own points are the reflections themselves."""
+"""Distance from a path's points within which a crossing is the reflection itself."""
 MIRRORED = 1e-5
-"""Cosines of the angles before and after a reflection: 1e-6 m over the shortest segments."""
+"""Tolerance of the cosine between bisector and normal of a reflection."""
 SHORTEST_M = 1e-2
-"""Sionna RT drops paths with a shorter segment."""
-PAIRS_PER_CHUNK = 1 << 20
+"""Least length of a segment in Sionna RT."""
 
 
-def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) -> dict[str, Any]:
-    """Paths and channels of a room of the NeWRF data, traced anew and compared with MATLAB's.
+def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, Any]:
+    """Paths and channels of a room of the NeWRF data compared with MATLAB's.
 
-    MATLAB's image method takes surfaces for perfect mirrors without change of sign, up to two reflections, so the
-    channel compared is the sum over paths of lambda / (4 pi d) exp(-j k d). Paths that MATLAB has not are confirmed, or
-    not, in float64 without any ray tracer: reflected as from a mirror at every point and crossing no triangle between.
-
-    Args:
-        room: ``<room>.npz`` with ``<room>.stl`` beside it (see `wrf_mi.datasets.newrf`).
-        rays: see `wrf_mi.tracing.TraceOptions`.
-        seed: of the rays.
+    MATLAB's image method has perfect reflections without change of sign, two at most, so the channel is the sum over
+    paths of lambda / (4 pi d) exp(-j k d). Paths that MATLAB lacks are confirmed in float64 by `confirm_paths`.
 
     Returns:
-        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers that MATLAB has a
-        channel for and over those of them where MATLAB lacks no path, seconds, and the process's memory. Quantiles
-        of no receiver and the share of no path are None.
-
-    Raises:
-        InputError: the room's files are missing or damaged.
+        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers with a channel in
+        MATLAB and over those where MATLAB lacks no path, seconds, and memory; None for quantiles of no receiver and
+        the share of no path.
     """
     file = Path(room)
     data = read_arrays(file, KEYS)
@@ -63,8 +57,8 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
     scene = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     access_point = Receiver("access-point", data["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0]))
     start = time.perf_counter()
-    options = TraceOptions(max_depth=2, rays=rays, seed=seed)
-    # The moving end is the transmitter, by reciprocity: MATLAB's last point is our first.
+    options = TraceOptions(max_depth=2, rays=rays, seed=1)
+    # The moving end is the transmitter, by reciprocity, so MATLAB's last point is the first one here.
     trace = trace_paths(scene, data["rx_pos"], access_point, options)
     seconds = time.perf_counter() - start
     paths = trace.paths
@@ -79,18 +73,13 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
         paths.select(extra), data["rx_pos"], access_point.position_m, scene_surfaces(scene).triangles
     )
     last = np.linalg.norm(data["path_last_point"][missing] - data["rx_pos"][row[missing]], axis=1)
-    free_space = Paths(
-        **{name: getattr(paths, name) for name in ("tx", "rx", "length_m", "departure", "arrival")},
-        gain=(wavelength / (4 * np.pi * paths.length_m)).astype(complex),
-        **{name: getattr(paths, name) for name in ("interactions", "vertices_m", "objects", "object_names")},
-        n_tx=paths.n_tx,
-        n_rx=paths.n_rx,
-    )
+    free_space = replace(paths, gain=(wavelength / (4 * np.pi * paths.length_m)).astype(complex))
     # An error relative to a channel that is zero, as where MATLAB has no path, is not defined.
     reached = np.flatnonzero(data["csi"])
     error = csi(free_space, frequency_hz)[0, reached, 0] - data["csi"][reached]
     cea = -20 * np.log10(np.abs(error) / np.abs(data["csi"][reached]))
     incomplete = np.unique(paths.tx[extra])
+    complete = cea[~np.isin(reached, incomplete)]
     return {
         "room": file.stem,
         "receivers": paths.n_tx,
@@ -103,133 +92,109 @@ def image_method_agreement(room: str | Path, rays: Any = "auto", seed: int = 1) 
         "paths_matlab_lacks": len(extra),
         "of_these_confirmed": int(confirmed.sum()),
         "receivers_matlab_lacks_paths": len(incomplete),
-        "cea_db": _quantiles(cea),
-        "cea_db_where_matlab_lacks_none": _quantiles(cea[~np.isin(reached, incomplete)]),
+        "cea_db": summary(cea) if len(cea) else None,
+        "cea_db_where_matlab_lacks_none": summary(complete) if len(complete) else None,
         "seconds": seconds,
         "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
 
 
 PathKey = tuple[IntArray, FloatArray, FloatArray]
+Distances = Callable[[IntArray, IntArray], Sequence[FloatArray]]
 
 
 def match_paths(ours: PathKey, theirs: PathKey) -> tuple[IntArray, IntArray]:
-    """Which paths of two lists are the same, one to one, as few as possible left over.
+    """Indices into two lists of paths that are the same, one to one.
+
+    Each list has the index of the position [p], the length [p] and the last interaction point [p, 3] in m.
+    """
+
+    def distances(a: IntArray, b: IntArray) -> Sequence[FloatArray]:
+        longer = np.abs(ours[1][a, None] - theirs[1][None, b])
+        return longer / SAME_LENGTH_M, np.linalg.norm(ours[2][a, None] - theirs[2][None, b], axis=-1) / SAME_POINT_M
+
+    return assign(ours[0], theirs[0], distances)
+
+
+def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntArray, IntArray]:
+    """One-to-one assignment of as many paths as possible of the same position, all of whose distances are below 1.
 
     Args:
-        ours: position's index [p], length [p] and last interaction point [p, 3] in metres.
-        theirs: the same of q paths.
+        ours: index of the position of each path, [p].
+        theirs: index of the position of each path of the other list, [q].
+        distances: matrices of distances between paths a [n] and b [m] of both lists, [n, m] each.
 
     Returns:
-        Indices into both, of equal length.
+        Indices into both lists, of equal length.
     """
-    pairs = []
-    for position in np.intersect1d(ours[0], theirs[0]):
-        mine, other = (np.flatnonzero(side[0] == position) for side in (ours, theirs))
-        longer = np.abs(ours[1][mine, None] - theirs[1][None, other])
-        apart = np.linalg.norm(ours[2][mine, None] - theirs[2][None, other], axis=-1)
-        cost = longer / SAME_LENGTH_M + apart / SAME_POINT_M
-        same = (longer < SAME_LENGTH_M) & (apart < SAME_POINT_M)
-        chosen = linear_sum_assignment(np.where(same, cost, 1e3))
-        kept = same[chosen]
-        pairs.append((mine[chosen[0][kept]], other[chosen[1][kept]]))
-    if not pairs:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate([pair[0] for pair in pairs]), np.concatenate([pair[1] for pair in pairs])
+    pairs = [np.zeros((2, 0), np.int64)]
+    for position in np.intersect1d(ours, theirs):
+        a, b = (np.flatnonzero(side == position) for side in (ours, theirs))
+        apart = np.stack(distances(a, b))
+        same = apart.max(axis=0) < 1
+        rows, columns = linear_sum_assignment(np.where(same, apart.sum(axis=0), 1e3))
+        kept = same[rows, columns]
+        pairs.append(np.stack([a[rows[kept]], b[columns[kept]]]))
+    first, second = np.concatenate(pairs, axis=1)
+    return first, second
 
 
 def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
-    """Which paths are lines of sight or mirror reflections that no triangle obstructs; brute force in float64.
+    """Which paths are mirror reflections or lines of sight without obstruction, by brute force in float64.
 
     Args:
-        paths: of reflections alone, to one receiver.
-        tx_pos_m: shape [n_tx, 3].
-        rx_pos_m: shape [3].
-        triangles: shape [f, 3, 3].
-
-    Source: Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection" (1997), J. Graphics Tools 2(1).
+        paths: paths of reflections to a receiver.
+        tx_pos_m: positions of the transmitters, [n_tx, 3].
+        rx_pos_m: position of the receiver, [3].
+        triangles: corners of the mesh in metres, [f, 3, 3].
     """
+    corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal = np.cross(first, second)
+    area = np.linalg.norm(normal, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal = normal / area[:, None]
+    offset, slack = (corner * normal).sum(axis=1), ON_SURFACE_M / np.sqrt(np.maximum(area, 1e-12))
+
+    def inside(points: FloatArray, which: IntArray, slack: Any) -> NDArray[np.bool_]:
+        """Whether points in the planes of triangles lie inside them, by barycentric coordinates."""
+        s, n = points - corner[which], normal[which] / area[which, None]
+        u, v = (np.cross(s, second[which]) * n).sum(axis=1), (np.cross(first[which], s) * n).sum(axis=1)
+        return np.asarray((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack))
+
+    def obstructed(here: FloatArray, there: FloatArray) -> bool:
+        length = float(np.linalg.norm(there - here))
+        way = (there - here) / length
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (offset - normal @ here) / (normal @ way)
+        which = np.flatnonzero((t > ON_SURFACE_M) & (t < length - ON_SURFACE_M))
+        return bool(inside(here + t[which, None] * way, which, 0.0).any())
+
+    def mirrored(before: FloatArray, at: FloatArray, after: FloatArray) -> bool:
+        which = np.flatnonzero(np.abs(normal @ at - offset) < ON_SURFACE_M)
+        which = which[inside(at, which, slack[which])]
+        half = sum((end - at) / np.linalg.norm(end - at) for end in (before, after))
+        return bool((np.abs(normal[which] @ half) > (1 - MIRRORED) * np.linalg.norm(half)).any())
+
     good = np.ones(len(paths), bool)
-    for index in range(len(paths)):
-        bounces = int(paths.bounces[index])
+    for index, bounces in enumerate(paths.bounces):
         points = [tx_pos_m[paths.tx[index]], *paths.vertices_m[index, :bounces], rx_pos_m]
-        for here, there in pairwise(points):
-            good[index] &= not _crosses(here, there, triangles)
-        for before, at, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
-            good[index] &= _mirrors(before, at, after, triangles)
+        good[index] = not any(obstructed(*ends) for ends in pairwise(points))
+        good[index] &= all(mirrored(*turn) for turn in zip(points, points[1:], points[2:], strict=False))
     return good
 
 
-def _crosses(here: FloatArray, there: FloatArray, triangles: FloatArray) -> bool:
-    """Whether a triangle lies between two points."""
-    way = there - here
-    length = float(np.linalg.norm(way))
-    a, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    p = np.cross(way, second)
-    volume = (first * p).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = here - a
-        u = (s * p).sum(axis=1) / volume
-        q = np.cross(s, first)
-        v = q @ way / volume
-        t = (second * q).sum(axis=1) / volume * length
-        return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > ON_SURFACE_M) & (t < length - ON_SURFACE_M)).any())
-
-
-def _mirrors(before: FloatArray, at: FloatArray, after: FloatArray, triangles: FloatArray) -> bool:
-    """Whether the turn at a point is that of a mirror in the plane of a triangle that holds the point."""
-    a, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    cross = np.cross(first, second)
-    area = np.linalg.norm(cross, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        n = cross / area[:, None]
-        near = np.abs(((at - a) * n).sum(axis=1)) < ON_SURFACE_M
-        s = at - a
-        u, v = (np.cross(s, second) * n).sum(axis=1) / area, (np.cross(first, s) * n).sum(axis=1) / area
-    slack = ON_SURFACE_M / np.sqrt(np.maximum(area, 1e-12))
-    holds = near & (u > -slack) & (v > -slack) & (u + v < 1 + slack)
-    to, fro = before - at, after - at
-    half = to / np.linalg.norm(to) + fro / np.linalg.norm(fro)
-    half /= np.linalg.norm(half)
-    return bool((np.abs(n[holds] @ half) > 1 - MIRRORED).any())
-
-
-def _quantiles(values: FloatArray) -> dict[str, float] | None:
-    """Median, mean, 10th and 90th percentile; None of no values."""
-    if not len(values):
-        return None
-    p10, median, p90 = np.percentile(values, [10, 50, 90])
-    return {"median": float(median), "mean": float(values.mean()), "p10": float(p10), "p90": float(p90)}
-
-
 def newrf() -> dict[str, Any]:
-    """Both rooms of the NeWRF data against MATLAB's image method, for the benchmark."""
+    """Both rooms of the NeWRF data compared with MATLAB's image method, with rows for the table."""
     figures = {name: image_method_agreement(room_file(name)) for name in ROOMS}
     rows = []
     for name, found in figures.items():
         lacking = (
             f"MATLAB lacks {found['paths_matlab_lacks']} more, of which {found['of_these_confirmed']} are confirmed"
         )
-        share, error = 100 * found["share_found"], 1e3 * found["length_error_m"]
-        value = f"{share:.2f} %, lengths within {error:.2f} mm"
-        rows.append({"what": f"{name}, paths found ({lacking})", "value": value, "asked": "99 %, 1 mm"})
-        rows.append(
-            {
-                "what": f"{name}, channel of all {found['receivers']} positions, median CEA",
-                "value": f"{found['cea_db']['median']:.0f} dB (p10 {found['cea_db']['p10']:.0f} dB)",
-                "asked": "30 dB",
-            }
-        )
+        value = f"{100 * found['share_found']:.2f} %, lengths within {1e3 * found['length_error_m']:.2f} mm"
+        cea = f"{found['cea_db']['median']:.0f} dB (p10 {found['cea_db']['p10']:.0f} dB)"
+        rows += [
+            line(f"{name}, paths found ({lacking})", value, "99 %, 1 mm"),
+            line(f"{name}, channel of all {found['receivers']} positions, median CEA", cea, "30 dB"),
+        ]
     return {"rows": rows, "rooms": figures}
-
-
-def room_file(name: str) -> Path:
-    """The file of one of the NeWRF rooms.
-
-    Raises:
-        InputError: it is not on this machine.
-    """
-    folder = locate(f"newrf-{name}")
-    if folder is None:
-        raise InputError(f"newrf-{name}: not on this machine; run `wrf-mi data fetch newrf-{name}`")
-    return folder / f"{name}.npz"

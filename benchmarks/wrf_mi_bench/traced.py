@@ -1,11 +1,7 @@
-"""Figures of the traced evaluation: against splatting, and its pace against Mitsuba's own integrator.
-
-python -m wrf_mi_bench.traced
-"""
+"""Mitsuba integrator of this package compared with splatting, and its time with ``volprim_rf_basic``'s."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,22 +13,23 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import Receiver, unit_vectors
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.timing import Within, seconds
+from wrf_mi.training.step import device_pose
 
+from .comparison import line
 from .stock import StockRenderer, rgb_variant
 
 HEIGHT, WIDTH = 90, 360
 BLENDINGS = ("alpha", "product")
 LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02
-"""Of traced against splatted images of small Gaussians: SSIM of magnitudes, relative L2 error of complex values."""
+"""Bounds for small Gaussians: SSIM of magnitudes, relative L2 error of complex values."""
 DISTANCE_M = (2.0, 8.0)
 
 SMALL_DEG = 2.0
-"""Largest standard deviation, seen from the receiver, of Gaussians whose projection is close to exact."""
+"""Largest angular standard deviation of Gaussians whose projection is close to exact."""
 
 Image = NDArray[np.complex128]
 
@@ -40,15 +37,15 @@ Image = NDArray[np.complex128]
 def random_field(
     seed: int, blending: str, count: int = 300, size_deg: float = SMALL_DEG, ratio: float = 2.0, opacity: float = 0.8
 ) -> tuple[Gaussians, Receiver]:
-    """Gaussians in random directions above a receiver at a random pose; one on its zenith, one on its azimuth seam.
+    """Gaussians in random directions above a receiver at a random pose, with the receiver.
 
     Args:
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         blending: ``"alpha"`` or ``"product"``.
-        count: of Gaussians, two or more.
-        size_deg: largest standard deviation of each as the receiver sees it.
-        ratio: between the largest and the smallest that the axes of one Gaussian may have.
-        opacity: the largest.
+        count: number of Gaussians, two or more: one at the zenith, one on the azimuth seam.
+        size_deg: largest angular standard deviation.
+        ratio: largest ratio between the axes of a Gaussian.
+        opacity: largest opacity.
     """
     rng = np.random.default_rng(seed)
     quaternion = rng.standard_normal(4)
@@ -77,7 +74,7 @@ def random_field(
 
 
 def scene_of(gaussians: Gaussians, receiver: Receiver, height: int = HEIGHT, width: int = WIDTH, **more: Any) -> Any:
-    """A ``mi.Scene`` with the field, the receiver's perception plane and the traced integrator."""
+    """``mi.Scene`` with Gaussians, the receiver's perception plane and this package's integrator."""
     from wrf_mi_plugins.sensor import receiver_to_world
     from wrf_mi_plugins.shape import gaussian_shape
 
@@ -99,22 +96,18 @@ def scene_of(gaussians: Gaussians, receiver: Receiver, height: int = HEIGHT, wid
 
 
 def traced(gaussians: Gaussians, receiver: Receiver) -> Image:
-    """The field by ``mi.render``, complex [HEIGHT, WIDTH]."""
+    """Complex image [HEIGHT, WIDTH] by ``mi.render``."""
     return np.asarray(mi.render(scene_of(gaussians, receiver)).numpy(), float) @ np.array([1, 1j])
 
 
 def splatted(gaussians: Gaussians, receiver: Receiver) -> Image:
-    """The same by splatting."""
-    pose = Pose(
-        [mi.Float(float(x)) for x in receiver.position_m],
-        [[mi.Float(float(x)) for x in row] for row in receiver.to_world],
-    )
-    re, im = splat(gaussians, pose, perception_plane(HEIGHT, WIDTH, mi.Float))
+    """Complex image [HEIGHT, WIDTH] by splatting."""
+    re, im = splat(gaussians, device_pose(receiver), perception_plane(HEIGHT, WIDTH, mi.Float))
     return (re.numpy().astype(float) + 1j * im.numpy()).reshape(HEIGHT, WIDTH)
 
 
 def difference(a: Image, b: Image) -> dict[str, float]:
-    """How far image a is from b: SSIM of magnitudes (scaled to b's largest), relative L2 errors of both."""
+    """SSIM of the magnitudes of images a and b, scaled to b's largest, and relative L2 errors."""
     top = np.abs(b).max()
     return {
         "ssim": float(structural_similarity(np.abs(a) / top, np.abs(b) / top, data_range=1)),
@@ -143,15 +136,15 @@ def worst(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int = 3) -> list[dict[str, float]]:
-    """Mean `difference` by angular size, for round Gaussians and for those of axes 2 : 1.
+    """Mean `difference` by angular size, for round Gaussians and for axes of 2 : 1.
 
-    Projection leaves out two things (`wrf_mi.gaussians.ray_response`): a Gaussian's lean against the line of sight, of
-    first order in its size, which round ones have none of; and its extent in depth, of second order.
+    Projection neglects the tilt against the line of sight, of first order in the size and zero for round Gaussians, and
+    the extent in depth, of second order (`wrf_mi.gaussians.ray_response`).
     """
     rows = []
     for size in sizes_deg:
         for ratio in (1.0, 2.0):
-            # As much overlap at every size as 300 Gaussians of 2 degrees have, but for the largest.
+            # The overlap is that of 300 Gaussians of 2 degrees, except at the largest sizes.
             count = max(30, int(300 * (2 / size) ** 2))
             found = against_splatted(fields, size_deg=size, ratio=ratio, count=min(count, 1000))
             means = {name: float(np.mean([f[name] for f in found])) for name in found[0]}
@@ -160,18 +153,16 @@ def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int
 
 
 def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, float]:
-    """Median times of one render in ms, ours and ``volprim_rf_basic``'s, alternating in this process.
+    """Median times of interleaved renders in ms, by this package and by ``volprim_rf_basic`` in the rgb variant.
 
-    Ours computes in the mono_polarized variant, where that one fails; it does in the rgb variant of the same backend.
-    Both see the same Gaussians along the same rays, one a pixel. ``traced_ms`` is a render after the geometry changed,
-    which finds all hits anew, ``again_ms`` one after the signals changed. The update of the scene, in which Mitsuba
-    builds its own BVH, is left out on both sides.
+    ``traced_ms`` is a render after the geometry changed, ``again_ms`` after the signals changed. Updates of the scene,
+    in which Mitsuba builds its BVH, do not count.
     """
     gaussians, receiver = random_field(0, "alpha", count, size_deg, opacity=0.1)
     opacity: Any = gaussians.opacity
     scene = scene_of(gaussians, receiver)
     params = mi.traverse(scene)
-    # Copies: what `numpy` gives on the CPU is the array's own memory, which an update of the scene frees.
+    # Copied, as an update of the scene frees the memory.
     data, signal = (params[f"gaussians.{name}"].numpy().copy() for name in ("data", "signal"))
     times: dict[str, list[float]] = {"traced_ms": [], "again_ms": [], "stock_ms": []}
     stock = StockRenderer(receiver, HEIGHT, WIDTH)
@@ -195,7 +186,7 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
 
 
 def main() -> dict[str, Any]:
-    """All figures, as plain numbers, and rows for the benchmark's table."""
+    """All figures, with rows for the table."""
     small = against_splatted()
     figures: dict[str, Any] = {
         "small": {"fields": len(small), **worst(small)},
@@ -205,13 +196,8 @@ def main() -> dict[str, Any]:
     least, most = figures["small"]["lowest_ssim"], 100 * figures["small"]["largest_complex_error"]
     what = f"traced against splatted, worst of {len(small)} renders of random fields of small Gaussians"
     asked = f"{LOWEST_SSIM:g}, {100 * LARGEST_ERROR:g} %"
-    rows = [{"what": what, "value": f"SSIM {least:.4f}, L2 error {most:.2f} %", "asked": asked}]
+    rows = [line(what, f"SSIM {least:.4f}, L2 error {most:.2f} %", asked)]
     for found in figures["pace"]:
         what = f"10,000 Gaussians of {found['size_deg']:g}°, 360 x 90: `volprim_rf_basic`'s time over ours"
-        value = f"{found['stock_over_traced']:.1f} ({found['traced_ms']:.0f} ms)"
-        rows.append({"what": what, "value": value, "asked": "1"})
+        rows.append(line(what, f"{found['stock_over_traced']:.1f} ({found['traced_ms']:.0f} ms)", "1"))
     return {"rows": rows, **figures}
-
-
-if __name__ == "__main__":
-    print(json.dumps(main(), indent=1))

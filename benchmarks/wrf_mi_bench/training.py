@@ -1,8 +1,7 @@
-"""Training: time and memory to the final accuracy, and how far a step is from what the machine can do.
+"""Training: time and memory of default fits, and times of steps compared with the machine's limits.
 
-Each fit runs in a process of its own, with the default settings. A step is then timed with as many Gaussians as the fit
-ended with, beside the machine's own best in the same run: the rate of a large matrix product, and the rate at which
-memory is read and written. What a step computes and moves is counted from the shapes of its arrays.
+Each fit runs in a subprocess. Steps have as many Gaussians as the fit ended with. Limits are the measured rates of a
+large matrix product and of memory; operations and bytes of a step are counted from the shapes of its arrays.
 """
 
 from __future__ import annotations
@@ -10,7 +9,8 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -27,18 +27,19 @@ from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.tiles import TILE_COLUMNS, TILE_ROWS, build_lists, perception_plane
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.api import train
-from wrf_mi.runs.timing import Interval, bootstrap, interleaved
+from wrf_mi.runs.timing import Interval, bootstrap, interleaved, seconds
 from wrf_mi.synthetic import load_record
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer, peak_memory_mb
 
 from .bench import BenchFailed
+from .comparison import line
 
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "physics": "physics"}
 ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Of the physics model and of WRF-GS+, on two cores."""
+"""Bounds on time and memory of the physics model and of WRF-GS+, on two cores."""
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
 STEPS, ROUNDS = 10, 9
@@ -47,22 +48,16 @@ PRODUCT_SIZE = 1536
 STREAM_FLOATS = 1 << 26
 """An array of 256 MB, which no cache holds."""
 FORWARD, BACKWARD = 28, 63
-"""Operations for one pixel and one Gaussian on its tile's list, counted in `wrf_mi.gaussians.blend` (alpha blending): a
+"""Operations of a pixel and a Gaussian on its tile's list, counted in `wrf_mi.gaussians.blend` (alpha blending): a
 multiply-add is two, a root, an exponential or a reciprocal one."""
 SHARED_FORWARD, SHARED_BACKWARD = 4, 8
-"""Of these, what a further transmitter of the same geometry adds."""
+"""Operations of a further transmitter with the same geometry."""
 QUIET = ("density.every=0", "log_every=1000000", "validate_every=1000000", "checkpoint_every=1000000")
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one step computes and moves.
-
-    Attributes:
-        network_gflop: of the networks' products, forwards and backwards.
-        splat_gflop: of the pixels' walks.
-        moved_gb: read and written at least: each product's operands and result, hidden layers, Adam's arrays, images.
-    """
+    """Operations of networks and of splatting, forwards and backwards, and least bytes moved, of a step."""
 
     network_gflop: float
     splat_gflop: float
@@ -70,12 +65,12 @@ class Work:
 
     @property
     def gflop(self) -> float:
-        """All of it."""
+        """Operations of networks and splatting."""
         return self.network_gflop + self.splat_gflop
 
 
 def fit(model: str) -> dict[str, Any]:
-    """One fit with the default settings on the authors' split, in this process."""
+    """Time, memory and accuracy of a fit with default settings on the authors' split, in this process."""
     record = load_record(DATA)
     processor = time.process_time()
     with tempfile.TemporaryDirectory() as work:
@@ -94,33 +89,29 @@ def fit(model: str) -> dict[str, Any]:
 
 fit_wrf_gs_plus, fit_wrf_gs, fit_factorised, fit_physics = (partial(fit, model) for model in TITLES)
 FITS = dict(zip(TITLES, ("fit_wrf_gs_plus", "fit_wrf_gs", "fit_factorised", "fit_physics"), strict=True))
-"""By model the function of this module that fits it in a process of its own, whose peak memory is then the fit's."""
+"""Function that fits each model in a subprocess, whose peak memory is then the fit's."""
 
 
-def fit_alone(model: str) -> dict[str, Any]:
-    """`fit` in a process of its own.
-
-    Raises:
-        BenchFailed: it did not finish.
-    """
+def fit_in_subprocess(model: str) -> dict[str, Any]:
+    """Result of `fit` in a subprocess; `BenchFailed` where it failed."""
     with tempfile.TemporaryDirectory() as work:
         out = Path(work) / "fit.json"
-        status, said = run_module("wrf_mi_bench.check", [f"{__name__.rpartition('.')[2]}:{FITS[model]}", str(out)])
+        status, message = run_module("wrf_mi_bench.check", [f"{__name__}:{FITS[model]}", str(out)])
         if status != 0:
-            raise BenchFailed(f"training: fitting {model} ended with status {status} {said}".rstrip())
+            raise BenchFailed(f"training: fitting {model} ended with status {status} {message}".rstrip())
         result: dict[str, Any] = json.loads(out.read_text())
         return result
 
 
 def trainer(model: str, gaussians: int, batch: int) -> Trainer:
-    """A fit of so many Gaussians and transmitters a step, all else the default, that goes on for ever."""
+    """Trainer with a number of Gaussians and transmitters a step, otherwise default, without end."""
     record = load_record(DATA)
-    own = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
-    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), own))
+    given = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
+    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), given))
 
 
 def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
-    """A call that takes a few more steps."""
+    """Call that takes a number of further steps."""
 
     def call() -> None:
         goal = of.state.step + steps
@@ -130,7 +121,7 @@ def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
 
 
 def work_of(of: Trainer) -> Work:
-    """What a step of a fit computes and moves, from the shapes of its arrays."""
+    """Operations and bytes of a step, from the shapes of its arrays."""
     shapes = {name: tuple(value.shape) for name, value in of.state.mean.items()}
     n, batch = shapes["position"][1], of.config.batch
     height, width = of.graph.form.size
@@ -162,7 +153,7 @@ def work_of(of: Trainer) -> Work:
 
 
 def _columns(name: str, n: int, batch: int) -> int:
-    """For how many columns a layer's matrix is used: Gaussians, transmitters or pairs of them."""
+    """Number of columns of a layer's input: Gaussians, transmitters or pairs of them."""
     if name.startswith("terms.") or name.endswith(".transmitter"):
         return batch
     if name.startswith("attenuation.") or name.endswith((".position", ".feature")):
@@ -171,7 +162,7 @@ def _columns(name: str, n: int, batch: int) -> int:
 
 
 def _visits(of: Trainer) -> float:
-    """Pixels times Gaussians on their tiles' lists, for one transmitter."""
+    """Number of pairs of a pixel and a Gaussian on its tile's list, for one transmitter."""
     params = {name: dr.detach(value) for name, value in of.state.mean.items()}
     with dr.suspend_grad():
         gaussians = of.field.gaussians(params, to_tensor(of.record.tx_pos_m[:1].T))
@@ -182,48 +173,44 @@ def _visits(of: Trainer) -> float:
 
 
 def product_call(size: int = PRODUCT_SIZE) -> Callable[[], Any]:
-    """A large matrix product, the same code as a network's layers: 2 size^3 operations."""
+    """Matrix product by the code of a network's layers: 2 size^3 operations."""
     rng = np.random.default_rng(0)
     a, b = (to_tensor(rng.standard_normal((size, size))) for _ in range(2))
     return lambda: a @ b
 
 
 def stream_call(floats: int = STREAM_FLOATS) -> Callable[[], Any]:
-    """Read an array and write another: 8 bytes a number."""
+    """Reading of an array and writing of another: 8 bytes a number."""
     values = dr.full(mi.Float, 1, floats)
     dr.make_opaque(values)
     return lambda: values * 0.5
 
 
-KINDS = {"BatchedGemm": "products of networks"}
-WALKS = "two longest kernels, the walks of splatting"
+PRODUCTS, WALKS = "products of networks", "two longest kernels, the walks of splatting"
 
 
 def shares(call: Callable[[], Any]) -> dict[str, float]:
-    """What the time of a call goes to, shares of all, by Dr.Jit's kernel history."""
+    """Shares of the time of a call by kind of work, from Dr.Jit's kernel history."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()  # recorded anew, as recordings belong to such flags
+        call()  # recorded again, as recordings depend on this flag
         dr.sync_thread()
         dr.kernel_history_clear()
-        start = time.perf_counter()
-        call()
-        dr.sync_thread()
-        whole = 1e3 * (time.perf_counter() - start)
+        whole = 1e3 * seconds(call)
         history = dr.kernel_history()
-    by_kind: dict[str, float] = {}
-    by_kernel: dict[str, float] = {}
+    by_kind: Counter[str] = Counter()
+    by_kernel: Counter[str] = Counter()
     for entry in history:
-        kind, spent = str(entry["type"]).rpartition(".")[2], entry["execution_time"]
-        by_kind[kind] = by_kind.get(kind, 0.0) + spent
+        kind = str(entry["type"]).rpartition(".")[2]
+        by_kind[kind] += entry["execution_time"]
         if kind == "JIT":
-            key = str(entry["hash"])
-            by_kernel[key] = by_kernel.get(key, 0.0) + spent
-    walks = sum(sorted(by_kernel.values())[-2:])
+            by_kernel[str(entry["hash"])] += entry["execution_time"]
+    walks = sum(time for _, time in by_kernel.most_common(2))
+    products, kernels = by_kind.pop("BatchedGemm", 0.0), by_kind.pop("JIT", 0.0)
     parts = {
-        KINDS["BatchedGemm"]: by_kind.get("BatchedGemm", 0.0),
+        PRODUCTS: products,
         WALKS: walks,
-        "other kernels": sum(by_kernel.values()) - walks,
-        "sorts, sums and copies": sum(by_kind.values()) - by_kind.get("BatchedGemm", 0.0) - by_kind.get("JIT", 0.0),
+        "other kernels": kernels - walks,
+        "sorts, sums and copies": sum(by_kind.values()),
     }
     parts["launching them, Python"] = max(whole - sum(parts.values()), 0.0)
     return {name: value / whole for name, value in parts.items()}
@@ -231,8 +218,8 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
 
 def main() -> dict[str, Any]:
     """Fits of all models, and their steps beside the machine's best."""
-    load_record(DATA)  # what is missing is said first
-    fits = {model: fit_alone(model) for model in TITLES}
+    load_record(DATA)  # missing data are reported first
+    fits = {model: fit_in_subprocess(model) for model in TITLES}
     trainers = {
         f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)
         for model in TITLES
@@ -262,36 +249,26 @@ def rows(
 ) -> list[dict[str, str]]:
     """Lines of the table."""
     peak, stream = machine["product_gflop_s"], machine["stream_gb_s"]
-    lines = [_line("the machine's best", f"{peak:.0f} GFLOP/s in a product, {stream:.1f} GB/s read and written")]
+    best = f"{peak:.0f} GFLOP/s in a product, {stream:.1f} GB/s read and written"
+    lines = [line("the machine's best", best)]
     for model, one in fits.items():
-        said = (
+        value = (
             f"{one['seconds']:.0f} s, of processors {one['processor_seconds']:.0f} s; {one['peak_memory_mb']:.0f} MB; "
             f"median SSIM {one['ssim']['median']:.3f}"
         )
         asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "physics") else ""
-        lines.append(_line(f"{TITLES[model]}, fit to its final accuracy", said, asked))
+        lines.append(line(f"{TITLES[model]}, fit to its final accuracy", value, asked))
     for name, one in steps.items():
         title, _, batch = name.rpartition(", ")
-        plural = "s" if int(batch) > 1 else ""
-        where = f"{title}, a step of {batch} transmitter{plural}"
-        work = Work(**one["work"])
-        # Both at once would be the best: arithmetic hides what is moved, or the other way round.
+        where = f"{title}, a step of {batch} transmitter{'s' if int(batch) > 1 else ''}"
+        work, ms = Work(**one["work"]), Interval(**one["ms"])
+        # At best arithmetic and transfers overlap.
         limit_ms = 1e3 * max(work.gflop / peak, work.moved_gb / stream)
-        ms = Interval(**one["ms"])
-        lines.append(
-            _line(
-                where,
-                f"{ms} ms; {work.network_gflop:.3f} GFLOP in networks, {work.splat_gflop:.3f} in splatting, "
-                f"{1e3 * work.moved_gb:.0f} MB moved: at least {limit_ms:.2f} ms, {100 * limit_ms / ms.value:.0f} %",
-            )
+        value = (
+            f"{ms} ms; {work.network_gflop:.3f} GFLOP in networks, {work.splat_gflop:.3f} in splatting, "
+            f"{1e3 * work.moved_gb:.0f} MB moved: at least {limit_ms:.2f} ms, {100 * limit_ms / ms.value:.0f} %"
         )
-        lines.append(_line(f"{where}: where its time goes", _shares(one["shares"].items())))
+        lines.append(line(where, value))
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in one["shares"].items())
+        lines.append(line(f"{where}: where its time goes", parts))
     return lines
-
-
-def _shares(parts: Iterable[tuple[str, float]]) -> str:
-    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in parts)
-
-
-def _line(what: str, value: str, asked: str = "") -> dict[str, str]:
-    return {"what": what, "value": value, "asked": asked}

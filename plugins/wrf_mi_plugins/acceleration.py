@@ -1,24 +1,24 @@
-"""Which Gaussians the rays of a bundle meet: found by Mitsuba's ray tracing of the ``ellipsoids`` shape.
+"""Lists of the Gaussians that the rays of a bundle meet, by Mitsuba's ray tracing of the ``ellipsoids`` shape.
 
-A ray through many overlapping ellipsoids costs one trace a hit, and each trace tests those around its start again.
-Three things keep that small:
+A ray through many overlapping ellipsoids costs one trace per hit, and each trace tests those around its start again.
+Three measures keep that small:
 
 * one ray is traced for each bundle, through ellipsoids grown by the bundle's width
   (`wrf_mi.gaussians.ray_response.hulls`);
-* the ellipsoids are dealt out to many places far from each other and traced in each, so that few overlap;
-* the caller keeps what was found for as long as neither the Gaussians' geometry nor the receiver changes.
+* the ellipsoids are distributed over many parts far from each other and traced in each, so that few overlap;
+* the caller keeps the lists until the Gaussians' geometry or the receiver changes.
 
-Each ellipsoid is scaled about the receiver, so that its centre comes to lie between `NEAREST` and `FARTHEST` by its
-rank, its place by distance. That changes nothing in which rays meet it, but the near and small are then as large as the
-far for the roundings of float32. Those wider than `WIDEST` as the receiver sees them are left to all rays.
+Each ellipsoid is scaled about the receiver so that its centre lies between `NEAREST` and `FARTHEST` by its rank, its
+position in the order of distances. Rays meet it as before, but small near ones become as large as far ones relative to
+the rounding of float32. Ellipsoids wider than `WIDEST` as the receiver sees them are listed for all rays.
 
-The hits come in order of entry. One sort of numbers (bundle, rank) puts them in order of depth: no buffer limits how
-far the two orders may differ.
+Hits come in order of entry. One sort of numbers (bundle, rank) puts them in order of depth: no buffer limits the
+difference between the two orders.
 
-A closest hit hides a second ellipsoid entered at the same place, and the next trace must begin a step behind the hit.
-So each bundle is traced from both ends: what is lost must share its entry with one ellipsoid and its exit with one,
-within `STEP`, of the few in its part. Ranks that follow each other lie in different parts, so coincident Gaussians do.
-Of 165,000 hits of 4,000 Gaussians of 7 degrees one way loses some 45, both ways none: one in 10^7 is to be expected.
+A closest hit hides a second ellipsoid entered at the same point, and the next trace begins a step behind the hit.
+So each bundle is traced from both ends: an ellipsoid is lost only if it shares its entry with one ellipsoid of its part
+and its exit with one, within `STEP`. Ranks that follow each other lie in different parts, so coincident Gaussians do.
+Of 165,000 hits of 4,000 Gaussians of 7 degrees one direction loses some 45, both none: one in 10^7 is to be expected.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.ray_response import Hulls, RayFootprints, hulls
 
 IN_PART = 64
-"""Ellipsoids in a part, about: with fewer, most rays meet none of it; with more, each trace tests many."""
+"""Approximate ellipsoids per part: with fewer, most rays meet none of it; with more, each trace tests many."""
 
 FEWEST_PARTS, MOST_ACROSS = 16, 16
 """Parts at least, and along each side of their cube at most: more would be too far from the origin for float32."""
 
 NEAREST, FARTHEST = 1000.0, 4000.0
-"""Distances of the nearest and of the farthest centre in the traced scene, whose unit of length is free.
+"""Distances of the nearest and of the farthest centre in the traced scene.
 
-But not for Mitsuba 3.9: of ellipsoids with a semi-axis far below 1 its intersection, in float32, loses rays even
-through the middle, a quarter of them at 0.016 in a distance of 1, and none at 16 in a distance of 1000.
+Mitsuba 3.9 intersects ellipsoids in float32 and loses rays through the middle of those with a semi-axis far below 1: a
+quarter of them at 0.016 in a distance of 1, and none at 16 in a distance of 1000.
 """
 
 WIDEST = 2.0
@@ -57,10 +57,10 @@ STEP = 1e-4 * NEAREST
 """Step behind a hit: some roundings of float32 at the farthest part, and a hundredth of the smallest ellipsoid."""
 
 SPACING = 2 * SIZE + 4 * STEP
-"""From one part to the next: rays of one part end before the ellipsoids of the next begin."""
+"""Distance between parts: rays of one part end before the ellipsoids of the next begin."""
 
 ENTRIES, ENTRIES_EACH = 1 << 18, 8
-"""Hits that there is room for at first, in all and for each ellipsoid; more are traced again with as much as they need.
+"""Hits allocated at first, in all and per ellipsoid; if there are more, rays are traced again with enough room.
 
 A thousand Gaussians that overlap as in a default field have 32 each, 100,000 of them 6.
 """
@@ -70,73 +70,78 @@ def traced_lists(gaussians: Gaussians, footprints: RayFootprints, pose: Pose, bu
     """For each bundle the Gaussians that its rays may meet, near to far, each once.
 
     Args:
-        gaussians: batch 1.
-        footprints: of these Gaussians from ``pose``.
-        pose: of the receiver.
-        bundles: its rays.
+        gaussians: Gaussians with batch 1.
+        footprints: responses of these Gaussians from ``pose``.
+        pose: pose of the receiver.
+        bundles: rays of the receiver.
     """
     order = depth_order(footprints.depth, gaussians.position)
     order = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, footprints.visible, order)))
     lists = dr.width(bundles.axis[0])
     if dr.width(order) == 0:
-        return RayLists(mi.UInt32(0), dr.zeros(mi.UInt32, lists + 1))
+        return RayLists(mi.UInt32(0), dr.zeros(mi.UInt32, lists), dr.zeros(mi.UInt32, lists))
     key_type: Any = mi.UInt32 if lists * dr.width(order) < 2**32 else mi.UInt64
     # Numbers that change with the geometry stay on the device: as constants of kernels they would compile new ones.
     count = dr.opaque(key_type, dr.width(order))
-    own = _scaled(hulls(gaussians, pose, bundles.margin_rad), order)
-    widest = dr.maximum(dr.maximum(*own.radius[:2]), own.radius[2]) / _distance(own)
+    ellipsoids = _scaled(hulls(gaussians, pose, bundles.margin_rad), order)
+    widest = dr.maximum(dr.maximum(*ellipsoids.radius[:2]), ellipsoids.radius[2]) / _distance(ellipsoids)
     narrow, wide = (mi.UInt32(dr.compress(m)) for m in (widest <= WIDEST, widest > WIDEST))
     found = []
     if dr.width(wide) > 0:
         bundle = dr.repeat(dr.arange(mi.UInt32, lists), dr.width(wide))
         found.append(key_type(bundle) * count + key_type(dr.tile(wide, lists)))
     if dr.width(narrow) > 0:
-        found.append(_hits(own, narrow, pose, bundles, count))
+        found.append(_hits(ellipsoids, narrow, pose, bundles, count))
     keys = dr.sort(dr.concat(found))
     number = dr.arange(mi.UInt32, dr.width(keys))
     first = (number == 0) | (keys != dr.gather(key_type, keys, dr.maximum(number, 1) - 1))
     keys = dr.gather(key_type, keys, dr.compress(first))
-    length = dr.zeros(mi.UInt32, lists + 1)
+    length = dr.zeros(mi.UInt32, lists)
     dr.scatter_add(length, mi.UInt32(1), mi.UInt32(keys // count))
-    result = RayLists(dr.gather(mi.UInt32, order, mi.UInt32(keys % count)), dr.cumsum(length) - length)
+    end = dr.cumsum(length)
+    result = RayLists(dr.gather(mi.UInt32, order, mi.UInt32(keys % count)), end - length, end)
     dr.eval(result)
     return result
 
 
-def _distance(own: Hulls) -> Any:
-    return dr.norm(mi.Vector3f(*own.centre))
+def _distance(ellipsoids: Hulls) -> Any:
+    return dr.norm(mi.Vector3f(*ellipsoids.centre))
 
 
-def _scaled(own: Hulls, order: Any) -> Hulls:
+def _scaled(ellipsoids: Hulls, order: Any) -> Hulls:
     """The ellipsoids in the order of their ranks, scaled about the receiver."""
-    own = Hulls(*([dr.gather(mi.Float, c, order) for c in part] for part in (own.centre, own.radius, own.rotation)))
+    ellipsoids = ellipsoids.at(order)
     rank = dr.arange(mi.Float, dr.width(order)) / dr.opaque(mi.Float, dr.width(order))
-    scale = dr.lerp(NEAREST, FARTHEST, rank) / _distance(own)
-    result = Hulls([c * scale for c in own.centre], [r * scale for r in own.radius], own.rotation)
+    scale = dr.lerp(NEAREST, FARTHEST, rank) / _distance(ellipsoids)
+    result = Hulls([c * scale for c in ellipsoids.centre], [r * scale for r in ellipsoids.radius], ellipsoids.rotation)
     dr.eval(result.centre, result.radius, result.rotation)
     return result
 
 
-def _hits(own: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any) -> Any:
+def _hits(ellipsoids: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any) -> Any:
     """Numbers ``bundle * count + rank`` of the ellipsoids of these ranks that the bundles' axes meet, some twice."""
-    own = Hulls(*([dr.gather(mi.Float, c, rank) for c in part] for part in (own.centre, own.radius, own.rotation)))
+    ellipsoids = ellipsoids.at(rank)
     # Room for rounding.
-    own.radius = [r + STEP for r in own.radius]
+    ellipsoids.radius = [r + STEP for r in ellipsoids.radius]
     n, lists, key_type = dr.width(rank), dr.width(bundles.axis[0]), type(count)
     parts = int(np.clip(-(-n // IN_PART), FEWEST_PARTS, MOST_ACROSS**3))
     across = int(np.ceil(round(parts ** (1 / 3), 6)))
     place = _place(dr.arange(mi.UInt32, n) % parts, across)
-    columns = [*(c + x for c, x in zip(own.centre, place, strict=True)), *own.radius, *own.rotation]
+    columns = [
+        *(c + x for c, x in zip(ellipsoids.centre, place, strict=True)),
+        *ellipsoids.radius,
+        *ellipsoids.rotation,
+    ]
     data = dr.concat([mi.TensorXf(c, (n, 1)) for c in columns], axis=1)
     shape = {"type": "ellipsoids", "data": data, "extent": 1.0, "extent_adaptive_clamping": False}
     scene = mi.load_dict({"type": "scene", "hulls": shape})
 
     # No closest hit reports an ellipsoid from within: rays begin in front of those that hold the receiver.
-    distance, radius = _distance(own), dr.maximum(dr.maximum(*own.radius[:2]), own.radius[2])
+    distance, radius = _distance(ellipsoids), dr.maximum(dr.maximum(*ellipsoids.radius[:2]), ellipsoids.radius[2])
     behind = dr.max(dr.select(radius + STEP > distance, distance + radius + STEP, 0))
     ray = dr.arange(mi.UInt32, 2 * parts * lists)
     axis = [dr.gather(mi.Float, c, ray % lists) for c in bundles.axis]
-    turned = mi.Vector3f(*(sum(dr.detach(pose.to_world[i][k]) * axis[k] for k in range(3)) for i in range(3)))
+    turned = dr.detach(mi.Vector3f(*pose.from_local(axis)))
     back = ray >= parts * lists
     end = SIZE + STEP
     origin = _place((ray // lists) % parts, across) + turned * dr.select(back, end, -behind)
@@ -151,7 +156,7 @@ def _hits(own: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any) -> An
 
 
 def _place(part: Any, across: int) -> Any:
-    """Where the receiver stands in a part."""
+    """Position of the receiver in a part."""
     middle = (across - 1) / 2
     x, y, z = mi.Float(part % across), mi.Float(part // across % across), mi.Float(part // across**2)
     return mi.Point3f((x - middle) * SPACING, (y - middle) * SPACING, (z - middle) * SPACING)
@@ -159,7 +164,7 @@ def _place(part: Any, across: int) -> Any:
 
 @dr.syntax
 def _trace(scene: Any, start: Any, first: Any, rank: Any, room: Any, entries: int) -> tuple[Any, int]:
-    """Each ray's ``first`` plus the rank of what it hits, unsorted; and how many there are, for whatever room.
+    """Each ray's ``first`` plus the rank of each hit, unsorted, and their number, which may exceed the room.
 
     ``room`` is ``entries`` as an array of width 1.
     """
@@ -174,8 +179,8 @@ def _trace(scene: Any, start: Any, first: Any, rank: Any, room: Any, entries: in
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         active &= hit.is_valid()
         slot = dr.scatter_inc(used, mi.UInt32(0), active)
-        own = key_type(dr.gather(mi.UInt32, rank, hit.prim_index, active))
-        dr.scatter(keys, first + own, slot, active & (slot < room))
+        hit_rank = key_type(dr.gather(mi.UInt32, rank, hit.prim_index, active))
+        dr.scatter(keys, first + hit_rank, slot, active & (slot < room))
         t += hit.t + STEP
     dr.eval(keys, used)
     return keys, int(used[0])

@@ -11,41 +11,35 @@ from numpy.typing import ArrayLike
 
 from wrf_mi.core import InputError
 from wrf_mi.gaussians.footprint_constants import CUTOFF
-from wrf_mi.gaussians.optical_depth import attenuators, one, passing
 from wrf_mi.gaussians.parameters import Gaussians
 
+from .optical_depth import attenuators, closest_approach
 from .shape import gaussian_shape, shape_parameters
 from .source import FieldSource, source_from_properties, source_of
 
 
 class GaussianEmitter(mi.Emitter):
-    """Gaussians as virtual transmitters whose complex signals depend on where the real transmitter is.
+    """Gaussians as virtual transmitters whose complex signals depend on the position of the real transmitter.
 
-    The emitter holds a trained field and a transmitter position. It is an area emitter: it belongs to one shape
-    `wrf_gaussians`, whose geometry and attributes ``signal``, ``opacity`` or ``attenuation`` it writes when that is
-    loaded and whenever one of its own parameters changes. The traced integrator reads the complex signals there.
+    The emitter holds a trained field and a transmitter position. It is an area emitter of one shape `wrf_gaussians`,
+    whose geometry and attributes ``signal``, ``opacity`` or ``attenuation`` it writes when the shape is loaded and
+    after each change of the emitter's parameters. The traced integrator reads the complex signals there.
     Declare the emitter in the scene and refer to it in the shape, so that ``mi.traverse(scene)`` lists its parameters.
 
-    ================ ============ ==== ======== =============== =====================================================
-    parameter        type         unit default  differentiable  meaning
-    ================ ============ ==== ======== =============== =====================================================
-    ``run``          string            required no              run folder made by ``wrf-mi train`` (or its
-                                                                ``model.npz``), looked for beside the scene file
-    ``tx_position``  point        m    required yes             transmitter, world frame
-    (weights)        tensor            of run   yes             each of the field's parameters by name, dots as
-                                                                underscores; ``position``, ``log_scale`` and
-                                                                ``rotation`` with discontinuities
-    ================ ============ ==== ======== =============== =====================================================
+    =============== ====== ==== ======== =========================================================================
+    parameter       type   unit default  meaning
+    =============== ====== ==== ======== =========================================================================
+    ``run``         string      required run folder made by ``wrf-mi train`` (or its ``model.npz``)
+    ``tx_position`` point  m    required position of the transmitter, world frame; differentiable
+    (weights)       tensor      from run parameters of the field by name, dots as underscores; differentiable
+    =============== ====== ==== ======== =========================================================================
 
-    .. code-block:: python
+    The parameters ``position``, ``log_scale`` and ``rotation`` have discontinuities at the edges of footprints.
 
-        "transmitter": {"type": "wrf_gaussian_emitter", "run": "runs/first", "tx_position": [0.5, 1.0, 0.8]},
-        "gaussians": {"type": "wrf_gaussians", "emitter": {"type": "ref", "id": "transmitter"}},
-
-    Stock integrators carry power, not phase. To them each Gaussian radiates |a S|^2 towards whoever sees it, with its
-    signal S and a = opacity times G under alpha blending, a = G under product blending, where G is its largest value
-    along the ray. In a shape with a ``null`` BSDF, the default, these powers add up along a ray. They are found by rays
-    that hit them: the emitter cannot be sampled and says so with a density of zero.
+    Stock integrators carry power, not phase. For them each Gaussian radiates |a S|^2 along each ray, with its signal S
+    and a = opacity times G under alpha blending, a = G under product blending, where G is its largest value along the
+    ray. In a shape with a ``null`` BSDF, the default, these powers add up along a ray. Only rays that hit a Gaussian
+    find it: the emitter cannot be sampled and returns a density of zero.
     """
 
     def __init__(self, props: mi.Properties, source: FieldSource | None = None) -> None:
@@ -57,10 +51,10 @@ class GaussianEmitter(mi.Emitter):
 
     def _refresh(self) -> None:
         self.gaussians: Gaussians = self.source.gaussians()
-        self._seen = attenuators(self.gaussians)
+        self._attenuators = attenuators(self.gaussians)
 
-    def tell(self, medium: Any) -> None:
-        """Call ``medium.gaussians_changed()`` whenever the Gaussians have changed."""
+    def add_medium(self, medium: Any) -> None:
+        """Call ``medium.gaussians_changed()`` after each change of the Gaussians."""
         self._media.append(weakref.ref(medium))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -69,17 +63,19 @@ class GaussianEmitter(mi.Emitter):
         self.source.traverse(callback)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Ask the field anew and pass the Gaussians on to the shape and to media."""
+        """Evaluate the field and update the shape and media."""
         super().parameters_changed(keys)
-        if list(keys) == ["parent"]:  # the shape says that it has changed, which is our doing
+        if list(keys) == ["parent"]:  # a change of the shape that this emitter made
             return
         self._refresh()
         shape = self.get_shape()
         if shape is not None:
             parameters = mi.traverse(shape)
             for name, values in shape_parameters(self.gaussians).items():
-                # Geometry that stays as it was is not traced anew.
-                if not _same(values, parameters[name]):
+                # Unchanged geometry is not traced anew.
+                old = parameters[name]
+                unchanged = dr.width(values) == dr.width(old) and not dr.grad_enabled((values, old))
+                if not (unchanged and dr.all(values == old)):
                     parameters[name] = values
             parameters.update()
         for reference in self._media:
@@ -88,10 +84,10 @@ class GaussianEmitter(mi.Emitter):
                 medium.gaussians_changed()
 
     def eval(self, si: mi.SurfaceInteraction3f, active: Any = True) -> mi.Spectrum:
-        """Power |a S|^2 that the Gaussian hit sends along the ray, unpolarised."""
+        """Power |a S|^2 of the Gaussian hit along the ray, unpolarised."""
         g, index = self.gaussians, si.prim_index
         direction = si.to_world(si.wi)
-        square, _, _ = passing(one(self._seen, index), list(si.p), list(direction))
+        square, _, _ = closest_approach(self._attenuators.at(index), list(si.p), list(direction))
         amplitude = dr.select(active & (square < CUTOFF * CUTOFF), dr.exp(-0.5 * square), 0)
         if g.opacity is not None:
             amplitude *= dr.gather(mi.Float, g.opacity, index)
@@ -101,7 +97,7 @@ class GaussianEmitter(mi.Emitter):
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: Any = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """No sample: density zero, so that rays that hit the Gaussians count in full."""
+        """No sample: density zero, so rays that hit the Gaussians count in full."""
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
 
     def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> mi.Float:
@@ -109,38 +105,31 @@ class GaussianEmitter(mi.Emitter):
         return mi.Float(0)
 
     def eval_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> mi.Spectrum:
-        """Radiance of a direction sample: none is ever made."""
+        """Radiance of a direction sample, of which there are none."""
         return mi.Spectrum(0)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        """That of the shape."""
+        """Bounding box of the shape."""
         shape = self.get_shape()
         return mi.ScalarBoundingBox3f() if shape is None else shape.bbox()
 
     def to_string(self) -> str:
-        """One line: model, number of Gaussians, transmitter."""
+        """Model, number of Gaussians and transmitter."""
         where = ", ".join(f"{x:g}" for x in dr.ravel(dr.detach(self.source.tx_position)))
         model = type(self.source.field).__name__
         return f"GaussianEmitter[{model}, {self.gaussians.count} Gaussians, transmitter at ({where}) m]"
 
 
-def _same(a: Any, b: Any) -> bool:
-    """Whether two arrays have the same numbers and no derivatives."""
-    if dr.width(a) != dr.width(b) or dr.grad_enabled(a) or dr.grad_enabled(b):
-        return False
-    return bool(dr.all(a == b))
-
-
 def gaussian_emitter(
     field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike, name: str = "transmitter"
 ) -> GaussianEmitter:
-    """The emitter of a model of your own, or of parameters that no run folder holds; an entry for ``mi.load_dict``.
+    """An emitter from a user-defined model, or from parameters without a run folder; an entry for ``mi.load_dict``.
 
     Args:
         field: any object with the method ``gaussians`` of `wrf_mi.gaussians.WrfGsPlus`.
-        params: its parameters by name.
-        tx_position_m: three coordinates, world frame.
-        name: under which ``mi.traverse`` lists its parameters; use it as the key in dictionaries, too.
+        params: parameters of the field by name.
+        tx_position_m: transmitter position [3], world frame, metres.
+        name: name under which ``mi.traverse`` lists the emitter's parameters; use it as the key in dictionaries, too.
 
     Raises:
         InputError: a position of another shape or not finite.
@@ -161,7 +150,7 @@ def _shape_of_emitter(props: mi.Properties) -> mi.Shape:
     others = {key: value for key, value in given.items() if value is not emitter}
     if not any(isinstance(value, mi.BSDF) for value in others.values()):
         entry["bsdf"] = {"type": "null"}
-    # Mitsuba may be loading a scene in parallel at this moment: no second round of tasks within one of its own.
+    # Mitsuba may be loading a scene in parallel, and parallel tasks do not nest.
     return mi.load_dict(entry | others, parallel=False)
 
 

@@ -1,8 +1,7 @@
 """The traced evaluation of a graph's Gaussians: ``mi.render`` with `wrf_traced`, walls of its scene included.
 
-A scene is built once for each transmitter of a batch, and each call assigns what has changed by ``mi.traverse``. The
-reverse pass of ``mi.render`` reads the scene again, so two transmitters whose derivatives are asked for cannot take
-turns in one scene; without derivatives they do.
+A scene is built once for each transmitter of a batch, and each call assigns parameters by ``mi.traverse``. The reverse
+pass of ``mi.render`` reads the scene again, so two transmitters can take turns in one scene only without derivatives.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.skip import NOTHING, Skip
 from wrf_mi.gaussians.tiles import Plane
-from wrf_mi.graph.learned import facing_down
+from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
 from wrf_mi.tracing.field_calculator import Complex
 from wrf_mi.tracing.material_parameters import MaterialGrouping, slabs_of_faces
 from wrf_mi.tracing.surfaces import scene_surfaces
 
 from . import register_all
-from .shape import gaussian_shape, shape_parameters
+from .shape import deinterleave, gaussian_shape, shape_parameters
 
 SHAPE = "gaussians"
 
@@ -36,15 +35,15 @@ SHAPE = "gaussians"
 class SceneWalls:
     """The surfaces of a Sionna RT scene as walls of another Mitsuba scene, one mesh for each material.
 
-    The Sionna RT scene is read and never changed: materials are copies, with parameters of their own.
+    The Sionna RT scene is not changed: materials are copies.
 
     Args:
-        scene: from `wrf_mi.tracing.open_scene`.
+        scene: scene from `wrf_mi.tracing.open_scene`.
         materials: whether each named material or each surface has a permittivity and a conductivity, see
             `wrf_mi.tracing.material_parameters`.
 
     Attributes:
-        names: of the materials, or ``object/plane`` of the surfaces, in the order of the walls.
+        names: names of the materials, or ``object/plane`` of the surfaces, in the order of the walls.
         shapes: entries for ``mi.load_dict``, ``wall_0`` and so on. ``mi.traverse`` lists each ``wall_<k>.bsdf.eta_r``
             (relative permittivity), ``.sigma`` (conductivity, S/m) and ``.d`` (thickness, m).
         frequency_hz: carrier of the scene.
@@ -79,7 +78,7 @@ class SceneWalls:
         return RadioMaterial(f"slab-{k}", **dict(zip(names, map(float, constants), strict=True)))
 
     def values(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        """What to assign in ``mi.traverse`` for trained materials, differentiable; those without stay as stated.
+        """Values for ``mi.traverse`` of trained materials, differentiable; others stay as stated.
 
         Args:
             params: Dr.Jit tensors by the names of `wrf_mi.tracing.material_parameters.SlabMaterials.parameters`.
@@ -113,13 +112,13 @@ class _FieldScene:
         carrier = {} if walls is None else {"frequency_hz": walls.frequency_hz}
         entries: dict[str, Any] = {"integrator": {"type": "wrf_traced"} | carrier, SHAPE: gaussian_shape(gaussians)}
         entries |= {f"view_{i}": sensor for i in range(views)} | ({} if walls is None else walls.shapes)
-        # Not optimised: materials that are alike at first are not the same.
+        # Not optimised: materials with equal starting values must not be merged.
         self.scene = mi.load_dict({"type": "scene"} | entries, optimize=False)
         self.params = mi.traverse(self.scene)
         self._assigned: list[str] = []
 
     def render(self, values: Mapping[str, Any], views: int) -> list[Any]:
-        """Images [height, width, 2] of all views, after parameters took these values."""
+        """Images [height, width, 2] of all views with these values of parameters."""
         for name, value in values.items():
             self.params[name] = value
         self.params.update()
@@ -127,22 +126,22 @@ class _FieldScene:
         return [mi.render(self.scene, self.params, sensor=i) for i in range(views)]
 
     def release(self) -> None:
-        """Detach what was assigned; the values stay."""
+        """Detach assigned values."""
         for name in self._assigned:
             self.params[name] = dr.detach(self.params[name])
 
 
-class Traced:
-    """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`: `wrf_mi.graph.Evaluation`.
+class Traced(Evaluation):
+    """Gaussians evaluated along rays by ``mi.render`` with the integrator `wrf_traced`.
 
     Derivatives reach Gaussians, the receiver's pose and the walls' materials. With a scene each Gaussian behind walls
-    is multiplied by what they pass of a wave polarised along the world's z axis. Scenes are built by the first calls
-    and whenever the number of Gaussians changes; Dr.Jit then finds each kernel compiled, but cannot record a call
+    is multiplied by their transmission of a wave polarised along the world's z axis. Scenes are built by the first
+    calls and whenever the number of Gaussians changes; Dr.Jit then finds each kernel compiled, but cannot record a call
     (`dr.freeze`), which builds bounding volumes anew.
 
     Args:
-        scene: from `wrf_mi.tracing.open_scene`; None: no walls.
-        traced: what of the scene is trained.
+        scene: scene from `wrf_mi.tracing.open_scene`; None: no walls.
+        traced: parameters of the scene that are trained.
 
     Raises:
         InputError: planes that training moves, or a material that is no slab.
@@ -168,36 +167,34 @@ class Traced:
         params: Mapping[str, Any],
         skip: Skip = NOTHING,
     ) -> Complex:
-        """Complex signal on directions, in the order of `wrf_mi.graph.learned.learned_field`; nothing is skipped."""
+        """Complex signal on directions, in the order of `wrf_mi.graph.evaluations.learned_field`."""
         poses = [pose, facing_down(pose)] if sphere else [pose]
         if not gaussians.count:
             pixels = gaussians.batch * len(poses) * plane.pixels
             return dr.zeros(mi.Float, pixels), dr.zeros(mi.Float, pixels)
         gaussians = gaussians.spread()
-        own = {f"view_{i}.to_world": _to_world(one) for i, one in enumerate(poses)}
+        common = {f"view_{i}.to_world": _to_world(view) for i, view in enumerate(poses)}
         if self._walls is not None:
-            own |= self._walls.values(params)
+            common |= self._walls.values(params)
         each = [
-            own | {f"{SHAPE}.{name}": value for name, value in shape_parameters(gaussians, k).items()}
+            common | {f"{SHAPE}.{name}": value for name, value in shape_parameters(gaussians, k).items()}
             for k in range(gaussians.batch)
         ]
-        taking_turns = not dr.grad_enabled(each)
-        images = [
-            image
-            for k, values in enumerate(each)
-            for image in self._scene(0 if taking_turns else k, gaussians, plane, len(poses)).render(values, len(poses))
-        ]
+        images = []
+        for k, values in enumerate(each):
+            scene = self._scene(k if dr.grad_enabled(each) else 0, gaussians, plane, len(poses))
+            images += scene.render(values, len(poses))
         flat = dr.concat([image.array for image in images])
-        index = 2 * dr.arange(mi.UInt32, dr.width(flat) // 2)
-        return dr.gather(mi.Float, flat, index), dr.gather(mi.Float, flat, index + 1)
+        re, im = deinterleave(flat, dr.width(flat) // 2)
+        return re, im
 
     def release(self) -> None:
         """Detach the scenes' parameters.
 
-        Mitsuba's calls of materials read those of all scenes: what another scene traces would have derivatives by them.
+        Mitsuba's calls of materials read those of all scenes, which would attach the results of another scene.
         """
-        for one in self._scenes:
-            one.release()
+        for scene in self._scenes:
+            scene.release()
 
     def _scene(self, number: int, gaussians: Gaussians, plane: Plane, views: int) -> _FieldScene:
         form = gaussians.count, gaussians.opacity is None, plane.height, plane.width, views

@@ -1,17 +1,17 @@
-"""Gaussians that opaque walls hide from all rays of a bundle, left out of its list, with a bound on the error.
+"""Removal of Gaussians that opaque walls hide from all rays of a bundle, with a bound on the error.
 
 Blending goes by the distance of centres, walls act at a Gaussian's strongest point on the ray: a Gaussian behind a wall
-may stand in the list before one that is not, and hides it. So only the end of a list is cut, from where on all its
-Gaussians lie behind walls that pass at most the share p of the power on each of the bundle's rays. What is cut off is
+may precede one before the wall in the list, and hides it. So only the end of a list is cut, from where on all its
+Gaussians lie behind walls that pass at most the share p of the power on each of the bundle's rays. The sum cut off is
 
     |sum_{k >= j} w_k S_k W_k T_k| <= sqrt(p) |T_j| M_j <= sqrt(p) M_j
 
 with M_j the largest |S_k| cut off, as their weights add up to less than one (alpha blending), or their sum (product
-blending, where |T| <= 1): the bound of `wrf_mi.gaussians.skip`, made smaller by the walls. Derivatives by S_k, which
+blending, where |T| <= 1): the bound of `wrf_mi.gaussians.skip`, reduced by the walls. Derivatives by S_k, which
 are w_k W_k T_k, are below sqrt(p) too.
 
-A Gaussian lies behind what is nearer than its distance less three of its largest standard deviations, the low-pass
-included: where it is cut off, and so nearer than its strongest point on any ray that sees it.
+A Gaussian lies behind anything nearer than its distance less three of its largest standard deviations, low-pass
+included: its cut-off ellipsoid ends there, before its strongest point on any ray that sees it.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def without_hidden(
     Args:
         lists: Gaussians of each bundle, near to far.
         bundles: the rays.
-        gaussians: batch 1.
-        footprints: of these.
-        walls: that the rays cross.
-        power: largest share of the power that a wall, or several, pass and still count as opaque.
+        gaussians: Gaussians with batch 1.
+        footprints: responses of the Gaussians along rays.
+        walls: walls that the rays cross.
+        power: largest share of the power that opaque walls pass.
     """
     with dr.suspend_grad():
         far = _opaque_from(walls, bundles, power)
@@ -50,18 +50,13 @@ def without_hidden(
         widest = dr.maximum(dr.maximum(*gaussians.scale[:2]), gaussians.scale[2])
         near = depth - CUTOFF * dr.sqrt(widest * widest + dr.square(LOW_PASS_RAD * depth))
         dr.eval(far, near)
-        length = _seen(lists, near, far)
-        start = dr.zeros(mi.UInt32, dr.width(length) + 1)
-        dr.scatter(start, dr.cumsum(length), dr.arange(mi.UInt32, dr.width(length)) + 1)
-        dr.eval(length, start)
-        index = dr.empty(mi.UInt32, max(int(start[dr.width(length)]), 1))
-        _copy(lists, length, start, index)
-        dr.eval(index)
-    return RayLists(index, start)
+        end = _seen_end(lists, near, far)
+        dr.eval(end)
+    return RayLists(lists.index, lists.begin, end)
 
 
 def _opaque_from(walls: Walls, bundles: Bundles, power: float) -> Any:
-    """Distance from which on walls pass at most this share along each ray of a bundle, [bundles]; infinite: none."""
+    """Distance beyond which walls pass at most this share along each ray of a bundle, [bundles]; infinite: none."""
     k = walls.k
     ray = dr.arange(mi.UInt32, dr.width(walls.distance) // k)
     opaque, still = dr.full(mi.Float, dr.inf, dr.width(ray)), mi.Bool(True)
@@ -71,30 +66,18 @@ def _opaque_from(walls: Walls, bundles: Bundles, power: float) -> Any:
         opaque = dr.select(still, dr.gather(mi.Float, walls.distance, ray * k + (crossed - 1)), opaque)
     far = dr.zeros(mi.Float, dr.width(bundles.axis[0]))
     dr.eval(opaque, far)
-    for own, active in zip(bundles.ray, bundles.active, strict=True):
-        dr.scatter_reduce(dr.ReduceOp.Max, far, dr.gather(mi.Float, opaque, own), bundles.bundle, active)
+    for ray, active in zip(bundles.ray, bundles.active, strict=True):
+        dr.scatter_reduce(dr.ReduceOp.Max, far, dr.gather(mi.Float, opaque, ray), bundles.bundle, active)
     return far
 
 
 @dr.syntax
-def _seen(lists: RayLists, near: Any, far: Any) -> Any:
-    """Entries of each list up to its last Gaussian that is not hidden, [bundles]."""
-    bundle = dr.arange(mi.UInt32, dr.width(far))
-    start = dr.gather(mi.UInt32, lists.start, bundle)
-    j, end, last = mi.UInt32(start), dr.gather(mi.UInt32, lists.start, bundle + 1), mi.UInt32(start)
+def _seen_end(lists: RayLists, near: Any, far: Any) -> Any:
+    """End of each list behind its last Gaussian that is not hidden, [bundles]."""
+    j, end, last = mi.UInt32(lists.begin), mi.UInt32(lists.end), mi.UInt32(lists.begin)
     behind = far * (1 + ROUNDING)
     while j < end:
         hidden = dr.gather(mi.Float, near, dr.gather(mi.UInt32, lists.index, j)) > behind
         j += 1
         last = dr.select(hidden, last, j)
-    return last - start
-
-
-@dr.syntax
-def _copy(lists: RayLists, length: Any, start: Any, index: Any) -> None:
-    bundle = dr.arange(mi.UInt32, dr.width(length))
-    source, to = dr.gather(mi.UInt32, lists.start, bundle), dr.gather(mi.UInt32, start, bundle)
-    j = mi.UInt32(0)
-    while j < length:
-        dr.scatter(index, dr.gather(mi.UInt32, lists.index, source + j), to + j)
-        j += 1
+    return last

@@ -25,30 +25,30 @@ from .shape import gaussian_shape_of, interleave, read_gaussians
 from .walls import find_crossings, wall_scene, wall_shapes, walls_of
 
 KEPT = 8
-"""Views (sensor and pose, with geometry) whose rays, hits and walls are kept."""
+"""Number of views (sensor and pose, with geometry) whose rays, hits and walls are kept."""
 
 POINT_TOLERANCE_M = 1e-3
-"""How far from its sensor's position a ray may pass: float32 is good to that some kilometres from the origin."""
+"""Largest distance of a ray from its sensor's position: the rounding of float32 some kilometres from the origin."""
 
 THICKNESS = "thickness_"
-"""Start of the names of properties that give the thickness of a material."""
+"""Prefix of properties with the thickness of a material."""
 
 
-class _Kept(OrderedDict[tuple[Any, ...], Any]):
-    """The last `KEPT` values by key. A value holds the arrays whose numbers are in its key, so that none is reused."""
+class _Cache(OrderedDict[tuple[Any, ...], Any]):
+    """The last `KEPT` values by key, with the arrays whose indices are in the key, so that Dr.Jit reuses none."""
 
-    def find(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    def find(self, key: tuple[Any, ...], make: Callable[[], Any], *arrays: Any) -> Any:
         if key not in self:
-            self[key] = make()
+            self[key] = make(), arrays
             while len(self) > KEPT:
                 self.popitem(last=False)
         self.move_to_end(key)
-        return self[key]
+        return self[key][0]
 
 
 @dataclass
-class _Look:
-    """A sensor's pose, its rays' directions in its own frame, samples a pixel, and what identifies all this."""
+class _View:
+    """A sensor's pose, its rays' directions in its frame, samples per pixel, and a key of all of them."""
 
     pose: Pose
     direction: Any
@@ -62,47 +62,32 @@ class TracedField(ADIntegrator):
     """Traced evaluation of a Gaussian field (:monosp:`wrf_traced`).
 
     Evaluates the complex field at a receiver along each ray of its sensor: from near to far, each Gaussian adds its
-    signal times its largest response on the ray, times what nearer Gaussians and walls let pass. Gaussians with an
-    ``opacity`` are blended as in WRF-GS+ (alpha), those with an ``attenuation`` as in WRF-GS (product). Order, cut-off
-    and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.render.splat`); the footprint is exact where
-    splatting projects (`wrf_mi.gaussians.ray_response`).
+    signal times its largest response on the ray, times the transmission of nearer Gaussians and walls. Gaussians with
+    an ``opacity`` are blended as in WRF-GS+ (alpha), those with an ``attenuation`` as in WRF-GS (product). Order,
+    cut-off and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.render.splat`); the footprint is
+    exact where splatting projects (`wrf_mi.gaussians.ray_response`).
 
     The field is the scene's ``ellipsoids`` shape with the attribute ``signal``, see
     `wrf_mi_plugins.shape.gaussian_shape`; its parameters in ``mi.traverse(scene)`` have derivatives, forward and
     backward, and so has the pose of a `wrf_perception_plane`. All other shapes, but those with a ``null`` BSDF, are
     walls: each that a ray crosses before the Gaussian's strongest point on the ray multiplies it by the slab's
-    transmission (ITU-R P.2040). Their materials' parameters, in scenes of Sionna RT, have derivatives too. As
-    everywhere in this project the edge of a footprint and the border of a wall are jumps that derivatives do not see.
+    transmission (ITU-R P.2040). Their materials' parameters, in scenes of Sionna RT, have derivatives too. The
+    edge of a footprint and the border of a wall are jumps that derivatives ignore.
 
     ``mi.render`` returns a tensor [height, width, 2], the real and the imaginary part. The film then holds the
     magnitude as its picture and both parts as channels ``real`` and ``imaginary``, so that ``mitsuba scene.xml`` and
     ``sensor.film().bitmap()`` give them. Samples within a pixel are averaged as complex numbers, whatever the film's
-    filter; `wrf_perception_plane` needs one and takes one.
+    filter; `wrf_perception_plane` takes one sample.
 
-    ======================= ======= ===== ========= ================================================== ==============
-    parameter               type    unit  default   meaning                                            ``mi.traverse``
-    ======================= ======= ===== ========= ================================================== ==============
-    ``walls``               boolean       true      shapes other than ellipsoids attenuate
-    ``frequency_hz``        float   Hz    0         carrier; 0 takes that of the walls' Sionna scene,  exposed
-                                                    and is an error where walls have none
-    ``polarization``        vector        vertical  of the antenna, receiver's frame; by default
-                                                    the world's z axis, however the sensor is turned
-    ``thickness_<name>``    float   m     0.1       slab thickness of a material ``mat-<name>`` that
-                                                    is known by its BSDF's id alone, e.g.
-                                                    ``thickness_itu_glass``
-    ``opaque_power``        float         0         Gaussians behind walls that pass at most this
-                                                    share of the power are left out; 0: none
-    ======================= ======= ===== ========= ================================================== ==============
-
-    .. code-block:: python
-
-        scene = mi.load_dict({
-            "type": "scene",
-            "integrator": {"type": "wrf_traced", "frequency_hz": 920e6},
-            "sensor": {"type": "wrf_perception_plane", "film": {"type": "hdrfilm", "width": 360, "height": 90}},
-            "gaussians": gaussian_shape(gaussians),
-        })
-        image = mi.render(scene)
+    ==================== ======= ==== ======= =======================================================================
+    parameter            type    unit default meaning
+    ==================== ======= ==== ======= =======================================================================
+    ``walls``            boolean      true    shapes other than ellipsoids attenuate
+    ``frequency_hz``     float   Hz   0       carrier (in ``mi.traverse``); 0: that of the walls' Sionna RT scene
+    ``polarization``     vector       z axis  direction of the antenna, receiver's frame; default: the world's z axis
+    ``thickness_<name>`` float   m    0.1     slab thickness of a material ``mat-<name>`` known by its BSDF's id alone
+    ``opaque_power``     float        0       largest share of the power that walls pass if Gaussians behind are skipped
+    ==================== ======= ==== ======= =======================================================================
 
     With ``opaque_power`` p no pixel's field changes by more than sqrt(p) M, M the largest abs(signal) (alpha blending)
     or the sum of all (product blending), nor a derivative by a signal by more than sqrt(p) (`wrf_mi_plugins.hidden`).
@@ -128,7 +113,34 @@ class TracedField(ADIntegrator):
         self.thickness_m = {n.removeprefix(THICKNESS): float(props[n]) for n in props if n.startswith(THICKNESS)}
         if self.polarization is not None and not (np.isfinite(self.polarization).all() and np.any(self.polarization)):
             raise InputError(f"{props.plugin_name()}: polarization {self.polarization} is no direction")
-        self._bundles, self._crossings, self._lists, self._wall_scenes = (_Kept() for _ in range(4))
+        self._bundles, self._crossings, self._lists, self._wall_scenes = (_Cache() for _ in range(4))
+
+    def sample(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: Any, spp: int) -> Any:
+        """The field of each pixel, a tensor [height, width, 2], attached to the scene's parameters.
+
+        Rays, hits and walls of a view are kept; blending alone is repeated when signals change.
+        """
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        shape = gaussian_shape_of(scene)
+        gaussians, data = read_gaussians(shape), dr.detach(mi.traverse(shape)["data"])
+        view = self._view(sensor, scene, seed, spp)
+        footprints = ray_footprints(gaussians, view.pose)
+        bundles = self._bundles.find(
+            view.key, lambda: ray_bundles(view.direction, view.height, view.width * view.samples), view.direction
+        )
+
+        def lists_of_view() -> RayLists:
+            with dr.suspend_grad():
+                return traced_lists(gaussians, footprints, view.pose, bundles)
+
+        lists = self._lists.find((data.index, *view.key), lists_of_view, data, view.direction)
+        walls = self._walls(scene, view) if self.with_walls else None
+        if walls is not None and self.opaque_power:
+            lists = without_hidden(lists, bundles, gaussians, footprints, walls, self.opaque_power)
+        parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending, walls)
+        if view.samples > 1:
+            parts = tuple(dr.block_sum(p, view.samples) / view.samples for p in parts)
+        return mi.TensorXf(interleave(list(parts)), (view.height, view.width, 2))
 
     def render(
         self,
@@ -142,8 +154,8 @@ class TracedField(ADIntegrator):
         """The field of each pixel, a tensor [height, width, 2]. See `mi.Integrator.render`."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         with dr.suspend_grad():
-            image = self._image(scene, sensor, seed, spp)
-            _put(sensor.film(), image)
+            image = self.sample(scene, sensor, seed, spp)
+            _write_film(sensor.film(), image)
             if evaluate:
                 dr.eval(image)
         return image
@@ -152,8 +164,7 @@ class TracedField(ADIntegrator):
         self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: Any = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Derivative of the image along the gradients of the scene's parameters, [height, width, 2]."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        image = self._image(scene, sensor, seed, spp)
+        image = self.sample(scene, sensor, seed, spp)
         dr.forward_to(image)
         return dr.grad(image)
 
@@ -166,10 +177,8 @@ class TracedField(ADIntegrator):
         seed: Any = 0,
         spp: int = 0,
     ) -> None:
-        """Add to the gradients of the scene's parameters that of the image, [height, width, 2]."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        image = self._image(scene, sensor, seed, spp)
-        dr.backward_from(image * grad_in)
+        """Add the gradient of the image, [height, width, 2], to the gradients of the scene's parameters."""
+        dr.backward_from(self.sample(scene, sensor, seed, spp) * grad_in)
 
     def aov_names(self) -> list[str]:
         """Channels of the film beside the magnitude."""
@@ -183,35 +192,13 @@ class TracedField(ADIntegrator):
         """Class and parameters."""
         return f"TracedField[walls = {self.with_walls}, frequency_hz = {self.frequency_hz[0]:g}]"
 
-    def _image(self, scene: Any, sensor: Any, seed: Any, spp: int) -> Any:
-        shape = gaussian_shape_of(scene)
-        gaussians, data = read_gaussians(shape), dr.detach(mi.traverse(shape)["data"])
-        look = self._look(sensor, scene, seed, spp)
-        footprints = ray_footprints(gaussians, look.pose)
-        bundles = self._bundles.find(
-            look.key, lambda: (ray_bundles(look.direction, look.height, look.width * look.samples), look.direction)
-        )[0]
-        lists = self._lists.find(
-            (data.index, *look.key), lambda: (_lists(gaussians, footprints, look.pose, bundles), data, look.direction)
-        )[0]
-        walls = self._walls(scene, look) if self.with_walls else None
-        if walls is not None and self.opaque_power:
-            lists = without_hidden(lists, bundles, gaussians, footprints, walls, self.opaque_power)
-        parts = blend_rays(
-            footprints, gaussians.signal, lists, bundles, gaussians.opacity, gaussians.attenuation, walls
-        )
-        if look.samples > 1:
-            parts = tuple(dr.block_sum(p, look.samples) / look.samples for p in parts)
-        return mi.TensorXf(interleave(list(parts)), (look.height, look.width, 2))
-
-    def _look(self, sensor: Any, scene: Any, seed: Any, spp: int) -> _Look:
+    def _view(self, sensor: Any, scene: Any, seed: Any, spp: int) -> _View:
         film = sensor.film()
         frame = tuple(int(s) for pair in (film.size(), film.crop_size(), film.crop_offset()) for s in pair)
         width, height = frame[2:4]
         if isinstance(sensor, PerceptionPlane):
-            place = np.array(dr.detach(sensor.to_world).matrix).tobytes()
-            key = (sensor.coverage, *frame, place)
-            return _Look(sensor.pose(), sensor.crop_directions(), height, width, 1, key)
+            matrix = np.array(dr.detach(sensor.to_world).matrix).tobytes()
+            return _View(sensor.pose(), sensor.crop_directions(), height, width, 1, (sensor.coverage, *frame, matrix))
         with dr.suspend_grad():
             sampler, samples = self.prepare(sensor, seed, spp, self.aov_names())
             ray, _, _ = self.sample_rays(scene, sensor, sampler)
@@ -220,67 +207,59 @@ class TracedField(ADIntegrator):
             local = mi.Vector3f(*pose.to_local(list(d)))
             off = dr.max(dr.squared_norm(dr.cross(start, d)))
             dr.eval(local, off)
-        if not (float(off[0]) < POINT_TOLERANCE_M**2 and _unit(local)):
+        rigid = dr.all(dr.abs(dr.squared_norm(local) - 1) < RIGID_TOLERANCE)
+        if not (float(off[0]) < POINT_TOLERANCE_M**2 and rigid):
             raise InputError(f"sensor {sensor.id()}: its rays do not start at one point, or its pose is not rigid")
-        place = np.array(dr.detach(sensor.world_transform()).matrix).tobytes()
-        return _Look(pose, local, height, width, samples, (*frame, place, *(c.index for c in local)))
+        matrix = np.array(dr.detach(sensor.world_transform()).matrix).tobytes()
+        return _View(pose, local, height, width, samples, (*frame, matrix, *(c.index for c in local)))
 
-    def _walls(self, scene: Any, look: _Look) -> Walls | None:
+    def _walls(self, scene: Any, view: _View) -> Walls | None:
         shapes = wall_shapes(scene)
         if not shapes:
             return None
         key, arrays = _fingerprint(shapes)
         frequency_hz = self._frequency(shapes)
-        walls_alone = self._wall_scenes.find(key, lambda: (wall_scene(shapes), arrays))[0]
+        only_walls = self._wall_scenes.find(key, lambda: wall_scene(shapes), arrays)
         crossings = self._crossings.find(
-            (*key, *look.key),
-            lambda: (
-                find_crossings(walls_alone, shapes, look.pose, look.direction, self.polarization),
-                arrays,
-                look.direction,
-            ),
-        )[0]
+            (*key, *view.key),
+            lambda: find_crossings(only_walls, shapes, view.pose, view.direction, self.polarization),
+            arrays,
+            view.direction,
+        )
         return walls_of(crossings, shapes, frequency_hz, self.thickness_m)
 
     def _frequency(self, shapes: list[Any]) -> Any:
         if self.frequency_hz[0] > 0:
             return self.frequency_hz
         scenes = [getattr(shape.bsdf(), "scene", None) for shape in shapes]
-        own = next((s.frequency for s in scenes if s is not None), None)
-        if own is None:
+        carrier = next((s.frequency for s in scenes if s is not None), None)
+        if carrier is None:
             raise InputError("wrf_traced: the scene has walls; give frequency_hz, or set walls to false")
-        return mi.Float(own)
-
-
-def _lists(*arguments: Any) -> RayLists:
-    with dr.suspend_grad():
-        return traced_lists(*arguments)
-
-
-def _unit(v: Any) -> bool:
-    return bool(dr.all(dr.abs(dr.squared_norm(v) - 1) < RIGID_TOLERANCE))
+        return mi.Float(carrier)
 
 
 def _fingerprint(shapes: list[Any]) -> tuple[tuple[Any, ...], list[Any]]:
-    """What changes when one of these shapes changes, and the arrays to hold so that it does."""
+    """A key that changes with any of these shapes, and the arrays whose numbers are in it."""
     key: list[Any] = []
     arrays = []
     for shape in shapes:
         for name, value in mi.traverse(shape).items():
             if name.startswith("bsdf."):
                 continue
-            key.append(value.index if isinstance(value, mi.Float | mi.UInt32) else repr(value))
-            arrays.append(dr.detach(value) if isinstance(value, mi.Float | mi.UInt32) else None)
+            is_array = isinstance(value, mi.Float | mi.UInt32)
+            key.append(value.index if is_array else repr(value))
+            if is_array:
+                arrays.append(dr.detach(value))
     return tuple(key), arrays
 
 
-def _put(film: Any, image: Any) -> None:
-    """The image in the film: its magnitude as the picture, its parts as channels."""
+def _write_film(film: Any, image: Any) -> None:
+    """Write the magnitude of an image as the film's picture and its parts as channels."""
     film.prepare(["real", "imaginary"])
     re, im = image[:, :, 0].array, image[:, :, 1].array
     size = dr.sqrt(re * re + im * im)
-    one = dr.full(mi.Float, 1, dr.width(size))
-    channels = [size, size, size] + [one] * (2 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 1) + [re, im]
+    unit = dr.full(mi.Float, 1, dr.width(size))
+    channels = [size, size, size] + [unit] * (2 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 1) + [re, im]
     tensor = mi.TensorXf(interleave(channels), (*image.shape[:2], len(channels)))
     film.put_block(mi.ImageBlock(tensor, mi.ScalarPoint2i(film.crop_offset())))
 

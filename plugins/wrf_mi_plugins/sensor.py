@@ -1,4 +1,4 @@
-"""The plugin `wrf_perception_plane`: the directions around a receiver, as Mitsuba's sensor."""
+"""The plugin `wrf_perception_plane`: directions around a receiver as a Mitsuba sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, equirectan
 from wrf_mi.gaussians.footprint import Pose
 
 DIRECTIONS = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}
-"""Functions of (height, width) that give the unit vector of every pixel."""
+"""Functions of (height, width) for the unit vectors of all pixels."""
 
 RIGID_TOLERANCE = 1e-4
 """Largest departure of R^T R from the identity: rotations in float32 and in files of five digits are nearer."""
@@ -26,9 +26,9 @@ class PerceptionPlane(mi.Sensor):
 
     Equirectangular. Pixel (row r, column c) of an H x W film is the *point* at azimuth ``c * 360 / W`` degrees and
     elevation ``r * 90 / H`` degrees (``hemisphere``) or ``-90 + r * 180 / H`` degrees (``sphere``) in the receiver's
-    frame, azimuth from +x towards +y, elevation from the x-y plane towards the boresight +z. A pixel has one ray:
-    wherever in the pixel a sample lies, it goes through that point, so more than one sample per pixel changes nothing
-    in what does not scatter. Row 0 is the film's first.
+    frame, azimuth from +x towards +y, elevation from the x-y plane towards the boresight +z. A pixel has one ray
+    through that point for all its samples, so more than one sample per pixel has no effect where nothing scatters. Row
+    0 is the film's first.
 
     ============ ========= ====== =========== ======================================== ========================
     parameter    type      unit   default     meaning                                  ``mi.traverse``
@@ -40,18 +40,9 @@ class PerceptionPlane(mi.Sensor):
     ``sampler``  sampler          independent Mitsuba's
     ============ ========= ====== =========== ======================================== ========================
 
-    A box filter keeps each pixel by itself; Mitsuba's default would blend it with its neighbours.
+    A box filter keeps pixels apart; Mitsuba's default would blend neighbours.
 
     The pose of a receiver from its position and quaternion is `receiver_to_world`.
-
-    .. code-block:: python
-
-        "sensor": {
-            "type": "wrf_perception_plane",
-            "to_world": receiver_to_world(position_m, orientation_xyzw),
-            "film": {"type": "hdrfilm", "width": 360, "height": 90, "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": 1},
-        }
 
     Raises:
         InputError: an unknown ``coverage``, or a ``to_world`` that is not a rotation and a translation.
@@ -78,14 +69,19 @@ class PerceptionPlane(mi.Sensor):
         return self._table
 
     def crop_directions(self) -> Any:
-        """Those of the film's crop, which is what is rendered."""
+        """Unit vectors of the pixels of the film's crop, which are rendered."""
         film = self.film()
-        crop, offset, width = film.crop_size(), film.crop_offset(), int(film.size()[0])
+        crop = film.crop_size()
         if list(crop) == list(film.size()):
             return self.directions()
         number = dr.arange(mi.UInt32, int(crop[0]) * int(crop[1]))
-        pixel = (number // int(crop[0]) + int(offset[1])) * width + number % int(crop[0]) + int(offset[0])
-        return dr.gather(mi.Vector3f, self.directions(), pixel)
+        return self._direction(number // int(crop[0]), number % int(crop[0]))
+
+    def _direction(self, row: Any, column: Any, active: Any = True) -> Any:
+        """Unit vectors of pixels of the crop."""
+        film = self.film()
+        x, y = (int(o) for o in film.crop_offset())
+        return dr.gather(mi.Vector3f, self.directions(), (row + y) * int(film.size()[0]) + column + x, active)
 
     def pose(self) -> Pose:
         """The receiver's pose, attached to ``to_world`` for derivatives."""
@@ -94,12 +90,10 @@ class PerceptionPlane(mi.Sensor):
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """The ray through the point of the pixel that ``sample2``, in 0..1 across the film's crop, falls into."""
-        film = self.film()
-        crop, offset, width = film.crop_size(), film.crop_offset(), int(film.size()[0])
+        """The ray of the pixel that contains ``sample2``, in 0..1 across the film's crop."""
+        crop = self.film().crop_size()
         column, row = (dr.minimum(mi.UInt32(sample2[k] * int(crop[k])), int(crop[k]) - 1) for k in range(2))
-        pixel = (row + int(offset[1])) * width + column + int(offset[0])
-        local = dr.gather(mi.Vector3f, self.directions(), pixel, active)
+        local = self._direction(row, column, active)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         ray = mi.Ray3f(self.to_world.translation(), self.to_world @ local, time, wavelengths)
         return ray, weight
@@ -107,21 +101,21 @@ class PerceptionPlane(mi.Sensor):
     def sample_ray_differential(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """That of `sample_ray`; a point has no differentials."""
+        """The ray of `sample_ray`; a point has no differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Nothing: the sensor is a point and adds nothing to the scene's extent."""
+        """Empty box: the sensor is a point and does not extend the scene."""
         return mi.ScalarBoundingBox3f()
 
     def traverse(self, callback: Any) -> None:
-        """Expose ``to_world`` beside the film's and the sensor's own parameters."""
+        """Expose ``to_world`` in addition to the base class's parameters."""
         super().traverse(callback)
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Take over a new pose.
+        """Check and adopt a new pose.
 
         Raises:
             InputError: it is not rigid.
@@ -137,10 +131,10 @@ class PerceptionPlane(mi.Sensor):
 
 
 def receiver_to_world(position_m: ArrayLike, orientation_xyzw: ArrayLike) -> mi.ScalarTransform4f:
-    """``to_world`` of a receiver.
+    """Transform ``to_world`` of a receiver.
 
     Args:
-        position_m: shape [3], world frame.
+        position_m: position [3], world frame, metres.
         orientation_xyzw: unit quaternion [4], receiver's frame to world.
 
     Raises:
@@ -157,9 +151,9 @@ def receiver_to_world(position_m: ArrayLike, orientation_xyzw: ArrayLike) -> mi.
 
 
 def pose_of(to_world: Any) -> Pose:
-    """The pose that a rigid ``mi.AffineTransform4f`` stands for, attached to its matrix."""
+    """Pose of a rigid ``mi.AffineTransform4f``, attached to its matrix."""
     m = to_world.matrix
-    # Constants of a kernel would make each pose compile its own.
+    # As constants each pose would compile a new kernel.
     dr.make_opaque(m)
     return Pose([mi.Float(m[i, 3]) for i in range(3)], [[mi.Float(m[i, j]) for j in range(3)] for i in range(3)])
 

@@ -1,11 +1,11 @@
-"""How a field's Gaussians stand in a Mitsuba scene: the built-in ``ellipsoids`` shape with attributes of ours.
+"""Gaussians of a field in a Mitsuba scene: the built-in ``ellipsoids`` shape with further attributes.
 
     gaussians = field.gaussians(params, tx_pos)
     scene = mi.load_dict({"type": "scene", "gaussians": gaussian_shape(gaussians)})
     params = mi.traverse(scene)  # gaussians.data, gaussians.signal, gaussians.opacity or gaussians.attenuation
 
-Every plugin of this package that looks for Gaussians in a scene finds them by `gaussian_shapes`, and reads them by
-`read_gaussians`. A step of training writes them by `shape_parameters`, through which gradients flow back.
+The plugins find the shape by `gaussian_shape_of` and read it by `read_gaussians`. Training writes it by
+`shape_parameters`, through which gradients flow back.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ DATA_WIDTH = 10
 def gaussian_shape(gaussians: Gaussians, transmitter: int = 0) -> dict[str, Any]:
     """The ``mi.load_dict`` entry of Gaussians as the built-in ``ellipsoids`` shape.
 
-    Its ellipsoids end at the footprints' cut-off, three standard deviations. Quaternions are normalised, which the
-    shape expects. What it exposes in ``mi.traverse``, all differentiable:
+    The ellipsoids end at the footprints' cut-off, three standard deviations. Quaternions are normalised, which the
+    shape expects. Parameters in ``mi.traverse``, all differentiable:
 
     ================ ================ ===== ==============================================================
     parameter        type             unit  meaning
@@ -43,8 +43,8 @@ def gaussian_shape(gaussians: Gaussians, transmitter: int = 0) -> dict[str, Any]
     ================ ================ ===== ==============================================================
 
     Args:
-        gaussians: of one field, for ``batch`` transmitters.
-        transmitter: which of them, 0 to ``batch - 1``.
+        gaussians: Gaussians of one field, for ``batch`` transmitters.
+        transmitter: number of the transmitter, 0 to ``batch - 1``.
 
     Raises:
         ValueError: no such transmitter, or no Gaussians.
@@ -60,15 +60,15 @@ def gaussian_shape(gaussians: Gaussians, transmitter: int = 0) -> dict[str, Any]
 
 
 def shape_parameters(gaussians: Gaussians, transmitter: int = 0) -> dict[str, Any]:
-    """What to assign to the shape's parameters for these Gaussians: flat ``mi.Float`` arrays, differentiable.
+    """Values of the shape's parameters for these Gaussians: flat ``mi.Float`` arrays, differentiable.
 
         for name, values in shape_parameters(gaussians).items():
             params[f"gaussians.{name}"] = values
         params.update()
 
     Args:
-        gaussians: of one field, for ``batch`` transmitters.
-        transmitter: which of them, 0 to ``batch - 1``.
+        gaussians: Gaussians of one field, for ``batch`` transmitters.
+        transmitter: number of the transmitter, 0 to ``batch - 1``.
 
     Raises:
         ValueError: no such transmitter.
@@ -76,27 +76,25 @@ def shape_parameters(gaussians: Gaussians, transmitter: int = 0) -> dict[str, An
     if not 0 <= transmitter < gaussians.batch:
         raise ValueError(f"transmitter {transmitter}: these Gaussians are for {gaussians.batch}, counted from 0")
     count = gaussians.count
-    own = dr.arange(mi.UInt32, count) + transmitter * count
+    index = dr.arange(mi.UInt32, count) + transmitter * count
 
-    def one(columns: list[Any]) -> list[Any]:
-        return [dr.gather(mi.Float, mi.Float(c), own) for c in columns]
+    def selected(columns: list[Any]) -> list[Any]:
+        return [dr.gather(mi.Float, mi.Float(c), index) for c in columns]
 
-    quaternion = one(gaussians.rotation)
+    quaternion = selected(gaussians.rotation)
     length = dr.rsqrt(sum(q * q for q in quaternion))
     position = [mi.Float(p) for p in gaussians.position]
+    blending = OPACITY if gaussians.attenuation is None else ATTENUATION
     columns = {
-        "data": [*position, *one(gaussians.scale), *(q * length for q in quaternion)],
-        SIGNAL: one(gaussians.signal),
+        "data": [*position, *selected(gaussians.scale), *(q * length for q in quaternion)],
+        SIGNAL: selected(gaussians.signal),
+        blending: selected(gaussians.blending),
     }
-    if gaussians.opacity is not None:
-        columns[OPACITY] = one([gaussians.opacity])
-    if gaussians.attenuation is not None:
-        columns[ATTENUATION] = one(gaussians.attenuation)
     return {name: interleave(c) for name, c in columns.items()}
 
 
 def interleave(columns: list[Any]) -> Any:
-    """Columns [n] as one array [n * k], the k values of a row beside each other. Differentiable."""
+    """Columns [n] as an array [n * k], row by row. Differentiable."""
     if len(columns) == 1:
         return columns[0]
     n = dr.width(columns[0])
@@ -107,24 +105,20 @@ def interleave(columns: list[Any]) -> Any:
     return out
 
 
-def _columns(values: Any, count: int) -> list[Any]:
+def deinterleave(values: Any, count: int) -> list[Any]:
+    """An array [count * k] as k columns [count]. Differentiable."""
     width = dr.width(values) // count
     index = dr.arange(mi.UInt32, count) * width
     return [dr.gather(mi.Float, values, index + k) for k in range(width)]
 
 
-def gaussian_shapes(scene: Any) -> list[Any]:
-    """The shapes of a ``mi.Scene`` that hold Gaussians: ``ellipsoids`` with a ``signal`` attribute."""
-    return [s for s in scene.shapes() if s.is_ellipsoids() and SIGNAL in mi.traverse(s)]
-
-
 def gaussian_shape_of(scene: Any) -> Any:
-    """The one shape of a ``mi.Scene`` that holds Gaussians.
+    """The shape of a ``mi.Scene`` that holds Gaussians: ``ellipsoids`` with a ``signal`` attribute.
 
     Raises:
         InputError: none, or more than one.
     """
-    shapes = gaussian_shapes(scene)
+    shapes = [s for s in scene.shapes() if s.is_ellipsoids() and SIGNAL in mi.traverse(s)]
     if len(shapes) != 1:
         found = "no ellipsoids shape with a signal attribute" if not shapes else f"{len(shapes)} shapes of Gaussians"
         raise InputError(f"scene: {found}; give it one made by wrf_mi_plugins.shape.gaussian_shape")
@@ -139,7 +133,6 @@ def read_gaussians(shape: Any) -> Gaussians:
     """
     parameters: Mapping[str, Any] = mi.traverse(shape)
     count = dr.width(parameters["data"]) // DATA_WIDTH
-    data = _columns(parameters["data"], count)
     blending = [name for name in (OPACITY, ATTENUATION) if name in parameters]
     if len(blending) != 1:
         what = " and ".join(blending) or "neither"
@@ -148,12 +141,13 @@ def read_gaussians(shape: Any) -> Gaussians:
         if name in parameters and dr.width(parameters[name]) != width * count:
             given = dr.width(parameters[name])
             raise InputError(f"shape {shape.id()}: {name} has {given} numbers, {count} Gaussians need {width * count}")
+    data = deinterleave(parameters["data"], count)
     return Gaussians(
         position=data[0:3],
         scale=data[3:6],
         rotation=data[6:10],
-        signal=_columns(parameters[SIGNAL], count),
+        signal=deinterleave(parameters[SIGNAL], count),
         opacity=parameters.get(OPACITY),
-        attenuation=_columns(parameters[ATTENUATION], count) if ATTENUATION in parameters else None,
+        attenuation=deinterleave(parameters[ATTENUATION], count) if ATTENUATION in parameters else None,
         batch=1,
     )

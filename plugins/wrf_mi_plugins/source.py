@@ -1,4 +1,4 @@
-"""A field with its parameters, asked for one transmitter: what the emitter and the medium hold."""
+"""A field with its parameters and one transmitter, held by the emitter and the medium."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from wrf_mi.runs.folder import FITTED
 
 @dataclass
 class FieldSource:
-    """A field's parameters and a transmitter position; the Gaussians follow from them.
+    """A field's parameters and a transmitter position, which determine the Gaussians.
 
     Attributes:
-        field: a model, e.g. ``wrf_mi.gaussians.WrfGsPlus``: any object with its method ``gaussians``.
+        field: model, e.g. ``wrf_mi.gaussians.WrfGsPlus``: any object with its method ``gaussians``.
         params: the model's parameters by name, ``mi.TensorXf``.
         tx_position: ``mi.Point3f`` of width 1, world frame, metres.
     """
@@ -40,8 +40,7 @@ class FieldSource:
     def traverse(self, callback: Any) -> None:
         """Expose the transmitter position and every parameter; dots in names become underscores.
 
-        Moving a Gaussian moves the edge of its footprint, where derivatives miss a jump of exp(-4.5) of its peak: so
-        the geometry is flagged discontinuous.
+        The geometry is flagged discontinuous: derivatives miss the jump of exp(-4.5) at the edge of a footprint.
         """
         differentiable, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.Discontinuous
         callback.put("tx_position", self.tx_position, differentiable)
@@ -54,9 +53,9 @@ def source_of(field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike
     """A source from a model and its parameters.
 
     Args:
-        field: the model.
-        params: its parameters as arrays, see its ``init``.
-        tx_position_m: three coordinates, world frame.
+        field: model.
+        params: parameters of the model as arrays, see its ``init``.
+        tx_position_m: transmitter position [3], world frame, metres.
 
     Raises:
         InputError: a position of another shape or not finite.
@@ -72,7 +71,7 @@ def source_from_properties(props: Any) -> FieldSource:
     """A source from the properties ``run`` and ``tx_position`` of a plugin.
 
     Raises:
-        InputError: one of them is missing, or the run folder is none or damaged.
+        InputError: a missing property, or a missing or damaged run folder.
     """
     name = props.plugin_name()
     for key, what in (("run", "a run folder made by wrf-mi train"), ("tx_position", "x, y, z in metres")):

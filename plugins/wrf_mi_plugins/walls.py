@@ -1,4 +1,4 @@
-"""What the meshes of a Mitsuba scene let pass: radio materials of walls, and where rays cross them."""
+"""Transmission through the meshes of a Mitsuba scene: radio materials of walls and their crossings by rays."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from wrf_mi.tracing.slab import slab
 from .shape import interleave
 
 ITU_PREFIX = "mat-itu_"
-"""Start of the id of a BSDF that stands for a material of ITU-R P.2040, as in Sionna RT's scene files."""
+"""Prefix of the id of a BSDF that denotes a material of ITU-R P.2040, as in Sionna RT's scene files."""
 
 MOST_CROSSINGS = 64
-"""Walls that a ray may cross; a scene where one crosses more is taken for a mistake (a terrain, say, or foliage)."""
+"""Largest number of walls on a ray; more are taken for a mistake (terrain, say, or foliage)."""
 
 SMALLEST_SINE = 1e-6
-"""Below this sine of the angle of incidence there is no plane of incidence, and both polarisations pass alike."""
+"""Sine of the angle of incidence below which both polarisations have equal transmission."""
 
 
 @dataclass
 class Crossings:
-    """Where rays cross walls; ``k`` lists of arrays [rays], in order of distance. Nothing here has derivatives.
+    """Crossings of walls by rays; ``k`` lists of arrays [rays], in order of distance, detached.
 
     Attributes:
-        distance: from the receiver, metres; infinite where a ray crosses no further wall.
-        cosine: of the angle of incidence.
+        distance: distance from the receiver, metres; infinite where a ray crosses no further wall.
+        cosine: cosine of the angle of incidence.
         across: share of the power polarised across the plane of incidence (TE).
         wall: number of the wall in the list of shapes.
     """
@@ -45,34 +45,35 @@ class Crossings:
 
 
 def wall_shapes(scene: Any) -> list[Any]:
-    """All shapes of a ``mi.Scene`` but ellipsoids and those of a ``null`` BSDF, the borders of media."""
+    """All shapes of a ``mi.Scene`` except ellipsoids and those of a ``null`` BSDF, the borders of media."""
     lobes, nothing = mi.BSDFFlags.All.value, mi.BSDFFlags.Null.value
     return [s for s in scene.shapes() if not s.is_ellipsoids() and s.bsdf().flags() & lobes != nothing]
 
 
 def wall_scene(shapes: list[Any]) -> Any:
-    """A ``mi.Scene`` of these shapes alone, which rays can be traced in without meeting Gaussians."""
+    """A ``mi.Scene`` of these shapes alone, in which rays do not meet Gaussians."""
     return mi.load_dict({"type": "scene"} | {f"wall_{i}": shape for i, shape in enumerate(shapes)})
 
 
 def find_crossings(
     scene: Any, shapes: list[Any], pose: Pose, direction: list[Any], polarization: list[float] | None
 ) -> Crossings:
-    """Trace rays through walls, straight on.
+    """Trace rays straight through walls.
 
     Args:
-        scene: from `wall_scene`.
-        shapes: its shapes.
-        pose: of the receiver.
+        scene: scene from `wall_scene`.
+        shapes: shapes of that scene.
+        pose: pose of the receiver.
         direction: unit vectors of the rays, receiver's frame, three arrays [rays].
-        polarization: of the receiver's antenna, receiver's frame; None: along the world's z axis.
+        polarization: direction of the receiver's antenna, receiver's frame; None: the world's z axis.
 
     Raises:
         InputError: a ray crosses more than `MOST_CROSSINGS` walls.
     """
-    d = _to_world(pose, direction)
-    vertical = mi.Vector3f(0, 0, 1)
-    field = vertical if polarization is None else _to_world(pose, [mi.Float(c) for c in polarization])
+    d = dr.detach(mi.Vector3f(*pose.from_local(direction)))
+    field = mi.Vector3f(0, 0, 1)
+    if polarization is not None:
+        field = dr.detach(mi.Vector3f(*pose.from_local([mi.Float(c) for c in polarization])))
     field -= dr.dot(field, d) * d
     number = dr.zeros(mi.UInt32, max(_registry(s) for s in shapes) + 1)
     for i, shape in enumerate(shapes):
@@ -97,10 +98,8 @@ def find_crossings(
             return found
         if len(found.distance) == MOST_CROSSINGS:
             raise InputError(f"scene: a ray crosses more than {MOST_CROSSINGS} walls; simplify its meshes")
-        found.distance.append(distance)
-        found.cosine.append(cosine)
-        found.across.append(across)
-        found.wall.append(wall)
+        for values, value in zip(vars(found).values(), (distance, cosine, across, wall), strict=True):
+            values.append(value)
 
 
 def walls_of(
@@ -112,10 +111,10 @@ def walls_of(
     T = T_TE s + T_TM (1 - s), where s is the share of it across the plane of incidence.
 
     Args:
-        crossings: of the rays.
-        shapes: as they were given to `find_crossings`.
-        frequency_hz: of the carrier, ``mi.Float`` of width 1.
-        thickness_m: of materials known by a BSDF's id alone, by their name ``itu_*``; others are Sionna RT's default.
+        crossings: result of `find_crossings`.
+        shapes: walls, in the order of `find_crossings`.
+        frequency_hz: carrier, ``mi.Float`` of width 1.
+        thickness_m: thickness of materials known by a BSDF's id alone, by name ``itu_*``; else Sionna RT's default.
 
     Raises:
         InputError: a shape without a radio material, or one unknown at this frequency.
@@ -126,9 +125,7 @@ def walls_of(
     columns = [interleave(list(column)) for column in zip(*constants, strict=True)]
     re, im = mi.Float(1), mi.Float(0)
     passed = [(re, im)]
-    for distance, cosine, across, wall in zip(
-        crossings.distance, crossings.cosine, crossings.across, crossings.wall, strict=True
-    ):
+    for distance, cosine, across, wall in zip(*vars(crossings).values(), strict=True):
         c = slab(cosine, *(dr.gather(mi.Float, column, wall) for column in columns), frequency_hz)
         t = c.transmitted_te * across + c.transmitted_tm * (1 - across)
         there = dr.isfinite(distance)
@@ -147,11 +144,11 @@ def walls_of(
 def radio_constants(shape: Any, frequency_hz: Any, thickness_m: Mapping[str, float]) -> tuple[Any, Any, Any]:
     """Relative permittivity, conductivity (S/m) and slab thickness (m) of a shape's material, of width 1.
 
-    A radio material of Sionna RT has its own, with derivatives. Any other BSDF whose id is ``mat-itu_*`` stands for the
-    material of ITU-R P.2040 of that name.
+    Those of a radio material of Sionna RT have derivatives. Any other BSDF with id ``mat-itu_*`` denotes the material
+    of ITU-R P.2040 of that name.
 
     Raises:
-        InputError: neither, a material unknown at this frequency, or one that is set to another frequency.
+        InputError: neither, a material unknown at this frequency, or a material at another frequency.
     """
     from sionna.rt import RadioMaterial
     from sionna.rt.constants import DEFAULT_THICKNESS
@@ -160,8 +157,10 @@ def radio_constants(shape: Any, frequency_hz: Any, thickness_m: Mapping[str, flo
     frequency = float(dr.detach(frequency_hz)[0])
     if isinstance(bsdf, RadioMaterial):
         if bsdf.scene is not None and abs(float(bsdf.scene.frequency[0]) / frequency - 1) > 1e-6:
-            own = float(bsdf.scene.frequency[0])
-            raise InputError(f"{bsdf.id()}: its scene is at {own:g} Hz, the integrator at {frequency:g} Hz; use one")
+            carrier = float(bsdf.scene.frequency[0])
+            raise InputError(
+                f"{bsdf.id()}: its scene is at {carrier:g} Hz, the integrator at {frequency:g} Hz; use one"
+            )
         return bsdf.relative_permittivity, bsdf.conductivity, bsdf.thickness
     name = bsdf.id()
     if not name.startswith(ITU_PREFIX):
@@ -181,10 +180,6 @@ def _itu(kind: str, frequency_hz: float) -> tuple[float, float]:
         if kind in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
             return BELOW_1_GHZ[kind]
         raise InputError(f"{ITU_PREFIX}{kind} at {frequency_hz:g} Hz: {error}; choose another material") from None
-
-
-def _to_world(pose: Pose, v: list[Any]) -> Any:
-    return mi.Vector3f(*(sum(dr.detach(pose.to_world[i][k]) * v[k] for k in range(3)) for i in range(3)))
 
 
 def _registry(shape: Any) -> int:

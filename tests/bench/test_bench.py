@@ -1,4 +1,4 @@
-"""The benchmark's table, and that README and stored results say the same."""
+"""Tables of the benchmarks, and their agreement with the documents."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from wrf_mi_bench import plan as bench_plan
 from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
 from wrf_mi_bench.check import main
-from wrf_mi_bench.pareto_front import full_table
-from wrf_mi_bench.stress_summary import STAGES, summary_table
+from wrf_mi_bench.pareto import full_table
+from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -40,7 +40,7 @@ ON_PAGE = {
     "determinism": "numerics.md",
     "sentinels": "results.md",
 }
-"""Pages that show a check's table; those of physics models have their own, and all others are in the README."""
+"""Pages that show a check's table; those of physics models have their own, and all others are in `docs/results.md`."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -77,7 +77,7 @@ def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_checks_say_what_data_they_lack(
+def test_checks_name_missing_data(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The function is there; without data it is one line, exit status 2 and no file."""
@@ -91,7 +91,7 @@ def test_checks_say_what_data_they_lack(
     assert not (tmp_path / "out.json").exists()
 
 
-def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
     monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
     assert main("wrf_mi_bench.plan:flat_plan", str(tmp_path / "out.json")) == 0
@@ -100,8 +100,8 @@ def test_what_a_check_returns_is_kept(tmp_path: Path, monkeypatch: pytest.Monkey
     assert line == "| mesh: walls | **0.9** | 0.8 |"
 
 
-def test_readme_shows_the_stored_results() -> None:
-    readme = (CHECKOUT / "README.md").read_text()
+def test_documents_show_the_stored_results() -> None:
+    results = (CHECKOUT / "docs" / "results.md").read_text()
     trained, checked = read_results(RESULTS)
     physics = [one for one in checked if one["case"].startswith("physics-")]
     others = [one for one in checked if one not in physics and one["case"] not in ON_PAGE]
@@ -114,12 +114,12 @@ def test_readme_shows_the_stored_results() -> None:
             page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
             assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
-        assert text in readme.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+        assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
 
 
-def test_readme_shows_the_worst_of_each_stage() -> None:
+def test_documents_show_the_worst_of_each_stage() -> None:
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
-    shown = (CHECKOUT / "README.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
+    shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
     assert shown.strip() == summary_table(rows)
     stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
     assert set(stages) >= {words for words, _ in STAGES}

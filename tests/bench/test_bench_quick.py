@@ -20,8 +20,8 @@ from wrf_mi.core import InputError
 CHECKOUT = Path(__file__).resolve().parents[2]
 STORED = CHECKOUT / "benchmarks" / "results" / FILE
 SAME_SSIM, SAME_L2 = 0.99, 0.06
-"""Of Gaussians of 2 degrees: projection differs from rays by 1.4 % (`wrf_mi.gaussians.ray_response`), and Mitsuba's
-integrator makes those of low opacity smaller and stops early."""
+"""Bounds for Gaussians of 2 degrees: projection differs from rays by 1.4 % (`wrf_mi.gaussians.ray_response`), and
+Mitsuba's integrator makes those of low opacity smaller and stops early."""
 
 Ratios = dict[str, dict[str, float]]
 
@@ -53,7 +53,7 @@ def with_ratios(monkeypatch: pytest.MonkeyPatch, ratios: Ratios) -> None:
     monkeypatch.setattr(bench_quick, "measure_pairs", lambda pairs: ratios)
 
 
-def test_what_is_stored_is_held_against(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ratios_are_compared_with_stored_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no stored ratios; measure them with `wrf-mi bench --quick --store`"):
         quick(tmp_path / "out", store=False)
     with_ratios(monkeypatch, made_up(0.5))
@@ -68,22 +68,22 @@ def test_what_is_stored_is_held_against(tmp_path: Path, monkeypatch: pytest.Monk
         quick(tmp_path / "out", store=False)
 
 
-def test_the_command_fails_with_one_line(
+def test_quick_command_fails_with_one_line_for_a_worse_ratio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with_ratios(monkeypatch, made_up(0.5))
-    assert cli.main(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
-    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 0
+    assert cli(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
+    assert cli(["bench", "--quick", "--out", str(tmp_path)]) == 0
     capsys.readouterr()
     with_ratios(monkeypatch, made_up(2.0))
-    assert cli.main(["bench", "--quick", "--out", str(tmp_path)]) == 1
+    assert cli(["bench", "--quick", "--out", str(tmp_path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "wrf-mi: bench --quick: splatting 2 (1.82 to 2.2) is above 2 times the stored 0.5"
 
 
 @pytest.mark.parametrize("arguments", [["--store"], ["--quick", "demo"]])
-def test_what_does_not_belong_to_quick_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", *arguments]) == 2
+def test_options_outside_quick_are_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli(["bench", *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
@@ -102,7 +102,7 @@ def test_ratios_of_another_backend_or_a_damaged_file_are_refused(
             read_stored(tmp_path / FILE)
 
 
-def test_a_pair_gives_ours_over_theirs() -> None:
+def test_pair_measures_the_ratio_of_ours_to_theirs() -> None:
     calls: list[str] = []
 
     def busy(name: str, size: int) -> None:
@@ -116,7 +116,7 @@ def test_a_pair_gives_ours_over_theirs() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_stock_integrator_sees_the_same_field(seed: int) -> None:
+def test_stock_integrator_renders_the_splatted_field(seed: int) -> None:
     """So that its time and ours are for the same job; complex and signed signals go through colours."""
     gaussians, receiver = random_field(seed, "alpha", 100, 2.0)
     stock = StockRenderer(receiver, 90, 360)
@@ -128,17 +128,17 @@ def test_the_stock_integrator_sees_the_same_field(seed: int) -> None:
     assert difference(stock.field(other), splatted(other, receiver))["complex_error"] < SAME_L2
 
 
-def test_the_stock_integrator_cannot_blend_by_attenuation() -> None:
+def test_stock_integrator_refuses_attenuation() -> None:
     gaussians, receiver = random_field(0, "product", 5)
     with pytest.raises(ValueError, match="opacity"):
         StockRenderer(receiver, 9, 36).field(gaussians)
 
 
-def test_readme_shows_the_stored_ratios() -> None:
+def test_documents_show_the_stored_ratios() -> None:
     stored = json.loads(STORED.read_text())
     assert set(stored["figures"]["ratios"]) == {pair.name for pair in PAIRS}
     assert stored["wall_seconds"] < 120
-    readme = (CHECKOUT / "README.md").read_text()
-    block = re.search(r"<!-- ratios -->\n(.*?)\n<!-- /ratios -->", readme, re.DOTALL)
+    results = (CHECKOUT / "docs" / "results.md").read_text()
+    block = re.search(r"<!-- ratios -->\n(.*?)\n<!-- /ratios -->", results, re.DOTALL)
     assert block is not None
     assert block[1] == ratio_table(stored["figures"]["ratios"])

@@ -1,4 +1,4 @@
-"""What the benchmark of training counts and says."""
+"""Operations, shares and lines of the training benchmark."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from wrf_mi.training.trainer import Trainer
 SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
 
 
-def test_operations_are_those_of_the_shapes(one_gateway: Record) -> None:
+def test_operations_follow_from_the_shapes(one_gateway: Record) -> None:
     """WRF-GS+ of 8 Gaussians, two layers of 16 that both see 12 and 18 numbers, nine outputs."""
     trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
     n, width = 8, 16
@@ -39,7 +39,7 @@ def test_operations_are_those_of_the_shapes(one_gateway: Record) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
-def test_what_stands_still_is_walked_once(model: str, one_gateway: Record) -> None:
+def test_static_geometry_is_walked_once_per_batch(model: str, one_gateway: Record) -> None:
     one, four = (
         work_of(Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model)))
         for batch in (1, 4)
@@ -51,30 +51,30 @@ def test_what_stands_still_is_walked_once(model: str, one_gateway: Record) -> No
     assert one.moved_gb < four.moved_gb < 4 * one.moved_gb
 
 
-def test_shares_of_a_step_are_all_of_it(one_gateway: Record) -> None:
+def test_shares_of_a_step_sum_to_one(one_gateway: Record) -> None:
     trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
     found = shares(some_steps(trainer, 3))
     assert trainer.state.step == 6
     assert sum(found.values()) >= 1 - 1e-9
     assert min(found.values()) >= 0
-    assert found[bench_training.KINDS["BatchedGemm"]] > 0
+    assert found[bench_training.PRODUCTS] > 0
     assert found[bench_training.WALKS] > 0
 
 
-def test_the_machines_best_computes_what_it_says() -> None:
+def test_reference_calls_compute_a_product_and_a_copy() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.standard_normal((32, 32)) for _ in range(2))
     np.testing.assert_allclose(product_call(32)().numpy(), a @ b, atol=1e-4)
     assert dr.width(stream_call(1000)()) == 1000
 
 
-def test_every_model_has_a_process_of_its_own() -> None:
+def test_every_model_has_a_fit_function() -> None:
     for model, name in FITS.items():
         assert getattr(bench_training, name).args == (model,)
     assert list(FITS) == list(TITLES)
 
 
-def test_lines_say_how_far_from_the_limit() -> None:
+def test_lines_state_the_share_of_the_limit() -> None:
     fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
     work = {"network_gflop": 0.9, "splat_gflop": 0.1, "moved_gb": 0.02}
     step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "work": work, "shares": {"products of networks": 0.6}}

@@ -1,4 +1,4 @@
-"""The same again: processes that are compared, what is compared, and which backend `--deterministic` asks for."""
+"""Repeatability: comparison of subprocesses, and the backend of ``--deterministic``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 import pytest
 from small_fits import QUICK, official, settings
-from wrf_mi_bench.alone import AloneFailed, Job, alone
 from wrf_mi_bench.determinism import GRADIENT, IMAGE, cuda_works, different, distance, other_llvms
+from wrf_mi_bench.subprocess_job import Job, SubprocessJobFailed, subprocess_job
 
 from wrf_mi import backend
 from wrf_mi.cli import train as cli_train
@@ -33,11 +33,11 @@ def gpu_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "_active", cuda)
 
 
-def test_two_processes_give_the_same_bits(folder: Path) -> None:
+def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path) -> None:
     """One trains in one go, one stops, and a third goes on: parameters, moments, test rows and new positions."""
     job = Job("field", str(folder), FIT, deterministic=True)
-    whole = alone(job)
-    assert different(whole, alone(replace(job, stop=17))) == []
+    whole = subprocess_job(job)
+    assert different(whole, subprocess_job(replace(job, stop=17))) == []
     assert {"score", "model.npz: param/position", "predictions.npz: prediction", "new.npz: prediction"} <= set(whole)
     assert whole["model.npz: param/position"].shape[1] > 8
 
@@ -57,25 +57,25 @@ def test_distance_of_two_steps() -> None:
     assert distance(one, other) == {"image": pytest.approx(0.05), "gradient": pytest.approx(0.1)}
 
 
-def test_a_process_that_fails_says_why() -> None:
-    with pytest.raises(AloneFailed, match=r"nothing of nowhere ended with status 1: KeyError: 'nothing'"):
-        alone(Job("nothing", "nowhere"))
+def test_failed_subprocess_job_states_its_error() -> None:
+    with pytest.raises(SubprocessJobFailed, match=r"nothing of nowhere ended with status 1: KeyError: 'nothing'"):
+        subprocess_job(Job("nothing", "nowhere"))
 
 
 @pytest.mark.skipif(not other_llvms(), reason="one version of LLVM here")
-def test_another_llvm_computes_the_same(folder: Path) -> None:
-    one = alone(Job("step", str(folder), STEP, threads=1))
+def test_another_llvm_gives_equal_steps(folder: Path) -> None:
+    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
     for path in other_llvms().values():
-        found = distance(one, alone(Job("step", str(folder), STEP, threads=1), path))
+        found = distance(one, subprocess_job(Job("step", str(folder), STEP, threads=1), path))
         assert found["image"] < IMAGE
         assert found["gradient"] < GRADIENT
 
 
 @pytest.mark.gpu
-def test_a_gpu_computes_the_same(folder: Path) -> None:
+def test_gpu_gives_equal_steps(folder: Path) -> None:
     assert cuda_works()
-    one = alone(Job("step", str(folder), STEP, threads=1))
-    found = distance(one, alone(Job("step", str(folder), STEP, backend="cuda")))
+    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
+    found = distance(one, subprocess_job(Job("step", str(folder), STEP, backend="cuda")))
     assert found["image"] < IMAGE
     assert found["gradient"] < GRADIENT
 
@@ -104,7 +104,9 @@ def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "physics", "ray-tracing"])
-def test_the_command_asks_for_the_cpu_first(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deterministic_command_initialises_the_cpu_first(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before anything is read: whatever reads a data set may choose the GPU."""
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(cli_train, "init", lambda name, threads: asked.append((name, threads)))
@@ -116,7 +118,7 @@ def test_the_command_asks_for_the_cpu_first(model: str, tmp_path: Path, monkeypa
     assert asked == [("llvm", 1)]
 
 
-def test_a_deterministic_run_goes_on_on_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deterministic_run_is_resumed_on_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(cli_train, "init", lambda name, threads: asked.append((name, threads)))
     for text in ("settings: {deterministic: true}", "[", "deterministic: false"):
@@ -128,7 +130,7 @@ def test_a_deterministic_run_goes_on_on_the_cpu(tmp_path: Path, monkeypatch: pyt
     assert asked == [("llvm", 1)]
 
 
-def test_a_deterministic_baseline_remembers_it(one_gateway: Record, tmp_path: Path) -> None:
+def test_deterministic_baseline_is_resumed_on_one_thread(one_gateway: Record, tmp_path: Path) -> None:
     """Stopped before it was fitted, and resumed by a process with more threads."""
     settings = ("steps=5", "width=8", "last=8")
     run = train(one_gateway, tmp_path / "run", "vae", settings=settings, deterministic=True).folder

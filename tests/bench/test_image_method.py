@@ -1,4 +1,4 @@
-"""Against MATLAB's image method in real rooms, and the checks that the comparison itself makes."""
+"""Comparison with MATLAB's image method in real rooms, and its checks."""
 
 import os
 from dataclasses import replace
@@ -16,12 +16,12 @@ from wrf_mi.tracing.surfaces import scene_surfaces
 
 DATA = Path(os.environ.get("WRF_MI_DATA", "")) / "newrf"
 SHARE = 0.99
-"""Of MATLAB's paths; what is missing has a segment below 1 cm or meets a face of square millimetres."""
+"""Share of MATLAB's paths; missing ones have a segment below 1 cm or meet a face of square millimetres."""
 CEA_DB = 30.0
 
 
 @pytest.mark.parametrize("name", ["conference", "office"])
-def test_the_paths_of_another_ray_tracer_are_found(name: str):
+def test_paths_of_matlabs_image_method_are_found(name: str):
     if not (DATA / f"{name}.npz").is_file():
         pytest.skip("newrf is not in WRF_MI_DATA")
     found = image_method_agreement(DATA / f"{name}.npz", rays=1 << 17)
@@ -73,7 +73,7 @@ def test_matching_is_one_to_one():
     assert not len(match_paths(ours, far)[0])
 
 
-def test_confirmation_sees_what_is_wrong_with_a_path(tmp_path: Path):
+def test_confirmation_rejects_moved_and_obstructed_paths(tmp_path: Path):
     partition = {"partition": ("itu_wood", sheet(0, 3.0, (0.0, 4.0), (0.0, 2.0)))}
     scene = room(tmp_path / "open", SHOEBOX)
     tx, rx = np.array([[1.3, 2, 1]]), np.array([4.4, 3.1, 1.7])

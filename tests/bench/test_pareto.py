@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from wrf_mi_bench.methods import METHODS, FittedMethod, Method, Place
-from wrf_mi_bench.pareto_front import front, full_table, measure_methods, pareto_figure, table
+from wrf_mi_bench.methods import METHODS, FittedMethod, Method, MethodInput
+from wrf_mi_bench.pareto import front, full_table, measure_methods, pareto_figure, table
 
 from wrf_mi.core import Record
 
@@ -40,7 +40,7 @@ def point(name: str, ms: float, error: float, **more: Any) -> dict[str, Any]:
 POINTS = [point("slow", 10, 0.01), point("fast", 1, 0.3), point("middle", 3, 0.1), point("beaten", 5, 0.2)]
 
 
-def test_front_holds_what_no_other_beats_in_both() -> None:
+def test_front_holds_the_pareto_optimal_points() -> None:
     assert front(POINTS) == ["fast", "middle", "slow"]
     assert front([*POINTS, point("best", 0.5, 0.001)]) == ["best"]
     # As good in one and better in the other is better.
@@ -83,12 +83,12 @@ def test_names_of_methods_are_unique_and_the_reference_is_there() -> None:
     assert REFERENCE in names
 
 
-def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -> None:
+def test_user_defined_method_is_measured(one_gateway: Record, tmp_path: Path) -> None:
     """One that answers truly and slowly, one that does not and fast; only the first gains nothing from batches."""
     truth = one_gateway.observation[0]
     entered: list[bool] = []
 
-    def true(place: Place) -> FittedMethod:
+    def true(place: MethodInput) -> FittedMethod:
         def predict(tx_pos_m: np.ndarray) -> np.ndarray:
             np.sort(np.random.default_rng(0).random(BUSY_ROWS))
             np.ones(HELD_MB * 1_000_000 // 8)
@@ -97,7 +97,7 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
 
         return FittedMethod(predict, stored_mb=3.0, train_seconds=7.0)
 
-    def grey(place: Place) -> FittedMethod:
+    def grey(place: MethodInput) -> FittedMethod:
         from contextlib import contextmanager
 
         @contextmanager
@@ -108,7 +108,7 @@ def test_a_method_of_ones_own_is_measured(one_gateway: Record, tmp_path: Path) -
         return FittedMethod(lambda tx: np.full((len(tx), *truth.shape[1:]), 0.5), stored_mb=0.0, context=context)
 
     methods = [Method("true", "mine", true, batches=False), Method("grey", "mine", grey)]
-    place = Place(replace(one_gateway), Path("none"), tmp_path, rows=5)
+    place = MethodInput(replace(one_gateway), Path("none"), tmp_path, rows=5)
     found = {one["name"]: one for one in measure_methods(place, methods, "grey", repeats=3)}
     assert found["true"]["error"]["value"] == pytest.approx(0, abs=1e-6)
     assert found["grey"]["error"]["value"] > 0.1

@@ -1,4 +1,4 @@
-"""What the README and the documents show works: scripts run, commands parse, links and numbers hold."""
+"""README and documents: scripts run, commands parse, links exist, numbers equal the stored ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
 
-from wrf_mi.cli.main import _parser
+from wrf_mi.cli.main import build_parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder
@@ -62,11 +62,12 @@ def tiny_folder(tmp_path: Path) -> Path:
 
 
 def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """As they stand, but for the data set and the number of steps."""
+    """Scripts run unchanged except data set and number of steps."""
     script = "\n".join(blocks(README, "python"))
     for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
+    script += "\n".join(blocks(CHECKOUT / "docs" / "model.md", "python"))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(script, str(README), "exec"), names)
@@ -94,7 +95,7 @@ def test_commands_parse(path: Path) -> None:
             continue
         assert program == "wrf-mi", line
         try:
-            parsed: argparse.Namespace = _parser().parse_args(arguments)
+            parsed: argparse.Namespace = build_parser().parse_args(arguments)
         except SystemExit:
             pytest.fail(f"{path.name}: {line}")
         with_settings(TrainConfig(), getattr(parsed, "set", []))
@@ -102,14 +103,14 @@ def test_commands_parse(path: Path) -> None:
             assert name in {*CASES, *CHECKS, TABLES}, line
 
 
-def test_readme_shows_every_step_of_the_way() -> None:
+def test_readme_shows_all_main_commands() -> None:
     shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
     assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace", "sweep"}
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
-def test_links_and_paths_lead_somewhere(path: Path) -> None:
+def test_links_and_paths_exist(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
     for link in links:

@@ -42,7 +42,7 @@ def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeyp
 
 
 @pytest.mark.parametrize("count", [40, 400])
-def test_interval_of_a_median_covers_it_as_often_as_it_says(count: int) -> None:
+def test_interval_of_a_median_has_its_nominal_coverage(count: int) -> None:
     rng = np.random.default_rng(1)
     inside = 0
     for _ in range(400):
@@ -101,7 +101,7 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Made:
     return Made(monkeypatch, tmp_path / "sentinels")
 
 
-def test_kept_figures_pass_and_data_elsewhere_are_said(made: Made) -> None:
+def test_equal_figures_pass_and_missing_data_are_reported(made: Made) -> None:
     found = main()
     assert "failed" not in found
     assert [row["verdict"] for row in found["rows"]] == ["equal", "equal", "not on this machine"]
@@ -110,7 +110,7 @@ def test_kept_figures_pass_and_data_elsewhere_are_said(made: Made) -> None:
     assert lines[4] == "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 |  | not on this machine |"
 
 
-def test_a_call_that_was_stopped_goes_on_from_what_is_measured(made: Made, tmp_path: Path) -> None:
+def test_stopped_call_resumes_from_measured_groups(made: Made, tmp_path: Path) -> None:
     made.error = KeyboardInterrupt
     assert check.main(CHECKS["sentinels"].function, str(tmp_path / "out.json")) == 130
     assert not (tmp_path / "out.json").exists()
@@ -119,7 +119,7 @@ def test_a_call_that_was_stopped_goes_on_from_what_is_measured(made: Made, tmp_p
     assert made.asked == ["good", "other", "other"]
 
 
-def test_other_code_is_measured_anew(made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     first = main()
     assert main() == first  # nothing was measured, dates and seconds are those of the measurement
     changed = tmp_path / "changed.py"
@@ -138,7 +138,7 @@ def test_source_files_are_the_packages_without_compiled_files() -> None:
 @pytest.mark.parametrize(
     ("error", "value"), [(3.3, "3.3, worse"), (InputError("no\nscene"), "failed: no scene"), (OSError(), "failed")]
 )
-def test_what_got_worse_or_failed_is_named_after_all_were_measured(
+def test_worse_or_failed_figure_is_named_after_all_were_measured(
     made: Made, error: float | Exception, value: str
 ) -> None:
     made.error = error
@@ -178,7 +178,7 @@ def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_wo
     assert calls == [CHECKS["sentinels"].function] * 2
 
 
-def test_without_stored_figures_it_is_one_line(
+def test_missing_stored_figures_are_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The command, with the process that it starts."""

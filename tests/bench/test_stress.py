@@ -1,4 +1,4 @@
-"""What `wrf-mi bench stress` runs at full size, here with a case or two of each."""
+"""The stress benchmark with a case or two of each row."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ import numpy as np
 import pytest
 from wrf_mi_bench import stress as bench_stress
 from wrf_mi_bench import stress_fields, stress_joint, stress_plugins, stress_receivers, stress_rows
-from wrf_mi_bench.stress import held, worst_of
-from wrf_mi_bench.stress_fields import HARD, Field, image, made, reference
+from wrf_mi_bench.stress_fields import HARD, Field, image, image_row, made, reference
 from wrf_mi_bench.stress_joint import joint
 from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
 from wrf_mi_bench.stress_receivers import derivatives, of_fields, of_paths
-from wrf_mi_bench.stress_traced import traced_gradients
+from wrf_mi_bench.stress_rows import held, worst_of
+from wrf_mi_bench.stress_traced import phases, traced_gradients
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_images_of_hard_fields(name: str) -> None:
+def test_images_of_ill_conditioned_fields_equal_the_reference(name: str) -> None:
     for seed in range(2):
         field = HARD[name](np.random.default_rng(seed))
         for blending in stress_fields.BLENDINGS:
             truth, clear = reference(field, blending, (30, 60))
             found = image(field, blending, (30, 60))
             assert np.isfinite(found).all()
-            assert np.linalg.norm((found - truth)[clear]) <= bench_stress.IMAGE * np.linalg.norm(truth)
+            assert np.linalg.norm((found - truth)[clear]) <= stress_rows.IMAGE * np.linalg.norm(truth)
             assert clear.mean() > 0.9
 
 
-def test_derivatives_of_hard_fields() -> None:
+def test_derivatives_of_ill_conditioned_fields_keep_their_bound() -> None:
     names = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in depth", "opacity 0, 1 and 1 - 1e-7")
     for row in bench_stress.gradients(1, names):
         worst, bound = worst_of(row)
         assert worst <= bound, row
 
 
-def test_ties_are_ties_in_both() -> None:
-    """Permuted and mirrored offsets have the same distance; which is in front is settled by position alone."""
+def test_order_of_ties_in_depth_equals_the_reference() -> None:
+    """Permuted and mirrored offsets have equal distances, so that positions decide the order."""
     field = HARD["exact ties in depth"](np.random.default_rng(5))
     opaque = replace(field, opacity=np.ones(len(field.opacity)), scale_m=0 * field.scale_m + 0.5)
     truth, clear = reference(opaque, "alpha", (30, 60))
@@ -50,14 +50,14 @@ def test_ties_are_ties_in_both() -> None:
     np.testing.assert_allclose(image(opaque, "alpha", (30, 60))[clear], truth[clear], atol=1e-5)
 
 
-def test_an_image_of_nothing_is_dark() -> None:
+def test_image_of_an_empty_field_is_zero() -> None:
     for blending in stress_fields.BLENDINGS:
         found = image(made(0, np.random.default_rng(0)), blending, (3, 5))
         assert found.shape == (3, 5)
         assert not found.any()
 
 
-def test_one_pixel() -> None:
+def test_image_of_one_pixel_equals_the_reference() -> None:
     for seed in range(5):
         field = made(40, np.random.default_rng(seed))
         for blending in stress_fields.BLENDINGS:
@@ -65,40 +65,42 @@ def test_one_pixel() -> None:
             np.testing.assert_allclose(image(field, blending, (1, 1))[clear], truth[clear], rtol=1e-4)
 
 
-def test_phases_and_losses() -> None:
-    for row in [*bench_stress.phases(), *losses(2)]:
+def test_phases_and_losses_keep_their_bounds() -> None:
+    rows = phases(5)
+    for row in [*rows, *losses(2)]:
         assert held(row), row
-    # The same lengths in float32 would miss the bound: it is one that can be missed.
-    assert float(bench_stress.phases()[0]["value"].split()[-2]) > stress_rows.PHASE
+    # Lengths in float32 exceed the bound.
+    assert float(rows[0]["value"].split()[-2]) > stress_rows.PHASE
 
 
-def test_fits_end_finite_or_say_where_not() -> None:
+def test_fits_end_finite_or_name_the_group_that_is_not() -> None:
     value = bench_stress.fits(4)["value"]
     assert value.endswith(" 0 did neither")
     assert "4 ended finite" not in value
 
 
-def test_receivers() -> None:
+def test_receivers_keep_their_bounds() -> None:
     hard = ("random", "needles, 1e6 to 1", "signals of 1e-15 to 1e15", "none")
     for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), of_paths(1)]:
         assert held(row), row
 
 
-def test_derivatives_of_what_is_traced() -> None:
+def test_derivatives_of_traced_fields_keep_their_bounds() -> None:
     for row in traced_gradients(1):
         assert held(row), row
 
 
-def test_the_joint_graph() -> None:
-    """Values and derivatives of all receiver models."""
-    rows = joint(2)
-    assert len(rows) == 2 * len(stress_joint.cases())
+def test_joint_graph_keeps_its_bounds() -> None:
+    """Values and derivatives: all receiver models in one case, two of them in the others."""
+    others = [*(name for name in stress_joint.CASES if name != stress_joint.COPLANAR), "many paths"]
+    rows = [*joint(2, [stress_joint.COPLANAR]), *joint(2, others, ("array", "RSSI"))]
+    assert len(rows) == 2 * (1 + len(others))
     for row in rows:
         assert held(row), row
 
 
-def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Values see a shift that the graph forgets, derivatives a tilt that it holds."""
+def test_joint_rows_detect_a_wrong_shift_and_a_missing_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shift that the graph ignores shows in values, a tilt without gradient in derivatives."""
     moved = PlaneTables.moved
 
     def unshifted(self: PlaneTables, parameters: Any) -> Any:
@@ -119,31 +121,31 @@ def test_a_plane_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "plane.tilt" in slope["value"]
 
 
-def test_the_integrator_of_the_plugins() -> None:
-    for row in [*plugin_images(2, 1, many=0), *plugin_gradients(1, bench_stress.HARDEST[:1])]:
+def test_plugin_integrator_keeps_its_bounds() -> None:
+    for row in [*plugin_images(2, 1, many=0), *plugin_gradients(1, stress_fields.HARDEST[:1])]:
         assert held(row), row
 
 
-def test_a_receiver_that_is_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_receiver_rows_detect_a_wrong_frequency(monkeypatch: pytest.MonkeyPatch) -> None:
     off = replace(stress_receivers.MODELS["spectrum"], frequency_hz=1.001 * stress_receivers.CARRIER_HZ)
     monkeypatch.setitem(stress_receivers.MODELS, "spectrum", off)
     missed = [row["what"] for row in of_fields(1, 1, ("random",)) if not held(row)]
     assert missed == ["receiver: Bartlett spectrum, 2 cases"]
 
 
-def test_slim_gaussians_are_met_by_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugin_rows_detect_rays_lost_at_thin_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mitsuba's ellipsoids lose rays where they are small against its unit of length."""
     from wrf_mi_plugins import acceleration
 
     for name, value in {"NEAREST": 1.0, "FARTHEST": 4.0, "STEP": 1e-4, "SIZE": 12.0, "SPACING": 24.0004}.items():
         monkeypatch.setattr(acceleration, name, value)
-    lost = stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60))
+    lost = stress_plugins.plugin_row("needles", {"needles": HARD["needles, 1e6 to 1"]}, 1)
     assert worst_of(lost)[0] > 0.01
     monkeypatch.undo()
-    assert held(stress_plugins._images("needles", [HARD["needles, 1e6 to 1"]], 1, (30, 60)))
+    assert held(stress_plugins.plugin_row("needles", {"needles": HARD["needles, 1e6 to 1"]}, 1))
 
 
-def test_what_is_not_a_number_is_the_worst() -> None:
+def test_nan_is_the_worst_error() -> None:
     worst = stress_rows.Worst()
     for error, where in ((1e-6, "first"), (np.nan, "second"), (1.0, "third")):
         worst.add(error, where)
@@ -160,33 +162,34 @@ def test_what_is_not_a_number_is_the_worst() -> None:
     assert not held(known.row("made up"))
 
 
-def test_the_quick_form_by_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quick_stress_command_prints_rows_and_fails_beyond_a_bound(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def few() -> list[dict[str, str]]:
-        return [bench_stress._images("ordinary", lambda rng: made(20, rng), 1, bench_stress.IMAGE)]
+        return [image_row("image, ordinary", {"random": lambda rng: made(20, rng)}, 1)]
 
     monkeypatch.setattr(bench_stress, "QUICK", (few, lambda: losses(1), lambda: [bench_stress.fits(1)]))
-    assert cli.main(["bench", "stress", "--quick"]) == 0
+    assert cli(["bench", "stress", "--quick"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 1 + 7 + 1
     assert lines[2].startswith("| numbers under stress: image, ordinary, 2 cases | **worst ")
-    monkeypatch.setattr(bench_stress, "IMAGE", 1e-12)
-    assert cli.main(["bench", "stress", "--quick"]) == 1
+    monkeypatch.setattr(stress_fields, "IMAGE", 1e-12)
+    assert cli(["bench", "stress", "--quick"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("wrf-mi: bench stress --quick: image, ordinary, 2 cases: worst ")
 
 
 @pytest.mark.parametrize("names", [["operator"], ["stress", "demo"], ["nowhere"], ["stress", "--store"]])
-def test_what_has_no_quick_form_is_refused(names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", *names, "--quick"]) == 2
+def test_names_without_a_quick_form_are_refused(names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli(["bench", *names, "--quick"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "stress" in line
 
 
-def test_an_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_row_reports_an_error_beyond_its_bound() -> None:
     def off(field: Field, blending: str, size: tuple[int, int]) -> np.ndarray:
         return image(field, blending, size) * 1.001
 
-    monkeypatch.setattr(bench_stress, "image", off)
-    worst, bound = worst_of(bench_stress._images("random", lambda rng: made(20, rng), 2, bench_stress.IMAGE))
+    worst, bound = worst_of(image_row("image, random", {"random": lambda rng: made(20, rng)}, 2, render=off))
     assert worst == pytest.approx(1e-3, rel=0.05)
     assert worst > bound

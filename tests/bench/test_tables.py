@@ -57,7 +57,7 @@ def test_names_are_unique_and_whole_tables_come_first():
     assert {row.part.dataset for row in plan(quick=True)} == {part.dataset for part in QUICK_PARTS}
 
 
-def test_arguments_are_those_of_a_run_of_that_kind():
+def test_arguments_contain_scene_share_and_seed():
     part = next(part for part in PARTS if part.dataset == "flat-ble")
     words = Row(part, "ray-tracing", 0.3, 2).arguments(["--scene", "x", "--material", "y"])
     assert words[:2] == ["train", "flat-ble"]
@@ -76,7 +76,7 @@ def short_plan(monkeypatch):
     return rows
 
 
-def test_a_row_is_stored_when_it_is_done_and_never_measured_twice(short_plan, monkeypatch, tmp_path):
+def test_row_is_stored_when_done_and_not_measured_twice(short_plan, monkeypatch, tmp_path):
     asked = []
 
     def measure(runs, row):
@@ -96,7 +96,7 @@ def test_a_row_is_stored_when_it_is_done_and_never_measured_twice(short_plan, mo
     assert len(asked) == 4
 
 
-def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, monkeypatch, tmp_path):
+def test_row_with_another_planned_command_is_measured_again(short_plan, monkeypatch, tmp_path):
     monkeypatch.setattr(tables, "measure", lambda runs, row: made_row(row, 5.0))
     tables.tables(tmp_path, tmp_path / "runs")
     asked = []
@@ -107,9 +107,7 @@ def test_a_row_that_is_planned_otherwise_by_now_is_measured_again(short_plan, mo
     assert asked == [short_plan[0].name]
 
 
-def test_a_row_of_other_data_is_measured_again_and_one_of_other_versions_is_told(
-    short_plan, monkeypatch, tmp_path, capsys
-):
+def test_row_of_other_data_is_measured_again_and_of_other_versions_reported(short_plan, monkeypatch, tmp_path, capsys):
     data = tmp_path / "data"
     data.mkdir()
     monkeypatch.setattr(tables, "dataset_files", lambda name: [data])
@@ -138,7 +136,7 @@ def test_a_row_of_other_data_is_measured_again_and_one_of_other_versions_is_told
 
 
 def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_path):
-    monkeypatch.setattr(tables, "locate", lambda name: flat_folder)
+    monkeypatch.setattr(tables, "data_folder", lambda name: flat_folder)
     for name in ("flat-ble", "rfid-lab"):
         part = next(part for part in PARTS if part.dataset == name)
         (flag, path) = tables.scene_of(part, tmp_path)
@@ -149,7 +147,7 @@ def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_pa
         assert {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")} == before
 
 
-def test_no_row_is_begun_after_the_time_is_up(short_plan, monkeypatch, tmp_path):
+def test_no_row_begins_after_the_time_limit(short_plan, monkeypatch, tmp_path):
     monkeypatch.setattr(tables, "measure", lambda runs, row: pytest.fail("begun"))
     assert tables.tables(tmp_path, tmp_path / "runs", most_s=-1.0) == []
 
@@ -166,19 +164,19 @@ def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path
     assert (tmp_path / "csi-traced-csi-flat-official.png").stat().st_size > 5000
 
 
-def test_a_damaged_row_is_told(tmp_path):
+def test_damaged_row_is_reported(tmp_path):
     (tmp_path / "a-seed0.json").write_text('{"row": ')
     with pytest.raises(InputError, match=r"a-seed0\.json: not readable .*restore it, or delete it"):
         table_pages.read_rows(tmp_path)
 
 
-def test_data_that_are_not_here_are_left_out(monkeypatch, tmp_path, capsys):
+def test_missing_data_sets_are_skipped(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tables, "available", lambda part: False)
     assert tables.tables(tmp_path, tmp_path / "runs") == []
     assert "flat-ble is not on this machine" in capsys.readouterr().err
 
 
-def test_an_overview_has_a_line_a_method_and_the_mean_over_seeds(monkeypatch):
+def test_overview_has_a_line_per_method_with_the_mean_over_seeds(monkeypatch):
     flat, office = (part for part in PARTS if part.dataset.startswith("traced-csi-"))
     rows = [
         Row(flat, "fire", 1.0, 0),
@@ -197,7 +195,7 @@ def test_an_overview_has_a_line_a_method_and_the_mean_over_seeds(monkeypatch):
 
 
 @pytest.mark.parametrize("name", table_pages.OVERVIEWS)
-def test_readme_shows_what_is_stored(name):
+def test_readme_shows_the_stored_overviews(name):
     stored = table_pages.read_rows(CHECKOUT / "benchmarks" / "results" / "tables")
     shown = (CHECKOUT / "README.md").read_text(encoding="utf-8").split(f"<!-- {name} -->")[1]
     overview = table_pages.overview(name, {row["row"]: row for row in stored})

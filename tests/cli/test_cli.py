@@ -22,11 +22,12 @@ from calling import SET, SMALL, call, refused
 from made_spectra import SIZE
 
 from wrf_mi.cli import demo
-from wrf_mi.cli.main import _parser, main
+from wrf_mi.cli.main import build_parser, main
+from wrf_mi.cli.output import Watch
 from wrf_mi.core import InputError
 from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import open_run
-from wrf_mi.runs.watch import Watch
+from wrf_mi.training import config
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
 
@@ -50,33 +51,33 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
                 yield from commands(sub, (*name, key))
 
 
-def test_the_subcommands() -> None:
+def test_commands_are_complete() -> None:
     expected = {"doctor", "data", "mesh", "train", "trace", "sweep", "evaluate", "predict", "compress", "compare"}
     expected |= {"bench", "demo"}
-    assert {name[0] for name in commands(_parser()) if name} == expected
+    assert {name[0] for name in commands(build_parser()) if name} == expected
 
 
-@pytest.mark.parametrize("name", list(commands(_parser())), ids=" ".join)
-def test_help(name: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", list(commands(build_parser())), ids=" ".join)
+def test_every_command_has_help(name: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = call([*name, "--help"], capsys)
     assert (status, err) == (0, "")
     assert out.startswith(f"usage: {' '.join(('wrf-mi', *name))} ")
 
 
-def test_help_and_bad_arguments_start_nothing() -> None:
-    """They answer at once: neither Dr.Jit nor Mitsuba is loaded."""
+def test_help_and_bad_arguments_import_no_tracer() -> None:
+    """Help and parser errors appear before Dr.Jit, Mitsuba or Sionna RT is imported."""
     code = """
 import sys
 from wrf_mi.cli.main import main
-for arguments in (["train", "--help"], ["train", "--seed", "x"]):
+for arguments in (["--help"], ["train", "--help"], ["train", "--seed", "x"]):
     try:
         main(arguments)
     except SystemExit:
         pass
-print("drjit" in sys.modules, "mitsuba" in sys.modules)
+print({"drjit", "mitsuba", "sionna"} & set(sys.modules))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "False False"
+    assert done.stdout.splitlines()[-1] == "set()"
 
 
 def test_version_and_settings(capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,8 +119,10 @@ def test_train_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "deterministic: true" in (tmp_path / "run" / "config.yaml").read_text()
 
 
-def test_train_on_one_row(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """There is no row left for validation: no score meanwhile, and none that is not a number."""
+def test_train_with_one_row_logs_no_validation_score(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without validation rows the logged score is null, not NaN."""
     status, _, err = call(["train", folder, "--out", tmp_path / "run", "--n-train", 1, *SET], capsys)
     assert status == 0
     assert "4/4" in err
@@ -128,8 +131,8 @@ def test_train_on_one_row(folder: Path, tmp_path: Path, capsys: pytest.CaptureFi
         assert json.loads(line, parse_constant=pytest.fail)["validation_score"] is None
 
 
-def test_preset_model_and_settings_in_that_order(folder: Path, tmp_path: Path) -> None:
-    """What is set by hand wins."""
+def test_settings_override_the_preset(folder: Path, tmp_path: Path) -> None:
+    """``--set`` takes precedence over ``--preset``."""
     arguments = [
         "train",
         folder,
@@ -142,9 +145,9 @@ def test_preset_model_and_settings_in_that_order(folder: Path, tmp_path: Path) -
         "encoding.tx_octaves=3",
     ]
     assert main([str(a) for a in arguments]) == 0
-    config = (tmp_path / "run" / "config.yaml").read_text()
-    assert "position_octaves: 10" in config
-    assert "tx_octaves: 3" in config
+    text = (tmp_path / "run" / "config.yaml").read_text()
+    assert "position_octaves: 10" in text
+    assert "tx_octaves: 3" in text
 
 
 def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -202,8 +205,8 @@ def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert "rfid-lab" in table
 
 
-def test_a_fit_that_breaks_ends_with_one(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not bad input, but one line all the same."""
+def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The error is one line, without traceback."""
     own = [*SET, "--set", "optimiser.signal=1e38", "--set", "steps=20"]
     status, out, err = call(["train", folder, "--out", tmp_path / "run", *own], capsys)
     assert (status, out) == (1, "")
@@ -211,7 +214,7 @@ def test_a_fit_that_breaks_ends_with_one(folder: Path, tmp_path: Path, capsys: p
     assert "Traceback" not in err
 
 
-def test_a_stopped_run_ends_with_130(
+def test_stopped_run_ends_with_status_130(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(Watch, "stop", lambda self: True)
@@ -226,10 +229,10 @@ def test_a_stopped_run_ends_with_130(
     assert json.loads(out)["steps"] == 4
 
 
-def test_ctrl_c_loses_nothing(folder: Path, tmp_path: Path) -> None:
-    """A training process gets the signal that Ctrl-C sends."""
+def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
+    """A training process receives SIGINT."""
     out = tmp_path / "run"
-    own = [*SET, "--set", "steps=800", "--set", "log_every=1", "--set", "validate_every=800"]
+    own = [*SET, "--set", "steps=400", "--set", "log_every=1", "--set", "validate_every=400"]
     process = subprocess.Popen(
         [sys.executable, "-m", "wrf_mi.cli", "train", str(folder), "--out", str(out), *own],
         stdout=subprocess.PIPE,
@@ -247,11 +250,11 @@ def test_ctrl_c_loses_nothing(folder: Path, tmp_path: Path) -> None:
     assert stdout == ""
     assert stderr.splitlines()[0] == "stopping after this step; Ctrl-C again ends at once"
     step = int(read_checkpoint(out)["step"])
-    assert 0 < step < 800
-    assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 800; go on with:")
+    assert 0 < step < 400
+    assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 400; go on with:")
     assert main(["train", "--resume", str(out)]) == 0
     lines = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
-    assert lines == list(range(1, 801))
+    assert lines == list(range(1, 401))
     assert (out / "metrics.json").exists()
 
 
@@ -302,32 +305,32 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     assert "SSIM 0.500 (validation rows)  8 Gaussians  1:01 left" in shown
 
 
-def test_demo_takes_real_data_where_it_can(
+def test_demo_finds_or_fetches_real_data(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo, "locate", lambda name: folder)
-    assert demo.here("rfid-lab") == folder
-    monkeypatch.setattr(demo, "locate", lambda name: None)
-    monkeypatch.setattr(demo, "fetch", lambda name: folder)
-    assert demo.here("rfid-lab") == folder
+    monkeypatch.setattr("wrf_mi.datasets.registry.locate", lambda name: folder)
+    assert demo.find_data("rfid-lab") == folder
+    monkeypatch.setattr("wrf_mi.datasets.registry.locate", lambda name: None)
+    monkeypatch.setattr("wrf_mi.datasets.fetch", lambda name: folder)
+    assert demo.find_data("rfid-lab") == folder
     assert capsys.readouterr().err == ""
 
     def offline(name: str) -> Path:
         raise InputError("no network")
 
-    monkeypatch.setattr(demo, "fetch", offline)
-    assert demo.here("rfid-lab") is None
+    monkeypatch.setattr("wrf_mi.datasets.fetch", offline)
+    assert demo.find_data("rfid-lab") is None
     assert capsys.readouterr().err == "no rfid-lab (no network)\n"
 
 
 def test_demo_on_real_data(
     folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A field on spectra and a traced flat, here of data made up in the same layouts."""
+    """A field on spectra and a traced flat, with synthetic data in the layouts of the real data sets."""
     monkeypatch.setattr(demo, "REAL", str(folder))
     monkeypatch.setattr(demo, "FLAT", str(flat_folder))
-    monkeypatch.setattr(demo, "locate", Path)
-    monkeypatch.setattr(demo, "PRESETS", {"quick": tuple(SMALL)})
+    monkeypatch.setattr(demo, "find_data", Path)
+    monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
     status, out, err = call(["demo", "--out", tmp_path / "run", "--json"], capsys)
     assert status == 0, err
     assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -341,9 +344,9 @@ def test_demo_on_real_data(
 def test_demo_in_the_embedded_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without real data: the field and the ray tracer, on the mesh of the room's scan, on the same rows."""
-    monkeypatch.setattr(demo, "here", lambda name: None)
-    monkeypatch.setattr(demo, "PRESETS", {"quick": tuple(SMALL)})
+    """Without real data the field and the ray tracer are scored on the same rows of the embedded room."""
+    monkeypatch.setattr(demo, "find_data", lambda name: None)
+    monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
     status, _, err = call(["demo", "--out", tmp_path / "run"], capsys)
     assert status == 0, err
     with (tmp_path / "run" / "compare" / "compare.csv").open(newline="") as file:
@@ -353,7 +356,7 @@ def test_demo_in_the_embedded_room(
     assert (tmp_path / "run" / "scene" / "preview.png").is_file()
 
 
-def test_errors_that_are_ours_to_mend_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: Any) -> None:
         raise RuntimeError("a bug")
 

@@ -14,7 +14,7 @@ from calling import SET, refused
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
-from wrf_mi.runs.tx_file import read_inputs
+from wrf_mi.runs.prediction_file import read_inputs
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +24,8 @@ def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """By the parser of arguments: one line too, which names the command."""
+def test_bad_arguments_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser's error is one line that names the command."""
     for arguments, message in (
         ([], "wrf-mi: the following arguments are required: COMMAND; see wrf-mi --help"),
         (["fly"], "argument COMMAND: invalid choice: 'fly'"),
@@ -64,7 +64,7 @@ def test_calls_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
         (["--n-train", "nan"], "n_train nan; choose"),
     ],
 )
-def test_training_that_is_refused(
+def test_bad_training_options_are_refused(
     own: list[str], message: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for split in ([], ["--split", "blocked"]):
@@ -74,7 +74,7 @@ def test_training_that_is_refused(
         assert not (tmp_path / "run").exists()  # nothing is half written
 
 
-def test_data_and_folders_that_are_refused(
+def test_bad_data_and_folders_are_refused(
     folder: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "nothing"))
@@ -119,8 +119,8 @@ def test_data_and_folders_that_are_refused(
     ],
 )
 def test_resume_takes_no_settings(own: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """They would be left aside."""
-    refused(["train", "--resume", run, *own], "leave data set and settings away", capsys)
+    """Options beside ``--resume`` are refused."""
+    refused(["train", "--resume", run, *own], "omit data set and settings", capsys)
 
 
 BAD_POSITIONS = {
@@ -136,7 +136,7 @@ BAD_POSITIONS = {
 
 
 @pytest.mark.parametrize("name", BAD_POSITIONS)
-def test_positions_that_are_refused(name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_positions_are_refused(name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     content, message = BAD_POSITIONS[name]
     (tmp_path / name).write_bytes(content)
     option = "--input" if name.endswith(".npz") else "--tx"
@@ -154,7 +154,7 @@ def test_positions_that_are_refused(name: str, run: Path, tmp_path: Path, capsys
         ({"tx_pos": np.array([["a", "b", "c"]])}, "not readable as .npz"),
     ],
 )
-def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_bad_arrays_of_positions_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "tx.npz", **arrays)
     with pytest.raises(InputError, match=message):
         read_inputs(None, tmp_path / "tx.npz")
@@ -174,18 +174,18 @@ def test_arrays_of_positions_that_are_refused(arrays: dict[str, np.ndarray], mes
         (OSError("a damaged\nfile"), "a damaged file"),
     ],
 )
-def test_what_the_system_refused_is_named_with_its_own_remedy(
+def test_system_errors_are_one_line_with_a_remedy(
     error: OSError, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(_: object) -> int:
         raise error
 
-    monkeypatch.setattr("wrf_mi.cli.main._data_list", fails)
+    monkeypatch.setattr("wrf_mi.cli.data.list_command", fails)
     refused(["data", "list"], f"^wrf-mi: {re.escape(line)}", capsys)
 
 
-def test_a_reader_that_has_gone_ends_the_command_silently() -> None:
-    """As ``head`` does; all output goes to a pipe that nobody reads."""
+def test_closed_pipe_ends_the_command_silently() -> None:
+    """The command writes to a pipe without reader, as with ``head``."""
     code = "import sys; sys.stdin.read(1); from wrf_mi.cli.main import main; sys.exit(main(['data', 'list']))"
     with subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, stderr=-1) as command:
         assert command.stdin
@@ -197,7 +197,7 @@ def test_a_reader_that_has_gone_ends_the_command_silently() -> None:
     assert command.returncode == 141
 
 
-def test_predictions_that_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_predictions_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
     good, out = ["--tx", tmp_path / "tx.csv"], ["--out", tmp_path / "out.npz"]
     refused(["predict", run, "--tx", tmp_path / "no.csv", *out], "no.csv: no such file", capsys)

@@ -10,6 +10,7 @@ import pytest
 from wrf_mi import backend
 from wrf_mi.backend import cache, libraries, remedy
 from wrf_mi.cli import doctor
+from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError
 
 
@@ -117,7 +118,7 @@ def test_nothing_is_installed_where_a_backend_works(system: System, monkeypatch:
     assert system.calls() == [""]
 
 
-def test_apt_installs_the_newest_that_works(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apt_installs_the_newest_working_llvm(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     system.command("apt-get")
     system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
     works_after(monkeypatch, system, f"{INSTALL} libllvm19")
@@ -163,7 +164,7 @@ def test_without_rights_the_error_is_the_line_to_run(system: System, monkeypatch
     assert not [call for call in system.calls() if call.startswith("apt-get")]
 
 
-def test_with_sudo_that_asks_nothing(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_passwordless_sudo_is_used(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     system.command("sudo", 'shift; [ "$1" = true ] || "$@"')
     system.command("apt-get")
@@ -196,13 +197,15 @@ def test_a_named_library_is_not_replaced(system: System, monkeypatch: pytest.Mon
     assert system.calls() == []
 
 
-def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.main(["--json"]) == 0
+def test_command_prints_the_report_and_the_error_of_an_installation(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"]
 
     def refuse() -> None:
         raise BackendError("LLVM is missing: run this")
 
     monkeypatch.setattr(doctor, "install_llvm", refuse)
-    assert doctor.main(["--install-llvm"]) == 1
-    assert capsys.readouterr().err == "LLVM is missing: run this\n"
+    assert main(["doctor", "--install-llvm"]) == 1
+    assert capsys.readouterr().err == "wrf-mi: LLVM is missing: run this\n"

@@ -20,7 +20,7 @@ from wrf_mi.core.carriers import by_carrier
 from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
 from wrf_mi.models import MODELS
 from wrf_mi.runs.api import open_run, plan_run, train
-from wrf_mi.runs.references import reference_predictions
+from wrf_mi.runs.evaluate import reference_predictions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import TASKS, instrument_of
@@ -122,7 +122,7 @@ def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder
     with pytest.raises(InputError, match=r"2 positions and carriers \(1,\); give one positive frequency_hz for each"):
         run.predict(place, carriers_hz=LOW)
     one = train(flat_folder, tmp_path / "one", "idw")
-    with pytest.raises(InputError, match="its data have one carrier; leave frequency_hz away"):
+    with pytest.raises(InputError, match="its data have one carrier; omit frequency_hz"):
         one.predict(place, carriers_hz=[LOW, LOW])
 
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from wrf_mi_bench.stress_fields import BLENDINGS, RECEIVER, Field, made
+from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import Pose
-from wrf_mi.gaussians.optical_depth import attenuators, optical_depth
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.array import array_response, bartlett_spectrum

@@ -1,4 +1,4 @@
-"""Splatting of transmitters that share one geometry against splatting each with a geometry of its own."""
+"""Batched blending of transmitters that share one geometry against blending with repeated geometry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from wrf_mi.gaussians import (
     random_gaussians,
     tiles,
 )
-from wrf_mi.gaussians.blend_batched import GROUP, group_of
+from wrf_mi.gaussians.blend import GROUP, group_size
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
@@ -57,7 +57,7 @@ def drawn(name: str, batch: int) -> tuple[dict[str, Any], Any]:
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("batch", [2, 5, 8])
-def test_one_geometry_serves_all_transmitters(name: str, batch: int) -> None:
+def test_shared_geometry_equals_repeated_geometry(name: str, batch: int) -> None:
     """Spectra, and derivatives by every parameter; batches of half a group, of a prime number, of two groups."""
     plane, rng = perception_plane(*SIZE, Float64), np.random.default_rng(3)
     weight = [Float64(rng.standard_normal(batch * plane.pixels)) for _ in range(2)]
@@ -79,8 +79,8 @@ def test_one_geometry_serves_all_transmitters(name: str, batch: int) -> None:
         assert expected.any(), key
 
 
-def test_lists_that_were_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Large fields have lists with as much room as they need; they serve all groups of transmitters too."""
+def test_counted_lists_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted lists of large fields serve all groups of transmitters."""
     plane, images = perception_plane(*SIZE, Float64), []
     params, tx_pos = drawn("factorised", 8)
     gaussians = FIELDS["factorised"].gaussians(params, tx_pos)
@@ -91,7 +91,7 @@ def test_lists_that_were_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert images[0].any()
 
 
-def test_groups_divide_the_batch() -> None:
-    sizes = [group_of(batch) for batch in range(1, 13)]
+def test_group_size_divides_the_batch() -> None:
+    sizes = [group_size(batch) for batch in range(1, 13)]
     assert sizes == [1, 2, 3, 4, 1, 3, 1, 4, 3, 2, 1, 4]
     assert max(sizes) == GROUP

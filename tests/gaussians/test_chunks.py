@@ -1,4 +1,4 @@
-"""What is done in parts is what is done at once: lists of tiles, networks of many Gaussians."""
+"""Chunked evaluation equals evaluation at once: lists of tiles, networks of many Gaussians."""
 
 from __future__ import annotations
 
@@ -51,26 +51,25 @@ def members(lists: TileLists, n: int) -> list[list[int]]:
     return [index[a : a + b].tolist() for a, b in zip(start, length, strict=True)]
 
 
-@pytest.mark.parametrize("by_box", [True, False])
 @pytest.mark.parametrize("size", [0.02, 0.4])
-def test_counted_lists_are_the_reserved_ones(monkeypatch: pytest.MonkeyPatch, size: float, by_box: bool):
+def test_counted_lists_equal_allocated_lists(monkeypatch: pytest.MonkeyPatch, size: float):
     """A plane whose last tiles stick out, three transmitters, Gaussians below the horizon and across the seam."""
     batch, count, pose, plane = 3, 60, device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
     field = gaussians(batch, count, size)
     footprints = project(field, pose)
     order = depth_order(footprints.depth, field.position)
-    reserved = build_lists(footprints, order, plane, batch, by_box)
+    reserved = build_lists(footprints, order, plane, batch)
     monkeypatch.setattr(tiles, "RESERVED", 0)
-    counted = build_lists(footprints, order, plane, batch, by_box)
+    counted = build_lists(footprints, order, plane, batch)
     assert reserved.start is None
     assert counted.start is not None
     assert members(counted, count) == members(reserved, count)
     room = dr.width(counted.index)
     assert room == int(counted.length.numpy().sum())
-    assert room < dr.width(reserved.index) or not by_box
+    assert room < dr.width(reserved.index)
 
 
-def test_nothing_in_any_tile(monkeypatch: pytest.MonkeyPatch):
+def test_lists_without_visible_gaussians_are_empty(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tiles, "RESERVED", 0)
     field = gaussians(1, 5, 1e-3)
     field.position = [mi.Float(0, 0.1, 0.2, 0, 0), mi.Float(0), dr.full(mi.Float, -3, 5)]
@@ -80,7 +79,7 @@ def test_nothing_in_any_tile(monkeypatch: pytest.MonkeyPatch):
     assert not lists.length.numpy().any()
 
 
-def test_operator_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
+def test_operator_is_the_same_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
     """Its strips are planes of a row of tiles each."""
     field, pose, plane = gaussians(1, 60, 0.3), device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
     whole = [part.toarray() for _, part in weight_strips(field, pose, plane)]
@@ -90,16 +89,16 @@ def test_operator_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
     assert np.concatenate(whole).any()
 
 
-def test_lists_that_32_bits_cannot_count():
+def test_more_entries_than_32_bits_count_are_refused():
     """Refused before anything is reserved."""
     with pytest.raises(InputError, match="splatting: 4294967296 entries"):
-        tiles._checked(2**32)
-    assert tiles._checked(2**32 - 1) == 2**32 - 1
+        tiles.check_entries(2**32)
+    assert tiles.check_entries(2**32 - 1) == 2**32 - 1
 
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
 @pytest.mark.parametrize("batch", [1, 2])
-def test_networks_in_parts(model: str, batch: int):
+def test_networks_in_chunks_equal_the_whole(model: str, batch: int):
     field = FIELDS[model]()
     rng = np.random.default_rng(0)
     start = random_gaussians([RECEIVERS[0]], 23, rng)
@@ -115,8 +114,8 @@ def test_networks_in_parts(model: str, batch: int):
             np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING)
 
 
-def test_predictions_of_many_gaussians(monkeypatch: pytest.MonkeyPatch):
-    """Above a number of Gaussians nothing is recorded, networks see parts, lists are counted; spectra are the same."""
+def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.MonkeyPatch):
+    """Above a number of Gaussians nothing is recorded, networks run in chunks and lists are counted."""
     field, params = true_field("wrf-gs+")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
     recorded = Predictor(field, params, RECEIVERS, *SIZE)

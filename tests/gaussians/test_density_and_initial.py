@@ -12,12 +12,13 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import logit
 from scipy.stats import kstest
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
-from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, logit, reset_opacity
+from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, reset_opacity
 from wrf_mi.scene.points import read_points
 from wrf_mi.training.state import FitState
 
@@ -59,16 +60,16 @@ def one_round(parameters: dict[str, np.ndarray], view_gradient_norm: Any, **chan
     return adapt(parameters, np.asarray(view_gradient_norm, float), **(arguments | changes))
 
 
-def test_small_ones_are_cloned_and_large_ones_split() -> None:
+def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
     parameters = made_up(8)
     parameters["log_scale"][:] = np.log(0.01)
     parameters["log_scale"][1, 5] = np.log(0.5)  # one axis is enough
     view_gradient_norm = [1, 9, 2, 3, 4, 8, 5, 6]
     change = one_round(parameters, view_gradient_norm)
     assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
-    # The two that ask most, 1 and 5, stand once more behind the old ones.
+    # The two largest gradients, 1 and 5, have copies behind the old ones.
     np.testing.assert_array_equal(change.source, [0, 1, 2, 3, 4, 5, 6, 7, 1, 5])
-    # A clone's original goes on; both parts of a split one are new.
+    # The original of a clone is kept; both parts of a split Gaussian are new.
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [5, 8, 9])
     for name, values in change.parameters.items():
         for part, old in ((1, 1), (8, 1), (5, 5), (9, 5)):
@@ -85,7 +86,7 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
                 np.testing.assert_array_equal(values[:, part], parameters[name][:, old])
 
 
-def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
+def test_angular_size_decides_between_clone_and_split() -> None:
     """The same Gaussian is split near the receiver and cloned far from it."""
     parameters = made_up(2)
     parameters["log_scale"][:] = np.log(0.2)
@@ -94,7 +95,7 @@ def test_size_that_decides_is_the_angle_at_the_receiver() -> None:
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [0, 2, 3])
 
 
-def test_parts_of_a_split_one_are_drawn_from_it() -> None:
+def test_split_positions_are_drawn_from_the_gaussian() -> None:
     """In the Gaussian's own axes the parts lie as its density: each coordinate over its scale is standard normal."""
     n = 400
     parameters = made_up(n)
@@ -107,7 +108,7 @@ def test_parts_of_a_split_one_are_drawn_from_it() -> None:
         assert kstest(own[:, axis] / scale, "norm").pvalue > SMALLEST_P
 
 
-def test_faint_and_unseen_ones_are_pruned() -> None:
+def test_transparent_and_unseen_gaussians_are_pruned() -> None:
     parameters = made_up(5)
     parameters["opacity"][0] = [0, logit(LEAST_OPACITY) - 0.1, logit(LEAST_OPACITY) + 0.1, 0, 0]
     change = one_round(parameters, [1, 1, 1, 0, 1], growth_fraction=0.0)
@@ -119,7 +120,7 @@ def test_faint_and_unseen_ones_are_pruned() -> None:
 
 
 @pytest.mark.parametrize("opacity", [True, False])
-def test_a_field_never_becomes_empty(opacity: bool) -> None:
+def test_pruning_keeps_at_least_one_gaussian(opacity: bool) -> None:
     parameters = made_up(4, opacity=opacity)
     if opacity:
         parameters["opacity"][0] = [-20, -19, -18, -19]
@@ -131,23 +132,26 @@ def test_a_field_never_becomes_empty(opacity: bool) -> None:
 @settings(deadline=None, max_examples=60)
 @given(
     n=st.integers(1, 30),
-    most=st.integers(1, 40),
-    grow=st.floats(0, 1),
+    max_gaussians=st.integers(1, 40),
+    growth_fraction=st.floats(0, 1),
     seed=st.integers(0, 1000),
     opacity=st.booleans(),
 )
-def test_what_every_round_keeps(n: int, most: int, grow: float, seed: int, opacity: bool) -> None:
+def test_invariants_of_a_density_round(
+    n: int, max_gaussians: int, growth_fraction: float, seed: int, opacity: bool
+) -> None:
     parameters = made_up(n, seed, opacity)
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
     view_gradient_norm, distance = rng.uniform(0, 1, n) * rng.integers(0, 2, n), rng.uniform(0.5, 5, n)
-    change = one_round(parameters, view_gradient_norm, distance_m=distance, max_gaussians=most, growth_fraction=grow)
+    limits = {"max_gaussians": max_gaussians, "growth_fraction": growth_fraction}
+    change = one_round(parameters, view_gradient_norm, distance_m=distance, **limits)
     count = len(change.source)
     assert count >= 1
     # Growth ends at the most; a field that is larger to begin with is not cut.
-    assert count <= max(most, n - change.pruned)
+    assert count <= max(max_gaussians, n - change.pruned)
     assert count == n - change.pruned + change.cloned + change.split
-    assert change.cloned + change.split <= round(grow * (n - change.pruned))
+    assert change.cloned + change.split <= round(growth_fraction * (n - change.pruned))
     assert change.fresh.sum() == change.cloned + 2 * change.split
     for name, values in change.parameters.items():
         assert values.shape == (before[name].shape[0], count)
@@ -182,7 +186,7 @@ def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
     return state, state.params()
 
 
-def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
+def test_density_round_keeps_momentum_of_old_gaussians() -> None:
     n = 6
     state, before = trained_state(n)
     first, second, count = state.moments()
@@ -214,7 +218,7 @@ def test_a_round_keeps_momentum_but_for_what_is_fresh() -> None:
     np.testing.assert_array_equal(state.view_gradient_norm.numpy(), np.zeros(7))
 
 
-def test_a_step_works_after_a_round() -> None:
+def test_training_step_works_after_a_density_round() -> None:
     state, _ = trained_state(5)
     parameters = state.params()
     own = {name: parameters[name] for name in made_up(1)}
@@ -226,7 +230,7 @@ def test_a_step_works_after_a_round() -> None:
     assert all((values != before[name]).all() for name, values in state.params().items())
 
 
-def test_reset_forgets_momentum_of_that_parameter_alone() -> None:
+def test_opacity_reset_clears_only_its_momentum() -> None:
     state, before = trained_state(5)  # opacity is the last parameter: the step count must not come from it
     first, _, _ = state.moments()
     state.set_param("opacity", reset_opacity(before["opacity"], 0.05))
@@ -239,7 +243,7 @@ def test_reset_forgets_momentum_of_that_parameter_alone() -> None:
     assert {int(t[0]) for _, _, _, (t, _, _, _) in state.adam.state.values()} == {3}
 
 
-def test_state_survives_its_arrays() -> None:
+def test_state_round_trips_through_arrays() -> None:
     state, _ = trained_state(4)
     arrays = state.arrays()
     again = FitState.from_arrays(arrays).arrays()
@@ -248,7 +252,7 @@ def test_state_survives_its_arrays() -> None:
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
 
-def test_the_best_moment_stays_as_it_was() -> None:
+def test_best_parameters_are_not_modified_later() -> None:
     """Dr.Jit gives memory of an array that is summed to in place to the next one of that size."""
     state, _ = trained_state(4)
     state.keep_best(1.0)
@@ -293,7 +297,7 @@ def test_fewer_gaussians_than_receivers() -> None:
     assert np.isfinite(start.position_m).all()
 
 
-def test_geometry_of_the_start() -> None:
+def test_initial_geometry() -> None:
     start = random_gaussians([TILTED], 9, np.random.default_rng(2), opacity=0.3)
     weights = start.geometry()
     np.testing.assert_allclose(weights["position"].T, start.position_m, rtol=FLOAT32_EPS)
@@ -302,7 +306,7 @@ def test_geometry_of_the_start() -> None:
     np.testing.assert_allclose(sigmoid(start.opacity_logit()), 0.3, rtol=FLOAT32_EPS)
 
 
-def test_points_give_the_gap_to_their_neighbours() -> None:
+def test_initial_scale_is_the_gap_to_neighbours() -> None:
     """A square grid's nearest three points lie one step away (at a corner two, and one across)."""
     grid = np.stack(np.meshgrid(np.arange(5), np.arange(5), [2.0], indexing="ij"), axis=-1).reshape(-1, 3) * 0.5
     start = gaussians_from_points(grid, 25, np.random.default_rng(0))
@@ -313,7 +317,7 @@ def test_points_give_the_gap_to_their_neighbours() -> None:
     np.testing.assert_allclose(start.scale_m[order], expected)
 
 
-def test_chosen_points_are_points_of_the_cloud() -> None:
+def test_initial_positions_are_points_of_the_cloud() -> None:
     cloud = np.random.default_rng(3).normal(size=(50, 3))
     first = gaussians_from_points(cloud, 10, np.random.default_rng(4))
     assert len({tuple(p) for p in first.position_m} & {tuple(p) for p in cloud}) == 10
@@ -333,7 +337,7 @@ def test_chosen_points_are_points_of_the_cloud() -> None:
         (np.where(np.arange(27).reshape(9, 3) == 13, np.nan, 1.0), 4, "row 5: not a number"),
     ],
 )
-def test_point_clouds_that_cannot_be_used(points: np.ndarray, count: int, message: str) -> None:
+def test_invalid_point_clouds_are_refused(points: np.ndarray, count: int, message: str) -> None:
     with pytest.raises(InputError, match=message):
         gaussians_from_points(points, count, np.random.default_rng(0))
 
@@ -358,7 +362,7 @@ def test_points_are_read(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(points, POINTS, rtol=FLOAT32_EPS)
 
 
-def test_a_meshs_vertices_are_points(tmp_path: Path) -> None:
+def test_mesh_vertices_are_read_as_points(tmp_path: Path) -> None:
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     box.export(tmp_path / "box.obj")
     points = read_points(tmp_path / "box.obj")
@@ -376,7 +380,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_files_without_points(name: str, tmp_path: Path) -> None:
+def test_files_without_points_are_refused(name: str, tmp_path: Path) -> None:
     content, message = BAD_FILES[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
@@ -395,13 +399,13 @@ def test_files_without_points(name: str, tmp_path: Path) -> None:
         ({"points": np.where(POINTS == -7.75, np.inf, POINTS)}, "point 3: not finite"),
     ],
 )
-def test_arrays_without_points(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_arrays_without_points_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "cloud.npz", **arrays)
     with pytest.raises(InputError, match=message):
         read_points(tmp_path / "cloud.npz")
 
 
-def test_missing_and_damaged_files(tmp_path: Path) -> None:
+def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_points(tmp_path / "none.ply")
     write_points(tmp_path / "cloud.ply")

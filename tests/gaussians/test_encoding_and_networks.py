@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.gaussians import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.encoding import encode, encoded_size, telling_scale
+from wrf_mi.gaussians.encoding import encode, encoded_size, unambiguous_scale
 from wrf_mi.gaussians.network import dense, dense_of_pairs, init_layer, linear, relu
 
 FLOAT64_TOLERANCE = 1e-9
@@ -50,7 +50,7 @@ def paper_encoding(t: np.ndarray, octaves: int) -> np.ndarray:
     octaves=st.integers(1, 10),
     scale_m=st.floats(0.1, 20),
 )
-def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float) -> None:
+def test_encoding_matches_the_formula_of_the_paper(points: np.ndarray, octaves: int, scale_m: float) -> None:
     encoded = encode(doubles(points), octaves, scale_m).numpy()
     assert encoded.shape == (encoded_size(octaves), points.shape[1])
     # The tolerance grows with the number of turns, whose rounding NumPy's sine sees.
@@ -65,14 +65,14 @@ def test_encoding_is_the_papers(points: np.ndarray, octaves: int, scale_m: float
     axis=st.integers(0, 2),
     octaves=st.integers(1, 10),
 )
-def test_telling_scale_leaves_no_two_positions_alike(
+def test_unambiguous_scale_separates_all_positions(
     extent_m: np.ndarray, origin_m: np.ndarray, axis: int, octaves: int
 ) -> None:
     """Two of a room's positions a multiple of two metres apart are one at 1 m a unit, whatever the octaves."""
     ends = origin_m + np.stack([np.zeros(3), extent_m])
     twins = np.stack([ends[0], ends[0]])
     twins[1, axis] += 2.0 * np.floor(extent_m[axis] / 2.0)
-    scale = telling_scale(ends, 1.0)
+    scale = unambiguous_scale(ends, 1.0)
     alike = np.ptp(encode(doubles(twins.T), octaves, 1.0).numpy(), axis=1).max()
     assert alike < FLOAT64_TOLERANCE
     told = np.ptp(encode(doubles(twins.T), octaves, scale).numpy(), axis=1).max()
@@ -82,7 +82,7 @@ def test_telling_scale_leaves_no_two_positions_alike(
     assert scale == 1.0 or scale <= extent_m.max()
 
 
-def test_float32_keeps_its_digits_far_out() -> None:
+def test_encoding_in_float32_is_accurate_at_large_distances() -> None:
     """At 100 m the tenth octave has 25,600 whole turns: taken off exactly, they cost no digit."""
     points = np.float32(np.random.default_rng(0).uniform(90, 100, (3, 500)))
     encoded = encode(to_tensor(points), 10, 1.0).numpy()
@@ -94,7 +94,7 @@ def test_encoding_of_zero_octaves_is_empty() -> None:
 
 
 @pytest.mark.gradcheck
-def test_encodings_slope() -> None:
+def test_gradient_of_the_encoding() -> None:
     """Removing whole turns leaves the derivative as it is: d sin(2^k pi x / s) / dx = 2^k pi / s cos."""
     x = np.random.default_rng(1).uniform(-5, 5, (3, 7))
     points = doubles(x)
@@ -122,7 +122,7 @@ def draw_layer(name: str, inputs: dict[str, int], outputs: int) -> tuple[dict[st
 
 
 @pytest.mark.parametrize("with_hidden", [False, True])
-def test_layer_in_parts_is_the_product_with_the_concatenation(with_hidden: bool) -> None:
+def test_layer_in_parts_equals_layer_of_the_concatenation(with_hidden: bool) -> None:
     sizes = {"position": 60, "transmitter": 60} | ({"hidden": 23} if with_hidden else {})
     weights, params = draw_layer("layer", sizes, 11)
     rng = np.random.default_rng(6)
@@ -144,14 +144,14 @@ def test_linear_and_relu() -> None:
     x = np.random.default_rng(7).standard_normal((9, 6))
     out = linear(params, "layer", doubles(x)).numpy()
     np.testing.assert_allclose(out, weights["layer.hidden"] @ x + weights["layer.bias"], rtol=PRODUCT_TOLERANCE)
-    np.testing.assert_array_equal(relu(doubles(out)).numpy(), np.maximum(out, 0))
     np.testing.assert_array_equal(dense(params, "layer", doubles(x)).numpy(), np.maximum(out, 0))
+    np.testing.assert_array_equal(relu(doubles(out)).numpy(), np.maximum(out, 0))
 
 
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("with_hidden", [False, True])
-def test_slope_of_a_hidden_layer_is_that_of_its_parts(batch: int, with_hidden: bool) -> None:
+def test_gradient_of_a_hidden_layer_matches_its_parts(batch: int, with_hidden: bool) -> None:
     """The derivative that sums rows against the one of Dr.Jit, of the same sum written out."""
     n, rng = 5, np.random.default_rng(11)
     _, params = draw_layer("layer", {"position": 4, "transmitter": 3} | ({"hidden": 2} if with_hidden else {}), 7)
@@ -179,7 +179,7 @@ def test_slope_of_a_hidden_layer_is_that_of_its_parts(batch: int, with_hidden: b
         np.testing.assert_allclose(ours, expected, rtol=PRODUCT_TOLERANCE, atol=PRODUCT_TOLERANCE)
 
 
-def test_layers_start_as_he_et_al() -> None:
+def test_initial_weights_have_the_deviation_of_he_et_al() -> None:
     """Normal weights of deviation sqrt(2 / inputs), the inputs of all parts together; zero bias."""
     weights = init_layer("layer", {"hidden": 256, "position": 60, "transmitter": 60}, 256, np.random.default_rng(8))
     for part in ("hidden", "position", "transmitter"):
@@ -196,7 +196,7 @@ def shapes(weights: dict[str, np.ndarray], prefix: str) -> dict[str, tuple[int, 
     return {k.removeprefix(prefix): v.shape for k, v in weights.items() if k.startswith(prefix) and "bias" not in k}
 
 
-def test_wrf_gs_is_the_papers() -> None:
+def test_wrf_gs_has_the_layers_of_the_paper() -> None:
     """Section IV-B: eight layers of 128 see the centre; 128 and 64 see features and transmitter (L = 9: 60 each)."""
     weights = start(WrfGs())
     attenuation = {"0.position": (128, 60)} | {f"{i}.hidden": (128, 128) for i in range(1, 8)}
@@ -210,7 +210,7 @@ def test_wrf_gs_is_the_papers() -> None:
     assert set(WrfGs.per_gaussian) == {name for name in weights if "." not in name}
 
 
-def test_wrf_gs_plus_is_the_papers() -> None:
+def test_wrf_gs_plus_has_the_layers_of_the_paper() -> None:
     """Section V-A: eight layers of 256, the input again at the fifth; three heads without activation."""
     weights = start(WrfGsPlus())
     layers = {f"{i}.hidden": (256, 256) for i in range(1, 8)}
@@ -221,7 +221,7 @@ def test_wrf_gs_plus_is_the_papers() -> None:
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_every_weight_has_a_bias_and_takes_part(model: str) -> None:
+def test_every_weight_has_a_bias_and_a_gradient(model: str) -> None:
     """No matrix is left out of the network: each one's gradient differs from zero."""
     field, weights = FIELDS[model](), start(FIELDS[model](), seed=3)
     layers = {name.rsplit(".", 1)[0] for name in weights if "." in name}
@@ -302,7 +302,7 @@ def test_signals_are_signed(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
-def test_no_octaves_for_the_transmitter(model: str) -> None:
+def test_field_without_transmitter_octaves_is_constant(model: str) -> None:
     """Zero octaves leave the transmitter out: all its positions see the same field."""
     field = FIELDS[model](encoding=Encoding(tx_octaves=0))
     params = {k: to_tensor(v) for k, v in start(field, 5).items()}
@@ -312,7 +312,7 @@ def test_no_octaves_for_the_transmitter(model: str) -> None:
         np.testing.assert_array_equal(part.numpy()[:5], part.numpy()[5:])
 
 
-def test_a_factorised_field_needs_octaves_for_the_transmitter() -> None:
+def test_factorised_field_refuses_zero_transmitter_octaves() -> None:
     """It has nothing else to tell one transmitter from another."""
     with pytest.raises(InputError, match=r"encoding\.tx_octaves: 0 leaves factorised nothing to see"):
         FIELDS["factorised"](encoding=Encoding(tx_octaves=0))

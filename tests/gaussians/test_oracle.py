@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from wrf_mi.core import Receiver, azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
+from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from wrf_mi.gaussians.oracle import (
     blend_alpha,
     blend_product,
     covariance_matrix,
     footprint,
-    paper_jacobian_covariance,
     project,
     render,
     tangent_basis,
@@ -29,6 +30,20 @@ SAMPLED = 0.02
 
 ORIGIN = Receiver("origin", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 PLAIN = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+def paper_jacobian_covariance(centre_m: ArrayLike, covariance_m2: ArrayLike, height: int, width: int) -> FloatArray:
+    """The papers' J Sigma J^T [n, 2, 2] of the equirectangular map at centres [n, 3], in pixels squared, column first.
+
+    Its column variance grows as 1 / cos^2(elevation). Source: WRF-GS+, the projection model; Zwicker et al., "EWA
+    splatting" (2002).
+    """
+    x, y, z = np.moveaxis(np.asarray(centre_m, float), -1, 0)
+    ground, distance = np.hypot(x, y), np.sqrt(x * x + y * y + z * z)
+    longitude = np.stack([-y, x, np.zeros_like(x)], axis=-1) / ground[:, None] ** 2
+    latitude = np.stack([-x * z, -y * z, ground**2], axis=-1) / (ground * distance**2)[:, None]
+    jacobian = np.stack([longitude * width / (2 * np.pi), latitude * height / (np.pi / 2)], axis=-2)
+    return jacobian @ np.asarray(covariance_m2, float) @ np.swapaxes(jacobian, -1, -2)
 
 
 def at(azimuth_deg, elevation_deg):
@@ -83,7 +98,7 @@ def test_footprint_is_cut_at_three_standard_deviations():
         assert footprint(seen, 0, at(azimuth, 0)) == pytest.approx(expected, abs=EXACT)
 
 
-def test_each_axis_of_a_gaussian_reaches_its_own_way():
+def test_footprint_axes_follow_the_gaussian_axes():
     """At azimuth 90 the eastward axis is -x and the zenithward one z; the radial one (y) does not matter."""
     seen = single([0, 1, 0], 2.0, [0.2, 5.0, 0.06])
     expected = np.diag([0.1**2, 0.03**2]) + LOW_PASS_RAD**2 * np.eye(2)
@@ -104,14 +119,14 @@ def test_covariance_is_that_of_sampled_directions():
     assert np.cov(plane.T) == pytest.approx(expected, abs=SAMPLED * expected.max())
 
 
-def test_nothing_behind_a_large_gaussian_is_reached():
+def test_large_gaussian_does_not_reach_behind():
     directions = pixel_directions(30, 60)
     seen = single([1, 0, 0], 1.0, 50.0)
     reached = footprint(seen, 0, directions) > 0
     assert np.array_equal(reached, directions[..., 0] > MIN_COSINE)
 
 
-def test_gaussian_nearer_than_the_limit_is_skipped_and_a_farther_one_is_not():
+def test_only_gaussians_nearer_than_the_limit_are_skipped():
     near, far = single([0, 0, 1], NEAR_M * 0.999, 1.0), single([0, 0, 1], NEAR_M * 1.001, 1.0)
     assert len(near.order) == 0
     assert not footprint(near, 0, pixel_directions(10, 10)).any()
@@ -125,7 +140,7 @@ def test_centre_below_the_horizon_reaches_above_it():
     assert image.max() == image[0, 30] > 0.8
 
 
-def test_gaussian_at_the_zenith_is_round_and_near_it_reaches_across():
+def test_footprint_is_round_at_the_zenith_and_crosses_it_nearby():
     overhead = footprint(single([0, 0, 1], 1.0, 0.1), 0, pixel_directions(90, 360))
     assert np.ptp(overhead, axis=1) == pytest.approx(0, abs=EXACT)
     beyond = footprint(single(at(10, 88), 1.0, 0.1), 0, at(190, 88))
@@ -144,7 +159,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @settings(max_examples=25, deadline=None)
 @given(seeds, st.integers(1, 35))
-def test_turning_the_field_about_the_normal_shifts_the_columns(seed, columns):
+def test_rotation_about_the_normal_shifts_the_columns(seed, columns):
     rng = np.random.default_rng(seed)
     field, opacity = random_field(rng, 6), rng.uniform(0, 1, 6)
     directions = pixel_directions(9, 36)
@@ -162,7 +177,7 @@ def assert_same(a, b):
 
 @settings(max_examples=25, deadline=None)
 @given(seeds)
-def test_moving_field_and_receiver_together_changes_nothing(seed):
+def test_render_is_invariant_to_rigid_motion_of_field_and_receiver(seed):
     rng = np.random.default_rng(seed)
     field, delta = random_field(rng, 6), random_delta(rng, 6)
     quaternion = rng.standard_normal(4)
@@ -177,7 +192,7 @@ def test_moving_field_and_receiver_together_changes_nothing(seed):
 
 @settings(max_examples=25, deadline=None)
 @given(seeds)
-def test_storage_order_does_not_matter_even_at_equal_depth(seed):
+def test_render_is_invariant_to_storage_order_at_equal_depth(seed):
     rng = np.random.default_rng(seed)
     field, opacity = random_field(rng, 6), rng.uniform(0, 1, 6)
     field["mean_m"][3:] = [[0, 0, 2], [0, 2, 0], [2, 0, 0]]
@@ -205,7 +220,7 @@ def test_field_is_linear_in_the_signal(seed, factor, product):
     assert image(field["signal"] + factor * second) == pytest.approx(expected, abs=1e2 * EXACT)
 
 
-def test_blending_two_gaussians_by_hand():
+def test_blending_of_two_gaussians_matches_the_formula():
     g, s = np.array([0.8, 0.5]), np.array([1 + 2j, -3j])
     delta, opacity = np.array([0.5j, 0.3]), np.array([0.9, 0.4])
     assert blend_product(g, s, delta) == pytest.approx(0.8 * s[0] + 0.5 * s[1] * (1 - 0.8 * (1 - 0.5j)), abs=EXACT)
@@ -214,7 +229,7 @@ def test_blending_two_gaussians_by_hand():
 
 @settings(max_examples=50, deadline=None)
 @given(seeds)
-def test_the_two_blends_meet_where_they_must(seed):
+def test_blending_rules_agree_in_limits(seed):
     rng = np.random.default_rng(seed)
     g, s, opacity = rng.uniform(0, 1, (7, 4)), rng.standard_normal(7) + 1j, rng.uniform(0, 1, 7)
     # Attenuation zero is opacity one; attenuation one hides nothing; full footprints are the paper's equations.
@@ -228,7 +243,7 @@ def test_the_two_blends_meet_where_they_must(seed):
     assert blend_alpha(g, np.full(7, 2j), opacity) == pytest.approx(2j * covered, abs=EXACT)
 
 
-def test_render_wants_exactly_one_way_of_blending():
+def test_render_requires_exactly_one_blending_rule():
     field = random_field(np.random.default_rng(0), 2)
     with pytest.raises(TypeError, match="either"):
         render(**field, receiver=ORIGIN, directions=pixel_directions(2, 2))
@@ -255,7 +270,7 @@ def test_papers_jacobian_is_the_derivative_of_the_pixel_coordinates():
 
 
 @pytest.mark.parametrize("elevation_deg", [0, 2, 60, 89])
-def test_papers_covariance_is_ours_with_the_azimuth_stretched(elevation_deg):
+def test_covariance_of_the_paper_is_stretched_in_azimuth(elevation_deg):
     """Equal in pixels at the horizon; the azimuth's standard deviation is 1 / cos(elevation) times ours above."""
     rng = np.random.default_rng(2)
     mean = 3 * at(50, elevation_deg)[None]
@@ -286,7 +301,7 @@ def departure(elevation_deg, sigma_rad):
     return np.abs(ours - paper_footprint((100, elevation_deg), 2.0, sigma_rad, directions)).max()
 
 
-def test_both_forms_agree_to_first_order_at_the_horizon():
+def test_covariances_agree_to_first_order_at_the_horizon():
     sizes = np.radians([4.0, 2.0, 1.0])
     departures = np.array([departure(0, sigma) for sigma in sizes])
     assert departures[-1] < 1e-3
@@ -294,7 +309,7 @@ def test_both_forms_agree_to_first_order_at_the_horizon():
     assert departures[:-1] / departures[1:] == pytest.approx(4, rel=0.1)
 
 
-def test_both_forms_differ_near_the_zenith_as_the_map_does():
+def test_covariances_differ_near_the_zenith_like_the_map():
     """Two degrees from the zenith, 180 columns away is 4 degrees away; the paper's plane makes it 180 / 86 widths."""
     sigma = np.radians(3)
     across = at(280, 88)

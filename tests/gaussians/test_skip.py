@@ -1,4 +1,4 @@
-"""What predictions leave out: each bound on the error holds, and each switch saves something."""
+"""Skipped parts of predictions: each bound on the error holds, and each switch skips something."""
 
 from __future__ import annotations
 
@@ -16,21 +16,13 @@ from wrf_mi.gaussians import oracle
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.footprint_constants import CUTOFF
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.skip import Skip, behind, negligible
+from wrf_mi.gaussians.skip import Skip, negligible, signal_bounds
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
 
 pytestmark = pytest.mark.all_threads
 
 ROUNDING = 1e-12
 """Float64 sums of some tens of numbers near one."""
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32), st.booleans())
-def test_boxes_change_nothing(seed: int, product: bool) -> None:
-    """Below the horizon, behind the receiver, across the seam: what is in no list reaches no pixel of its tile."""
-    gaussians = fields(seed, product)
-    np.testing.assert_allclose(image(gaussians, Skip()), image(gaussians, Skip(boxes=False)), atol=ROUNDING)
 
 
 @settings(max_examples=25, deadline=None)
@@ -64,7 +56,7 @@ def walled(product: bool) -> tuple[Gaussians, Any]:
 
 
 @pytest.mark.parametrize("product", [False, True])
-def test_early_end_evaluates_nothing_behind_an_opaque_wall(product: bool) -> None:
+def test_early_stop_evaluates_nothing_behind_an_opaque_wall(product: bool) -> None:
     """Opacities and attenuations that are not numbers do not reach the image from there."""
     gaussians, wall = walled(product)
     exact, early = image(gaussians, Skip()), image(gaussians, Skip(early_stop_tolerance=1e-3))
@@ -80,8 +72,8 @@ def test_early_end_evaluates_nothing_behind_an_opaque_wall(product: bool) -> Non
 
 @pytest.mark.parametrize("product", [False, True])
 @pytest.mark.parametrize("skip", [Skip(early_stop_tolerance=1e-3), Skip(contribution=1e-3)])
-def test_skips_hide_no_signal_that_is_not_a_number(product: bool, skip: Skip) -> None:
-    """What it can change has no bound, so that neither skip may leave it out."""
+def test_skips_keep_signals_that_are_not_finite(product: bool, skip: Skip) -> None:
+    """Their effect has no bound, so neither skip applies."""
     gaussians, wall = walled(product)
     gaussians.signal = [dr.select(wall, s, np.nan) for s in gaussians.signal]
     exact = np.isfinite(image(gaussians, Skip()))
@@ -89,7 +81,7 @@ def test_skips_hide_no_signal_that_is_not_a_number(product: bool, skip: Skip) ->
     np.testing.assert_array_equal(np.isfinite(image(gaussians, skip)), exact)
 
 
-def test_early_end_gives_no_gradients() -> None:
+def test_early_stop_refuses_gradients() -> None:
     gaussians = fields(0, False)
     dr.enable_grad(gaussians.signal)
     with pytest.raises(ValueError, match="give no gradients"):
@@ -97,7 +89,7 @@ def test_early_end_gives_no_gradients() -> None:
 
 
 @pytest.mark.parametrize("product", [False, True])
-def test_negligible_ones_are_found(product: bool) -> None:
+def test_negligible_gaussians_are_found(product: bool) -> None:
     """Gaussians that neither send nor hide are left out, however many; the others stay."""
     gaussians = fields(5, product)
     idle = np.arange(BATCH * COUNT) % 4 == 1
@@ -112,20 +104,19 @@ def test_negligible_ones_are_found(product: bool) -> None:
         gaussians.opacity = dr.select(mask, 1e-6, gaussians.opacity)
     footprints = project(gaussians, POSE)
     order = depth_order(footprints.depth, gaussians.position)
-    _, beyond = behind(gaussians.signal, footprints.visible, order, BATCH, product)
-    found = negligible(gaussians.signal, beyond, BATCH, 1e-3, gaussians.opacity, gaussians.attenuation).numpy()
+    _, beyond = signal_bounds(gaussians.signal, footprints.visible, order, BATCH, product)
+    found = negligible(gaussians.signal, beyond, BATCH, 1e-3, gaussians.blending).numpy()
     assert found[idle].all()
     assert found[~idle].mean() < 0.2
 
 
-def test_what_is_behind_is_bound() -> None:
-    """M against its definition in NumPy."""
+def test_signal_bounds_match_numpy() -> None:
     gaussians = fields(6, False)
     footprints = project(gaussians, POSE)
     order = depth_order(footprints.depth, gaussians.position)
     strength = np.hypot(*(s.numpy() for s in gaussians.signal)) * footprints.visible.numpy()
     for product, reduce in ((False, np.max), (True, np.sum)):
-        own, beyond = (a.numpy() for a in behind(gaussians.signal, footprints.visible, order, BATCH, product))
+        own, beyond = (a.numpy() for a in signal_bounds(gaussians.signal, footprints.visible, order, BATCH, product))
         for b in range(BATCH):
             there = b * COUNT + order.numpy()
             for k, i in enumerate(there):
@@ -133,14 +124,12 @@ def test_what_is_behind_is_bound() -> None:
                 np.testing.assert_allclose(beyond[i], reduce(np.append(strength[there[k + 1 :]], 0)), rtol=1e-9)
 
 
-def test_boxes_shorten_lists() -> None:
+def test_lists_hold_only_gaussians_near_the_tile() -> None:
     gaussians = fields(1, False)
     footprints = project(gaussians, POSE)
     order = depth_order(footprints.depth, gaussians.position)
-    plane = perception_plane(*SIZE, Float64)
-    lengths = [build_lists(footprints, order, plane, BATCH, by_box).length.numpy().mean() for by_box in (True, False)]
-    assert lengths[0] < 0.7 * lengths[1]
-    assert lengths[1] == COUNT - 1  # all but the one that contains the receiver
+    length = build_lists(footprints, order, perception_plane(*SIZE, Float64), BATCH).length
+    assert length.numpy().mean() < 0.7 * COUNT
 
 
 @settings(max_examples=10, deadline=None)

@@ -91,7 +91,7 @@ def through_oracle(gaussians: Any, b: int, height: int, width: int) -> np.ndarra
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
 @pytest.mark.parametrize("size", [(90, 360), (23, 61)])
 @pytest.mark.parametrize("single", [True, False])
-def test_splat_is_the_oracle(model: str, size: tuple[int, int], single: bool) -> None:
+def test_splat_matches_the_oracle(model: str, size: tuple[int, int], single: bool) -> None:
     tensor = mi.TensorXf if single else Tensor64
     batch, floats = 2, dr.array_t(tensor)
     field, params = make(model, 60, tensor)
@@ -132,7 +132,7 @@ def test_seam_and_zenith() -> None:
         np.testing.assert_allclose(im.numpy().reshape(90, 360), 0.35 * footprint, atol=1e-6)
 
 
-def test_order_of_storage_does_not_matter() -> None:
+def test_splat_is_invariant_to_storage_order() -> None:
     """Equal depths too: ties go by position."""
     field, params = make("wrf-gs+", 40, Tensor64)
     rng = np.random.default_rng(3)
@@ -149,7 +149,7 @@ def test_order_of_storage_does_not_matter() -> None:
     np.testing.assert_allclose(images[0], images[1], atol=1e-12)
 
 
-def test_nothing_to_see_is_dark() -> None:
+def test_splat_without_visible_gaussians_is_zero() -> None:
     """Gaussians far below the horizon reach no pixel; nor does one that contains the receiver."""
     field, params = make("wrf-gs", 5, mi.TensorXf)
     below = RECEIVER.position_m - RECEIVER.to_world @ np.array([0.0, 0.0, 5.0])
@@ -168,7 +168,7 @@ def test_nothing_to_see_is_dark() -> None:
 
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
-def test_gradients_are_finite_differences(model: str) -> None:
+def test_gradients_match_finite_differences(model: str) -> None:
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it change.
     field, params = make(model, 30, Tensor64, position_octaves=1, position_scale_m=1e12)
     rng = np.random.default_rng(1)

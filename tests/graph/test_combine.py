@@ -11,7 +11,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing.traced_field import TracedPaths
 
 # isort: split
@@ -25,7 +25,7 @@ from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import magnitude, power, scaled
-from wrf_mi.graph.learned import hemisphere_pair
+from wrf_mi.graph.evaluations import hemisphere_pair
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
 
@@ -75,7 +75,7 @@ def image(h: np.ndarray) -> np.ndarray:
     return h @ array_response(ELEMENTS_M, DIRECTIONS, FREQUENCY_HZ).conj().T
 
 
-def test_sum_over_paths_is_spherical_waves() -> None:
+def test_path_sum_matches_spherical_waves() -> None:
     made, found = paths()
     re, im = path_sum(made, Ports(ELEMENTS_M, np.full(len(ELEMENTS_M), FREQUENCY_HZ)))
     np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(2, -1), signals(found, ELEMENTS_M), atol=DOUBLE)
@@ -109,7 +109,7 @@ def test_array_receiver(how: Any) -> None:
     np.testing.assert_allclose(alone, np.abs(image(h[1])).ravel(), atol=ROOT)
 
 
-def test_a_plane_wave_learned_is_one_traced() -> None:
+def test_learned_plane_wave_equals_traced_plane_wave() -> None:
     """A learned field that is one pixel of the right strength reaches the array as a traced path from afar does."""
     pixel, far = 7 * WIDTH + 11, 1e6
     weight = solid_angles(HEIGHT, WIDTH)[pixel]
@@ -213,7 +213,7 @@ def test_weights_and_scaling() -> None:
     np.testing.assert_allclose(scaled(Float64(values.ravel()), 20).numpy().reshape(values.shape), minmax_scale(values))
 
 
-def test_without_sides() -> None:
+def test_receivers_refuse_two_absent_sides() -> None:
     with pytest.raises(ValueError, match="0 sides"):
         magnitude(None, None, "coherent")
     field, _ = learned(1, 4)
@@ -221,7 +221,7 @@ def test_without_sides() -> None:
         power(field, field, "sum")  # type: ignore[arg-type]
 
 
-def test_the_full_sphere_sees_what_is_below() -> None:
+def test_full_sphere_includes_directions_below_the_horizon() -> None:
     """One Gaussian below the horizon: on the pixel of its direction, dark in the upper half."""
     target = (HEIGHT * WIDTH) + 5 * WIDTH + 13
     directions = hemisphere_pair(HEIGHT, WIDTH)

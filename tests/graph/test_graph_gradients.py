@@ -1,5 +1,4 @@
-"""Gradients of both sides of a physics model in one graph by every kind of parameter, against differences in
-float64."""
+"""Gradients of Gaussians and paths in one graph by every kind of parameter, against differences in float64."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ import mitsuba as mi
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing import TraceOptions
 
 Float64 = dr.float64_array_t(mi.Float)
@@ -31,10 +30,9 @@ TOLERANCE = 1e-6
 """Error of a derivative along a direction of standard normal numbers, relative to the gradient's norm: the standard
 deviation of such derivatives. Central differences in float64."""
 ROUNDING = 2e-15
-"""Of the terms that the loss sums, relative to the sum of their sizes: over the step, what differences add to that."""
+"""Rounding of the terms of the loss, relative to the sum of their magnitudes; differences divide it by the step."""
 STEP = 1e-6
 """So small that no pixel crosses a footprint's cut-off, where the field jumps."""
-DIRECTIONS = 3
 HEIGHT, WIDTH, BATCH = 12, 40, 2
 ELEMENTS_M = planar_array(3, 3, 0.16)
 
@@ -52,14 +50,14 @@ KINDS = (
     *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),
     *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal"),
 )
-"""Of parameters; beside them the field has networks."""
+"""Kinds of parameters; the field has networks, too."""
 
 
-@pytest.fixture(scope="module", params=["named", "surface"])
+@pytest.fixture(scope="module")
 def both(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
-    """A traced side with reflections and transmissions, a learned one, and all their parameters, none round."""
+    """A traced side with reflections and transmissions, a learned side, and generic values of all their parameters."""
     rng = np.random.default_rng(5)
     scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
     own = receiver((30, 20, 10))
@@ -96,7 +94,9 @@ def terms_of(
 
 
 @pytest.mark.gradcheck
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    ("both", "name"), [*(("named", name) for name in MODELS), ("surface", "csi")], indirect=["both"]
+)
 def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, dict[str, Any]]) -> None:
     model, rng = MODELS[name], np.random.default_rng(2)
     size = BATCH * int(np.prod(model.shape))
@@ -110,13 +110,12 @@ def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, 
     rounding = ROUNDING * float(np.abs(terms(parameters).numpy()).sum()) / STEP
     errors = {}
     for n, p in parameters.items():
-        for k in range(DIRECTIONS):
-            direction = rng.standard_normal(p.shape)
-            ends = [terms(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)}).numpy().sum() for s in (1, -1)]
-            numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[n] * direction).sum())
-            errors[n, k] = abs(numeric - analytic) / (TOLERANCE * np.linalg.norm(gradient[n]) + rounding)
+        direction = rng.standard_normal(p.shape)
+        ends = [terms(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)}).numpy().sum() for s in (1, -1)]
+        numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[n] * direction).sum())
+        errors[n] = abs(numeric - analytic) / (TOLERANCE * np.linalg.norm(gradient[n]) + rounding)
     assert all(any(fnmatchcase(n, kind) for n in gradient) for kind in KINDS)
-    # Differences see every slope but a metal's, which waves do not enter.
-    drowned = {n for n, slope in gradient.items() if rounding > 0.01 * np.linalg.norm(slope)}
-    assert drowned <= {"material.itu_metal.permittivity", "material.itu_metal.conductivity"}
+    # Rounding hides only slopes of a metal, which waves do not enter.
+    hidden = {n for n, slope in gradient.items() if rounding > 0.01 * np.linalg.norm(slope)}
+    assert hidden <= {"material.itu_metal.permittivity", "material.itu_metal.conductivity"}
     assert max(errors.values()) < 1, errors

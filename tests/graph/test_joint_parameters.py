@@ -1,4 +1,4 @@
-"""What training finds of a known truth: materials, gains, poses; what is recorded again, and what stays."""
+"""Recovery of known materials, gains and poses by training; recording and resumption of steps."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ QUICK = ("optimiser.warm_up=10", "optimiser.ema_decay=0.9", "holdout_steps_fract
 
 
 def rooms(folder: Path) -> tuple[Any, Any]:
-    """A room with a metal ceiling, and what is known of it: walls, with a wrong idea of concrete."""
+    """A room with a metal ceiling, and its walls alone, with a wrong permittivity of concrete."""
     known = room(folder / "known", WALLS)
     known.radio_materials["itu_concrete"].relative_permittivity = START_PERMITTIVITY
     return room(folder / "whole", {**WALLS, **CEILING}), known
 
 
 def record_of(task: str, scene: Any, receivers: tuple[Receiver, ...], tx: np.ndarray) -> Record:
-    """Observations traced by Sionna RT; nothing of the graph is in them."""
+    """Observations traced by Sionna RT, independent of the graph."""
     rows, count = len(tx), len(receivers)
     shape = {"spectrum": (30, 120), "rssi": (), "csi": (16, 4)}[task]
     empty = np.zeros((count, rows, *shape), np.complex64 if task == "csi" else np.float32)
@@ -74,7 +74,7 @@ def moved(own: Receiver, shift_m: Any, turn_rad: Any) -> Receiver:
 
 
 def test_material_gain_and_pose_are_recovered(tmp_path: Path) -> None:
-    """Channels of an array that stands 3 cm off, is turned by 2 degrees and has a gain, between other walls."""
+    """Channels of an array displaced by 3 cm, turned by 2 degrees, with a gain, between other walls."""
     own, shift_m, turn_rad = receiver(), np.array([0.02, -0.015, 0.01]), np.radians([0.5, -1.0, 2.0])
     tx = np.random.default_rng(0).uniform([1, 1, 0.8], [5, 4, 2.4], (20, 3))
     scene = room(tmp_path, WALLS)
@@ -95,7 +95,7 @@ def test_material_gain_and_pose_are_recovered(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi"])
-def test_a_gain_starts_at_that_of_the_observations(task: str, tmp_path: Path) -> None:
+def test_gain_starts_at_the_level_of_the_observations(task: str, tmp_path: Path) -> None:
     scene = room(tmp_path, WALLS)
     record = record_of(task, scene, (receiver(),), transmitters(8))
     record = record if task == "spectrum" else replace(record, observation=record.observation + 32)
@@ -111,7 +111,7 @@ def test_a_gain_starts_at_that_of_the_observations(task: str, tmp_path: Path) ->
 
 
 def test_patterns_are_recovered(tmp_path: Path) -> None:
-    """Strengths of a transmitter whose pattern turns with its heading, at receivers with patterns of their own."""
+    """Powers of a transmitter whose pattern turns with its heading, at receivers with different patterns."""
     scene, rng = room(tmp_path, WALLS), np.random.default_rng(7)
     tx, heading = rng.uniform([1, 1, 0.8], [5, 4, 2.4], (80, 3)), rng.uniform(-np.pi, np.pi, 80)
     receivers = receiver(), Receiver("tag", np.array([1.0, 4.0, 2.0]), receiver().orientation_xyzw)
@@ -137,11 +137,11 @@ def test_patterns_are_recovered(tmp_path: Path) -> None:
         predict(tx[:2])
 
 
-def test_permittivity_is_recovered_beside_gaussians(tmp_path: Path) -> None:
-    """The Gaussians take the echo of the ceiling, which the mesh lacks."""
+def test_permittivity_is_recovered_in_joint_training(tmp_path: Path) -> None:
+    """The Gaussians model the reflection at the ceiling, which the mesh lacks."""
     whole, known = rooms(tmp_path)
     record = record_of("csi", whole, (receiver(),), transmitters(28))
-    own = (*ONE_REFLECTION, *QUICK, "batch=20", "traced.material=0.05", "initial.gaussians=40", "steps=400")
+    own = (*ONE_REFLECTION, *QUICK, "batch=20", "traced.material=0.05", "initial.gaussians=40", "steps=150")
     config = with_settings(default_config("csi"), [*own, "network.width=32", "network.layers=2"])
     trainer = Trainer(record, all_of(record, 20), config, scene=known)
     trainer.run()
@@ -160,7 +160,7 @@ def small(tmp_path: Path, *settings: str) -> Trainer:
 
 
 def test_receivers_share_materials_and_steps_are_recorded_once(tmp_path: Path) -> None:
-    """Later batches and rates replay what was recorded."""
+    """Later batches and rates replay recorded steps."""
     trainer = small(tmp_path)
     assert {PERMITTIVITY, "receiver.array.gain", "receiver.tag.gain"} <= set(trainer.state.adam)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
@@ -175,7 +175,7 @@ def test_receivers_share_materials_and_steps_are_recorded_once(tmp_path: Path) -
     assert len(recorded) == 2
 
 
-def test_a_step_that_breaks_is_not_taken(tmp_path: Path) -> None:
+def test_step_with_non_finite_gradient_is_not_taken(tmp_path: Path) -> None:
     trainer = small(tmp_path)
     trainer.run(stop=stop_after(3))
     before = trainer.state.params()
@@ -188,8 +188,8 @@ def test_a_step_that_breaks_is_not_taken(tmp_path: Path) -> None:
         np.testing.assert_array_equal(values, before[name], err_msg=name)
 
 
-def test_the_documented_training_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    """As it stands, but for the number of steps."""
+def test_documented_training_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """With fewer steps."""
     page = (Path(__file__).parents[2] / "docs" / "joint.md").read_text(encoding="utf-8")
     (script,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert script.count('"steps=300"') == 1
@@ -211,12 +211,12 @@ def test_materials_are_replaced_for_a_block_only(tmp_path: Path) -> None:
         pass
 
 
-def test_a_resumed_fit_goes_on_with_the_paths_that_it_had(tmp_path: Path) -> None:
-    """Paths are searched again where a receiver has moved by a quarter of a wavelength; a resumed fit does not know."""
+def test_resumed_fit_keeps_its_paths(tmp_path: Path) -> None:
+    """Paths are searched again once a receiver has moved by a quarter of a wavelength, and restored on resumption."""
     own = (
         "traced.position=0.05",
         "optimiser.warm_up=1",
-        "steps=40",
+        "steps=14",
         "holdout_steps_fraction=0",
         "patience=0",
         "deterministic=true",
@@ -225,7 +225,7 @@ def test_a_resumed_fit_goes_on_with_the_paths_that_it_had(tmp_path: Path) -> Non
     whole.run()
     stated = np.stack([one.position_m for one in whole.graph.receivers])
     assert (np.linalg.norm(whole.state.searched_m - stated, axis=1) > 0).any(), "the receivers have hardly moved"
-    part.run(stop=stop_after(25))
+    part.run(stop=stop_after(9))
     state = FitState.from_arrays(part.state.arrays())
     resumed = Trainer(part.record, part.split, part.config, scene=part.graph.scene, state=state)
     for side, searched_m in zip(resumed._sides, part.state.searched_m, strict=True):

@@ -26,7 +26,7 @@ KNOWN = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 PLACES = (np.array([5.2, 2.4, 1.1]), np.array([0.9, 3.4, 1.9]))
 SETTINGS = (
-    "steps=800",
+    "steps=300",
     "batch=16",
     "validate_every=50",
     "initial.gaussians=24",
@@ -39,12 +39,12 @@ SETTINGS = (
 )
 SPECTRA = ("batch=4", "steps=60", "density.every=0")
 FLOAT32 = 1e-4
-"""Relative, of what a batch of transmitters and a single one give: sums in single precision."""
+"""Relative difference between a batch of transmitters and a single one: sums in single precision."""
 
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A room with a ceiling of metal, and what is known of it: floor and walls, of another material."""
+    """A room with a metal ceiling, its known part (floor and walls), and that part with another material."""
     folder = tmp_path_factory.mktemp("rooms")
     thought = {name: ("itu_wood", corners) for name, (_, corners) in KNOWN.items()}
     return {
@@ -55,7 +55,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def measured(task: str, scene: Path, antennas: int = 1, depth: int = 2) -> Record:
-    """What two receivers observe in a room, traced by Sionna RT."""
+    """Observations of two receivers in a room, traced by Sionna RT."""
     # Phases turn within a wavelength, powers that are added do not.
     near, far = ([1.7, 2.6, 1.4], [2.1, 3.0, 1.5]) if task == "csi" else ([1.2, 2.0, 1.2], [4.5, 3.8, 1.9])
     tx = np.random.default_rng(4).uniform(near, far, (90, 3))
@@ -70,7 +70,7 @@ def measured(task: str, scene: Path, antennas: int = 1, depth: int = 2) -> Recor
     paths = trace_paths(open_scene(scene, HZ), tx, receivers, TraceOptions(max_depth=depth, rays=1 << 12)).paths
     seen = instrument_of(record).observe(paths)
     if task == "rssi":
-        seen = seen + np.array([[3.0], [-8.0]])  # receivers report in units of their own
+        seen = seen + np.array([[3.0], [-8.0]])  # the receivers' units differ
     return replace(record, observation=seen.astype(empty.dtype))
 
 
@@ -96,9 +96,7 @@ def score(record: Record, trainer: Trainer) -> float:
 
 
 @pytest.mark.parametrize(("task", "antennas"), [("rssi", 1), ("csi", 1), ("csi", 2)])
-def test_trained_together_they_predict_better_than_either_alone(
-    task: str, antennas: int, rooms: dict[str, Path]
-) -> None:
+def test_joint_training_predicts_better_than_either_side(task: str, antennas: int, rooms: dict[str, Path]) -> None:
     record = measured(task, rooms["whole"], antennas)
     both = trained(record, rooms["known"])
     alone, paths = trained(record, None), trained(record, rooms["known"], "model=ray-tracing", "steps=60")
@@ -112,10 +110,10 @@ def test_trained_together_they_predict_better_than_either_alone(
 
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_paths_alone_are_calibrated_for_every_task(task: str, rooms: dict[str, Path]) -> None:
-    """Walls of another material than the scene says: training their permittivities explains what was measured."""
+def test_calibration_of_paths_improves_every_task(task: str, rooms: dict[str, Path]) -> None:
+    """Walls of another material than the scene states: training of their permittivities improves the prediction."""
     record = measured(task, rooms["known"], depth=1)
-    steps = ("model=ray-tracing", "steps=150", "traced.material=0.05", "traced.gain=0.02", "batch=16")
+    steps = ("model=ray-tracing", "steps=60", "traced.material=0.05", "traced.gain=0.02", "batch=16")
     held = trained(record, rooms["thought"], *steps, "traced.material=0")
     moved = trained(record, rooms["thought"], *steps)
     assert score(record, moved) > score(record, held)
@@ -125,8 +123,8 @@ def test_paths_alone_are_calibrated_for_every_task(task: str, rooms: dict[str, P
         _ = moved.field
 
 
-def test_a_receiver_without_paths_still_has_its_gaussians(rooms: dict[str, Path]) -> None:
-    """Nothing of the scene arrives: no reflection, and the direct way is shut by a floor between."""
+def test_receiver_without_paths_predicts_with_gaussians(rooms: dict[str, Path]) -> None:
+    """No reflections, and a floor blocks the direct path."""
     record = measured("rssi", rooms["known"])
     below = replace(record, tx_pos_m=record.tx_pos_m - np.array([0, 0, 9.0]))
     trainer = trained(below, rooms["known"], "traced.transmission=false", "steps=30")
@@ -135,7 +133,7 @@ def test_a_receiver_without_paths_still_has_its_gaussians(rooms: dict[str, Path]
         trained(below, rooms["known"], "model=ray-tracing", "traced.transmission=false", "steps=30")
 
 
-def test_beside_a_scene_positions_tell_and_not_the_uplink(rooms: dict[str, Path]) -> None:
+def test_joint_field_uses_positions_instead_of_the_uplink(rooms: dict[str, Path]) -> None:
     record = measured("csi", rooms["known"])
     first = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
     first = replace(first, uplink=np.asarray(first.observation[0][:, None]))

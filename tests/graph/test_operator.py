@@ -24,7 +24,7 @@ from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights, weigh
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
-from wrf_mi.graph.learned import learned_field
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, sector_of
 from wrf_mi.receivers import bartlett_spectrum, minmax_scale
 
@@ -89,7 +89,7 @@ def error(found: Any, expected: Any) -> float:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("product", [True, False])
 @pytest.mark.parametrize("single", [True, False])
-def test_weights_are_blending(product: bool, size: tuple[int, int], single: bool) -> None:
+def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, int], single: bool) -> None:
     floats = mi.Float if single else Float64
     gaussians, signal = hard(product, floats)
     plane = perception_plane(*size, floats)
@@ -110,7 +110,7 @@ def test_weights_are_blending(product: bool, size: tuple[int, int], single: bool
 
 
 @pytest.mark.parametrize("product", [True, False])
-def test_weights_are_the_oracle(product: bool) -> None:
+def test_weights_match_the_oracle(product: bool) -> None:
     gaussians, signal = hard(product, Float64)
     weights = pixel_weights(gaussians, pose_of(Float64), perception_plane(45, 120, Float64))
 
@@ -135,7 +135,7 @@ def test_any_field_and_size(seed: int, product: bool, height: int, width: int) -
     np.testing.assert_allclose(weights @ signal, direct, atol=1e-12 * np.abs(signal).sum())
 
 
-def test_nothing_to_see() -> None:
+def test_operator_without_visible_gaussians_is_zero() -> None:
     """Far below the horizon: no weights, and dark."""
     gaussians, signal = hard(False, mi.Float)
     below = RECEIVER.position_m - 90 * RECEIVER.to_world[:, 2]
@@ -187,7 +187,7 @@ def test_batches_and_factors() -> None:
 
 @pytest.mark.parametrize("scale", [False, True])
 @pytest.mark.parametrize("product", [True, False])
-def test_array_is_quadrature_and_bartlett(product: bool, scale: bool) -> None:
+def test_array_operator_matches_quadrature_and_bartlett(product: bool, scale: bool) -> None:
     gaussians, signal = hard(product, mi.Float)
     elements, pose, plane = planar_array(4, 4, 0.16), pose_of(mi.Float), perception_plane(90, 360, mi.Float)
     operator = ArrayOperator.of(gaussians, pose, plane, elements, 920e6)
@@ -243,7 +243,7 @@ def test_sectors(product: bool) -> None:
     np.testing.assert_allclose(both, 10 * np.log10(power * np.array([1, 4])), atol=DECIBEL)
 
 
-def test_what_is_refused() -> None:
+def test_operator_refuses_excess_memory_and_several_transmitters() -> None:
     gaussians, _ = hard(False, mi.Float)
     plane = perception_plane(23, 61, mi.Float)
     with pytest.raises(MemoryError, match="weights of 40 Gaussians take more than 0 MB"):

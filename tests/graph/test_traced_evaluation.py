@@ -104,7 +104,7 @@ def assert_close(found: dict[str, np.ndarray], expected: dict[str, np.ndarray], 
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_traced_gradient_of_every_parameter_is_that_of_the_sum_along_rays(model: str) -> None:
+def test_traced_gradients_match_the_sum_along_rays(model: str) -> None:
     """For a batch of three: no transmitter's derivative is taken at another's Gaussians.
 
     The reference sums all Gaussians on all rays by the blending kernel itself, without Mitsuba's scene and ray tracing.
@@ -121,8 +121,7 @@ def test_traced_gradient_of_every_parameter_is_that_of_the_sum_along_rays(model:
             gaussians = field.gaussians(params, to_tensor(row[:, None]))
             footprints = ray_footprints(gaussians, pose)
             lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
-            own = gaussians.opacity, gaussians.attenuation
-            re, im = blend_rays(footprints, gaussians.signal, lists, bundles, *own)
+            re, im = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending)
             greys.append(dr.sqrt(re * re + im * im + 1e-8))
         return dr.concat(greys)
 
@@ -132,7 +131,7 @@ def test_traced_gradient_of_every_parameter_is_that_of_the_sum_along_rays(model:
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("form", [Form("pixel", FINE), Form("power", FINE)], ids=lambda form: form.receiver)
-def test_traced_gradient_is_the_splatted_one_for_small_gaussians(model: str, form: Form) -> None:
+def test_traced_gradients_match_splatting_for_small_gaussians(model: str, form: Form) -> None:
     """Of every parameter, on the hemisphere of spectra and on the full sphere of one antenna."""
     values = parameters(model)
     if form.receiver == "power":
@@ -146,7 +145,7 @@ def test_traced_gradient_is_the_splatted_one_for_small_gaussians(model: str, for
     assert_close(*found, PROJECTED)
 
 
-def test_traced_gradient_of_the_receivers_pose_is_the_splatted_one_for_small_gaussians() -> None:
+def test_traced_pose_gradient_matches_splatting_for_small_gaussians() -> None:
     """Position and turn of the receiver, which its sensor's ``to_world`` carries."""
     gaussians = MODELS["wrf-gs+"].gaussians(
         {name: to_tensor(value) for name, value in parameters("wrf-gs+").items()}, to_tensor(TX.T)
@@ -192,7 +191,7 @@ FEW_STEPS = (
 )
 
 
-def test_training_by_tracing_scores_as_by_splatting_with_the_kernels_of_its_first_steps() -> None:
+def test_traced_training_scores_like_splatting_and_reuses_kernels() -> None:
     """The traced fit's median SSIM lies in the splatted one's 95 % bootstrap interval over the test rows."""
     record, start = made_record()
     split, scores = official(record), {}
@@ -240,7 +239,7 @@ def behind_the_ceiling(folder: Path, **traced: Any) -> tuple[Graph, dict[str, np
     return graph, values
 
 
-def test_traced_gaussians_behind_a_ceiling_have_what_its_slab_passes(tmp_path: Path) -> None:
+def test_slab_attenuates_traced_gaussians_behind_it(tmp_path: Path) -> None:
     """At every direction: transmission of a vertical wave, closed form in float64 (ITU-R P.2040, eq. 43)."""
     graph, values = behind_the_ceiling(tmp_path)
     params = {name: to_tensor(value) for name, value in values.items()}
@@ -261,7 +260,7 @@ def test_traced_gaussians_behind_a_ceiling_have_what_its_slab_passes(tmp_path: P
 
 
 @pytest.mark.parametrize("materials", ["named", "surface"])
-def test_derivative_of_traced_gaussians_by_the_walls_materials(tmp_path: Path, materials: str) -> None:
+def test_traced_derivative_by_wall_materials(tmp_path: Path, materials: str) -> None:
     """Of parameters that the paths have, too: against central differences."""
     graph, values = behind_the_ceiling(tmp_path, materials=materials)
     side = graph.trace(TX, 0)
@@ -287,7 +286,7 @@ def test_derivative_of_traced_gaussians_by_the_walls_materials(tmp_path: Path, m
         assert found[name][index] == pytest.approx(numeric, rel=DIFFERENCE), name
 
 
-def test_a_traced_run_with_a_scene_predicts_what_was_scored(tmp_path: Path) -> None:
+def test_traced_run_with_a_scene_reproduces_its_score(tmp_path: Path) -> None:
     """Gaussians and paths in one graph, trained, stored, opened: by rays through the scene's walls each time."""
     record, _ = made_record(24)
     tx = np.random.default_rng(1).uniform([2.5, 2.5, 0.8], [4.5, 4.0, 1.6], (24, 3))
@@ -304,7 +303,7 @@ def test_a_traced_run_with_a_scene_predicts_what_was_scored(tmp_path: Path) -> N
     assert config["settings"]["evaluation"] == "traced"
 
 
-def test_what_cannot_be_traced_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_untraceable_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set traced.shift=0 and traced.tilt=0, or evaluation=splatted"):
         behind_the_ceiling(tmp_path, shift=1e-3)
     with pytest.raises(

@@ -56,7 +56,7 @@ def test_traced_scene(names: dict[str, Any]) -> None:
     np.testing.assert_allclose(plain(mi.render(of_dict)), field, atol=1e-6)
 
 
-def test_gradient_by_the_transmitter(names: dict[str, Any]) -> None:
+def test_documented_gradient_by_the_transmitter(names: dict[str, Any]) -> None:
     """What the page prints is the slope of the power that is received."""
     gradient = plain(names["position"].grad)[:, 0]
     params, start = mi.traverse(names["scenes"][2]), np.array([0.5, -0.6, 1.0])
@@ -88,7 +88,7 @@ def test_powers_and_transmittance(names: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_tables_are_those_of_the_plugins(name: str) -> None:
+def test_documented_tables_match_the_plugins(name: str) -> None:
     """The same parameters in the page and in the docstring, in the same order."""
     module, kind = CLASSES[name].split(".")
     documented = getattr(importlib.import_module(f"wrf_mi_plugins.{module}"), kind).__doc__

@@ -80,7 +80,7 @@ def test_shape_follows_transmitter_and_weights(model: str) -> None:
     assert_shape_holds(scene, changed)
 
 
-def test_geometry_that_stays_is_left_alone() -> None:
+def test_unchanged_geometry_is_not_updated() -> None:
     """Under WRF-GS the transmitter changes signals alone, so what was traced still holds."""
     scene = scene_of(made("wrf-gs"))
     params = mi.traverse(scene)
@@ -109,7 +109,7 @@ def test_number_of_gaussians_may_change() -> None:
     assert len(found) > 1
 
 
-def test_scene_is_traced_anew_where_gaussians_move() -> None:
+def test_moved_gaussians_are_traced_again() -> None:
     scene = scene_of(made("wrf-gs+"))
     params = mi.traverse(scene)
     params["transmitter.position"] = to_tensor(params["transmitter.position"].numpy() + np.array([[0], [0], [100]]))
@@ -248,7 +248,7 @@ def test_light_on_a_wall_is_found_without_sampling_the_emitter() -> None:
     assert error < 0.05 * seen.mean()
 
 
-def test_what_belongs_to_whom() -> None:
+def test_emitter_belongs_to_one_shape() -> None:
     emitter = made("wrf-gs+")
     assert "WrfGsPlus, 6 Gaussians, transmitter at (0.4, -0.7, 1.1) m" in str(emitter)
     shape = scene_of(emitter).shapes()[0]

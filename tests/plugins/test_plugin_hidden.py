@@ -49,7 +49,7 @@ def rendered(blending: str, seed: int, power: float, monkeypatch: pytest.MonkeyP
     entries = []
 
     def counting(footprints: Any, signal: Any, lists: Any, *more: Any) -> Any:
-        entries.append(int(lists.start[dr.width(lists.start) - 1]))
+        entries.append(int(dr.sum(lists.end - lists.begin)[0]))
         return blend(footprints, signal, lists, *more)
 
     blend = integrator.blend_rays
@@ -77,7 +77,7 @@ def test_error_is_within_the_bound(blending: str, seed: int, monkeypatch: pytest
     assert 1e-3 < error <= np.sqrt(0.2) * largest
 
 
-def test_what_is_in_front_stays() -> None:
+def test_gaussians_before_walls_are_kept() -> None:
     """A sheet behind all Gaussians hides none, and of a scene without walls nothing is left out."""
     field = gaussians_of(any_field(COUNT, 0, 0.1), "alpha")
     traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
@@ -91,6 +91,6 @@ def test_what_is_in_front_stays() -> None:
 
 
 @pytest.mark.parametrize("power", [-0.1, 1.0])
-def test_no_such_share(power: float) -> None:
+def test_invalid_opaque_power_is_refused(power: float) -> None:
     with pytest.raises((InputError, RuntimeError), match="opaque_power"):
         mi.load_dict({"type": "wrf_traced", "opaque_power": power})

@@ -11,9 +11,9 @@ import pytest
 from plugin_fields import FIELDS, plain, weights_of
 from wrf_mi_plugins import emitter as emitter_plugin
 from wrf_mi_plugins import medium as plugin
+from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 
 from wrf_mi.backend.device import to_tensor
-from wrf_mi.gaussians.optical_depth import attenuators, optical_depth
 
 emitter_plugin.register()
 plugin.register()
@@ -111,7 +111,7 @@ def test_volpath_agrees_with_the_closed_form(kind: str, opacity: float | None, r
         assert (exact == 2.5).all() if opacity == 0 else exact.min() < 1e-3
 
 
-def test_a_rendered_picture_agrees_too() -> None:
+def test_rendered_transmittance_agrees_with_the_closed_form() -> None:
     """Through `mi.render`, with an area emitter behind the Gaussians and a sensor that stands among them."""
     values = arrays()
     centre, towards = np.array([0.1, -0.2, 0.3]), np.array([6.0, 1.0, 0.5])
@@ -139,7 +139,7 @@ def test_a_rendered_picture_agrees_too() -> None:
     assert abs(found - exact) < STANDARD_ERRORS * np.sqrt(exact * (radiance - exact) / samples)
 
 
-def test_needles_that_few_points_hit() -> None:
+def test_extinction_of_thin_needles_is_found() -> None:
     """Needles of 1 mm among round Gaussians: the extinction found where they are, and the bound above it."""
     values = arrays("needles")
     values["scales"][:, :2] = 0.001
@@ -264,7 +264,7 @@ def test_medium_follows_its_emitter(model: str) -> None:
     assert (extinction <= air.majorant_per_m).all()
 
 
-def test_scale_and_phase() -> None:
+def test_scale_multiplies_depth_and_phase_has_no_effect() -> None:
     """Twice the depth for powers; a phase of delta changes nothing."""
     values = arrays()
     ray = ray_of(*rays_through(values, 30))
@@ -277,7 +277,7 @@ def test_scale_and_phase() -> None:
     np.testing.assert_allclose(turned, once, rtol=FLOAT32_TOLERANCE, atol=FLOAT32_TOLERANCE)
 
 
-def test_input_is_checked() -> None:
+def test_invalid_arrays_are_refused() -> None:
     values = arrays()
 
     def spoil(row: int, by: float) -> np.ndarray:

@@ -48,7 +48,7 @@ def rays(sensor: Any, height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
-def test_rays_go_through_points(coverage: str) -> None:
+def test_rays_pass_through_pixel_points(coverage: str) -> None:
     """Wherever in a pixel the sample lies: the one direction of `core.angles`, turned by the quaternion."""
     sensor = mi.load_dict(plane(9, 36, coverage=coverage))
     expected = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](9, 36)
@@ -61,7 +61,7 @@ def test_rows_of_the_sphere() -> None:
     np.testing.assert_allclose(np.degrees(azimuth[3]), 10 * np.arange(36), atol=1e-6)
 
 
-def test_crop_is_a_part_of_the_film() -> None:
+def test_crop_is_part_of_the_film() -> None:
     crop = {"crop_width": 10, "crop_height": 4, "crop_offset_x": 7, "crop_offset_y": 3}
     sensor = mi.load_dict(plane(9, 36, crop))
     expected = pixel_directions(9, 36)[3:7, 7:17]

@@ -108,7 +108,7 @@ def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.Mo
         np.testing.assert_allclose(inside, 2 * outside, rtol=1e-6)
 
 
-def test_run_folder_says_what_the_shape_holds(run: Path) -> None:
+def test_shape_holds_the_gaussians_of_the_run_folder(run: Path) -> None:
     """The parameters of the fitted model, through the model that the configuration names."""
     scene = mi.load_dict(as_dict(str(run)))
     trained = open_run(run).field
@@ -183,7 +183,7 @@ except RuntimeError as error:
 
 
 @pytest.mark.parametrize("first", ["plugins", "sionna"])
-def test_beside_sionna_rt(first: str) -> None:
+def test_plugins_work_in_one_process_with_sionna_rt(first: str) -> None:
     """One process traces paths and renders a plugin's scene, whichever is imported first."""
     code = f"""
 import warnings

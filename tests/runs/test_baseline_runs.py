@@ -51,7 +51,7 @@ def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
-def test_stored_models_predict_what_was_scored(name: str, flat_folder: Path, tmp_path: Path) -> None:
+def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: Path, tmp_path: Path) -> None:
     """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
     few = ("trees=20",) if name == "trees" else ()
     out = train(flat_folder, tmp_path / "run", name, settings=few).folder
@@ -92,7 +92,7 @@ def test_command_trains_as_the_function_does(
         np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
 
 
-def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluation_reproduces_the_scores(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     again = scored_again_as_before(run, capsys)
     other = evaluate_run(run, "random")
     assert other["split"] == "random (rows unseen by official)"
@@ -152,8 +152,8 @@ TRAINED: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", list(TRAINED))
-def test_a_stopped_network_goes_on_to_the_same_bits(name: str, two_gateways: Record, tmp_path: Path) -> None:
-    """Stopped between two checkpoints of its last network, when the first of several has ended."""
+def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_path: Path) -> None:
+    """The run is stopped between two checkpoints of the second network."""
     data, own, networks = TRAINED[name]
     record = two_gateways if data == "spectra" else channels()
     ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
@@ -208,7 +208,7 @@ def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.
             np.testing.assert_allclose(arrays["prediction"], held_out["prediction"], atol=ROUNDING)
 
 
-def test_comparison_shows_baselines_beside_the_blend(run: Path, flat_folder: Path, tmp_path: Path) -> None:
+def test_comparison_shows_baselines_and_the_reference(run: Path, flat_folder: Path, tmp_path: Path) -> None:
     other = train(flat_folder, tmp_path / "idw", "idw").folder
     compare([run, other], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
@@ -231,7 +231,7 @@ def test_sweep_of_baselines(flat_folder: Path, tmp_path: Path, capsys: pytest.Ca
 # What is refused
 
 
-def test_calls_that_are_refused(
+def test_bad_calls_are_refused(
     flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     unplaced_folder = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
@@ -256,7 +256,7 @@ def test_calls_that_are_refused(
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
         (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
-        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; leave --scene away"),
+        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; omit --scene"),
         (
             [*train, "--preset", "quick"],
             "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
@@ -264,14 +264,14 @@ def test_calls_that_are_refused(
         (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
         (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
         (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
-        (["train", "--resume", run, "--model", "mri"], "leave data set and settings away"),
+        (["train", "--resume", run, "--model", "mri"], "omit data set and settings"),
         (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
     ):
         refused(arguments, message, capsys)
         assert not (tmp_path / "out").exists(), arguments
 
 
-def test_what_cannot_be_fitted_leaves_nothing_behind(flat_folder: Path, tmp_path: Path) -> None:
+def test_refused_fit_writes_nothing(flat_folder: Path, tmp_path: Path) -> None:
     record = load(flat_folder)
     still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
     with pytest.raises(InputError, match="rows at one distance"):

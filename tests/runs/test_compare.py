@@ -76,7 +76,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
-def test_table_holds_the_runs_own_figures(tmp_path):
+def test_table_contains_the_metrics_of_the_runs(tmp_path):
     good, bad = make_run(tmp_path / "good", seed=3), make_run(tmp_path / "bad", model="idw", noise=0.5, trained=False)
     page = compare([good, bad], tmp_path / "out")
     table = rows_of(tmp_path / "out" / "compare.csv")
@@ -117,7 +117,7 @@ def test_untrained_runs_have_no_training_picture(tmp_path):
     assert not (tmp_path / "out" / "room-training.png").exists()
 
 
-def test_blocked_run_brings_the_curves_of_its_folds(tmp_path):
+def test_blocked_run_shows_the_curves_of_its_folds(tmp_path):
     run = make_run(tmp_path / "blocked", split="blocked", trained=False)
     write_log(run / "fold0")
     write_log(run / "fold1")
@@ -156,7 +156,7 @@ def test_pictures_show_rows_that_all_runs_predict(tmp_path, monkeypatch):
     assert scores == sorted(scores)
 
 
-def test_runs_without_common_rows_leave_places_empty(tmp_path, monkeypatch):
+def test_runs_without_common_rows_leave_plots_empty(tmp_path, monkeypatch):
     calls = captured(monkeypatch, "spectrum_table")
     compare([make_run(tmp_path / "a", rows=[0, 1]), make_run(tmp_path / "b", rows=[5, 6])], tmp_path / "out")
     for _, (_, of_a, of_b, _) in calls[-1][0]:
@@ -164,7 +164,7 @@ def test_runs_without_common_rows_leave_places_empty(tmp_path, monkeypatch):
         assert of_b is None
 
 
-def test_blend_is_drawn_once_for_the_same_rows(tmp_path, monkeypatch):
+def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     calls = captured(monkeypatch, "score_cdf")
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", noise=0.2), make_run(tmp_path / "c", rows=[3, 4])]
     compare(runs, tmp_path / "out")
@@ -186,7 +186,7 @@ def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
     assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 
-def test_runs_of_the_same_name_are_told_apart(tmp_path):
+def test_runs_of_equal_names_get_different_names(tmp_path):
     compare([make_run(tmp_path / "x" / "run"), make_run(tmp_path / "y" / "run")], tmp_path / "out")
     assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
 
@@ -228,7 +228,7 @@ def cut_truth(run):
     [
         (remove("metrics.json"), "no metrics.json, so no finished run"),
         (remove("predictions.npz"), "predictions.npz: missing"),
-        (replace("metrics.json", "{"), "not readable as JSON"),
+        (replace("metrics.json", "{"), "not readable"),
         (replace("predictions.npz", "not a zip"), "predictions.npz: not readable"),
         (
             replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),

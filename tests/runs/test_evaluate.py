@@ -145,7 +145,7 @@ def test_folds_are_pooled(tmp_path: Path, task: str, receivers: int):
     np.testing.assert_array_equal(run.truth, truth.observation[:, run.row])
 
 
-def test_predictions_must_be_there_wherever_something_was_received():
+def test_predictions_must_be_finite_wherever_something_was_received():
     truth = record("rssi", 1)
     (split,) = make_splits(truth, "official")
     with pytest.raises(InputError, match="8 of 8 values are not finite where the truth is known"):
@@ -154,7 +154,7 @@ def test_predictions_must_be_there_wherever_something_was_received():
         evaluate(truth, split, lambda rows, receiver: np.zeros((len(rows), 2)))
 
 
-def test_what_cannot_be_scored_is_said_in_one_line():
+def test_rows_that_cannot_be_scored_are_refused():
     truth = record("rssi", 2)
     (split,) = make_splits(truth, "official")
     with pytest.raises(InputError, match="split official: no test rows to score"):

@@ -32,7 +32,7 @@ def outlines_of(figure: Figure) -> list[FloatArray]:
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(90, 60), (0, 10), (200, 89), (359.5, 0)])
 def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elevation: float) -> None:
-    """Its angular radius is that of the scale seen from the receiver, low-pass included, seam and zenith or not."""
+    """The angular radius is the scale seen from the receiver with the low-pass added, also at seam and zenith."""
     seen = seen_from(azimuth, elevation, 4.0, [0.4, 0.4, 0.4])
     (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
     angle = np.arccos(outline @ unit_vectors(np.radians(azimuth), np.radians(elevation)))
@@ -45,7 +45,7 @@ def test_outline_is_where_the_footprint_is_one_deviation() -> None:
     assert footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
 
 
-def test_largest_weight_is_drawn_last_and_what_has_no_footprint_not_at_all() -> None:
+def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> None:
     directions = unit_vectors(np.radians([0, 90, 180, 270]), np.radians(45))
     distance = np.array([3.0, 3.0, 3.0, NEAR_M / 2])
     position = RECEIVER.position_m + (distance[:, None] * directions) @ RECEIVER.to_world.T

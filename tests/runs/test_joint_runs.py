@@ -89,7 +89,7 @@ def median(run: Path) -> float:
     return float(json.loads((run / "metrics.json").read_text())["ssim"]["median"])
 
 
-def test_trained_together_they_predict_better_than_either_alone(
+def test_joint_training_predicts_better_than_paths_or_gaussians_alone(
     rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
 ) -> None:
     train(str(data), tmp_path / "field", settings=config(with_scene=False))
@@ -99,7 +99,7 @@ def test_trained_together_they_predict_better_than_either_alone(
     assert median(run) > median(tmp_path / "traced") + 0.03
 
 
-def test_run_folder_states_the_scene_and_what_was_trained(rooms: dict[str, Path], run: Path) -> None:
+def test_run_folder_states_scene_and_trained_parameters(rooms: dict[str, Path], run: Path) -> None:
     stated = yaml.safe_load((run / "config.yaml").read_text())
     assert stated["scene"] == str(rooms["known"])
     params = open_run(run).field.params
@@ -111,7 +111,7 @@ def test_run_folder_states_the_scene_and_what_was_trained(rooms: dict[str, Path]
         assert params[name].any()
 
 
-def test_predictions_are_those_that_were_scored(data: Path, run: Path) -> None:
+def test_new_predictions_reproduce_the_scored_ones(data: Path, run: Path) -> None:
     before = (run / "predictions.npz").read_bytes()
     score = median(run)
     assert evaluate_run(run)["ssim"]["median"] == score
@@ -123,9 +123,7 @@ def test_predictions_are_those_that_were_scored(data: Path, run: Path) -> None:
     np.testing.assert_allclose(predictor(record.tx_pos_m[rows[:3]], "gateway1"), prediction[:3], atol=FLOAT32_GREY)
 
 
-def test_stopped_and_resumed_is_the_same_bit_for_bit(
-    rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
-) -> None:
+def test_resumed_run_is_bit_identical(rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path) -> None:
     steps = 0
 
     def stop() -> bool:
@@ -176,7 +174,7 @@ def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path,
         (["--set", "traced.pattern_degree=9"], "setting traced.pattern_degree: 9"),
     ],
 )
-def test_what_does_not_belong_together_is_one_line(
+def test_incompatible_options_are_refused_in_one_line(
     data: Path, tmp_path: Path, capsys: Any, arguments: list[str], message: str
 ) -> None:
     status, _, err = call(["train", data, *arguments, "--out", tmp_path / "run"], capsys)

@@ -47,7 +47,7 @@ MODELS = ["wrf-gs", "factorised", "wrf-gs+ still"]
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_predictions_are_those_of_splatting(model: str) -> None:
+def test_operator_predicts_as_splatting_does(model: str) -> None:
     field, params = made(model)
     direct = Predictor(field, params, RECEIVERS, *SIZE)
     by_operator = Predictor(field, params, RECEIVERS, *SIZE, operator=True)
@@ -80,7 +80,7 @@ def test_moving_geometry_is_splatted() -> None:
         Factorised(Encoding(0, 4.0, 3, 0.5), terms=4, layers=3, width=16),
     ],
 )
-def test_networks_in_numpy_are_those_of_the_field(field: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks_in_numpy_equal_those_of_the_field(field: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     params = field.init(random_gaussians(RECEIVERS[:1], 30, rng), rng)
     params = {k: v + 0.1 * rng.standard_normal(v.shape).astype(np.float32) for k, v in params.items()}
@@ -101,7 +101,7 @@ def run(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(one_gateway, tmp_path_factory.mktemp("runs") / "run", config.model, settings=config).folder
 
 
-def test_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = run / "operator0.npz"
     first = stored.read_bytes()
     with np.load(stored, allow_pickle=False) as arrays:
@@ -125,8 +125,8 @@ def test_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.Monk
         np.testing.assert_allclose(a["prediction"], b["prediction"], atol=GREYS)
 
 
-def test_the_command_can_do_without(run: Path, tmp_path: Path) -> None:
-    """What was not asked for is not built."""
+def test_no_operator_option_splats(run: Path, tmp_path: Path) -> None:
+    """The operator is not built."""
     (tmp_path / "tx.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
     own = tmp_path / "run"
     shutil.copytree(run, own)
@@ -160,7 +160,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_what_ends_an_operator(what: str, tmp_path: Path) -> None:
+def test_changed_geometry_rebuilds_the_operator(what: str, tmp_path: Path) -> None:
     field, params = made("factorised")
     before = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
     before(TX, 0)
@@ -175,7 +175,7 @@ def test_what_ends_an_operator(what: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_signals_alone_do_not_end_it(model: str) -> None:
+def test_changed_signals_keep_the_operator(model: str) -> None:
     """Another signal network or other coefficients: the same weights serve."""
     field, params = made(model)
     changed = {k: v * 2 if k.startswith(field.signal_parameters) else v for k, v in params.items()}
@@ -212,7 +212,7 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
+def test_operator_works_in_a_read_only_folder(tmp_path: Path) -> None:
     field, params = made("factorised")
     tmp_path.chmod(0o500)
     found = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
@@ -220,7 +220,7 @@ def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_too_large_is_splatted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_operator_is_replaced_by_splatting(monkeypatch: pytest.MonkeyPatch) -> None:
     field, params = made("factorised")
     monkeypatch.setattr(still, "MOST_BYTES", 1000)
     asked = Predictor(field, params, RECEIVERS[:1], *SIZE, operator=True)
@@ -230,12 +230,12 @@ def test_too_large_is_splatted(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(asked(TX), found)  # and says so once
 
 
-def test_factorised_needs_to_see_the_transmitter() -> None:
+def test_factorised_field_needs_the_transmitter() -> None:
     with pytest.raises(InputError, match="tx_octaves: 0 leaves factorised nothing to see"):
         Factorised(Encoding(tx_octaves=0))
 
 
-def test_the_factorised_field_is_its_sum() -> None:
+def test_factorised_field_is_the_sum_of_its_terms() -> None:
     """S = C phi, per transmitter."""
     from wrf_mi.backend.device import to_tensor
 
@@ -248,7 +248,7 @@ def test_the_factorised_field_is_its_sum() -> None:
     np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(3, 8), phi.T @ c, atol=1e-5)
 
 
-def test_another_receiver_has_its_own(tmp_path: Path) -> None:
+def test_each_receiver_has_its_operator(tmp_path: Path) -> None:
     field, params = made("factorised")
     both = StaticOperator(field, params, RECEIVERS, *SIZE, tmp_path)
     assert isinstance(RECEIVERS[1], Receiver)

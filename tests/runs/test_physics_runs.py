@@ -57,7 +57,7 @@ def strengths(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return train(flat_folder, tmp_path_factory.mktemp("runs") / "strengths", "physics").folder
 
 
-def test_run_folder_holds_the_model_and_what_it_is_sure_of(waves: Path, run: Path) -> None:
+def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -> None:
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
     known = {"model": "physics", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
@@ -98,7 +98,7 @@ def test_command_trains_as_the_function_does(
     np.testing.assert_allclose(stored(out)["std"], stored(run)["std"], atol=ROUNDING)
 
 
-def test_scoring_again_says_the_same(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluation_reproduces_the_scores(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scored_again_as_before(run, capsys)
 
 
@@ -113,7 +113,7 @@ def test_scoring_other_rows_writes_nothing(run: Path, capsys: pytest.CaptureFixt
     assert {path: path.read_bytes() for path in run.iterdir()} == before
 
 
-def test_predictions_at_new_positions_carry_their_deviation(
+def test_predictions_at_new_positions_have_standard_deviations(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     held_out = stored(run)
@@ -208,7 +208,7 @@ def test_resuming_keeps_the_folds_that_were_fitted(
     assert json.loads(out)["ssim"]["median"] == pytest.approx(before.metrics["ssim"]["median"], abs=ROUNDING)
 
 
-def test_comparison_shows_a_physics_beside_the_blend(run: Path, blocked: Path, tmp_path: Path) -> None:
+def test_comparison_shows_physics_and_reference(run: Path, blocked: Path, tmp_path: Path) -> None:
     page = compare([run, blocked], tmp_path / "page").read_text()
     assert "inside 90 %" in page
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
@@ -246,7 +246,7 @@ def test_mesh_alone_predicts_signal_strengths(
 
 
 def test_mesh_alone_predicts_spectra(tmp_path: Path) -> None:
-    """What a mesh without rows predicts depends on the mesh."""
+    """Predictions without training rows depend on the mesh."""
     record = wave_record(30, 10, receivers=1)
     middle = np.array([2.0, 2.0, 1.2])
     receiver = replace(record.receivers[0], position_m=np.array([4.4, 3.1, 0.8]))
@@ -320,7 +320,7 @@ def test_channels_are_predicted_from_a_mesh(tmp_path: Path) -> None:
 # What is refused
 
 
-def test_calls_that_are_refused(
+def test_bad_calls_are_refused(
     waves: Path, run: Path, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     train = ["train", waves, "--model", "physics", "--out", tmp_path / "out"]
@@ -347,9 +347,9 @@ def test_calls_that_are_refused(
         ([*train, "--preset", "quick"], "physics on .*waves: takes no preset"),
         (["train", waves, "--model", "physics"], "train needs DATASET and --out RUN"),
         (["train", waves, "--model", "physics", "--out", waves], "exists and is not empty; choose another --out"),
-        (["train", "--resume", run, "--model", "physics"], "leave data set and settings away"),
-        (["train", "--resume", run, "--scene", "x"], "leave data set and settings away"),
-        (["train", "--resume", run, "--set", "lengths=2"], "leave data set and settings away"),
+        (["train", "--resume", run, "--model", "physics"], "omit data set and settings"),
+        (["train", "--resume", run, "--scene", "x"], "omit data set and settings"),
+        (["train", "--resume", run, "--set", "lengths=2"], "omit data set and settings"),
         (["train", waves, "--scene", "x", "--out", tmp_path / "out"], "x: no such scene file"),
         (["evaluate", run, "--split", "nowhere"], "split 'nowhere'"),
     ):
@@ -376,7 +376,7 @@ BAD_HEADINGS = {
 
 
 @pytest.mark.parametrize("name", BAD_HEADINGS)
-def test_headings_that_are_refused(name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_headings_are_refused(name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     content, message = BAD_HEADINGS[name]
     (tmp_path / name).write_text(content)
     refused(["predict", run, "--tx", tmp_path / name, "--out", tmp_path / "out.npz"], message, capsys)
@@ -397,7 +397,7 @@ def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     assert stored(out)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
 
 
-def test_settings_of_every_physics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_of_every_physics_model_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = call(["train", "--help-settings"], capsys)
     assert status == 0
     for line in (

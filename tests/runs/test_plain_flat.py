@@ -15,8 +15,7 @@ from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.datasets.csv_table import read_csv
 from wrf_mi.runs.api import train
 from wrf_mi.runs.compare import compare
-from wrf_mi.runs.prediction_file import write_prediction_file
-from wrf_mi.runs.tx_file import read_inputs
+from wrf_mi.runs.prediction_file import read_inputs, write_prediction_file
 
 NAMES = list(NAMED_ANCHORS_M)
 MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": (), "physics": ()}
@@ -49,7 +48,7 @@ def test_models_work_without_headings(
 
 
 @pytest.mark.parametrize("model", ["kriging", "trees", "physics"])
-def test_models_see_the_height(
+def test_models_use_the_height(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "tx.csv").write_text("x,y,z\n0.6,0.6,0.3\n0.6,0.6,1.9\n")
@@ -59,7 +58,7 @@ def test_models_see_the_height(
 
 
 @pytest.mark.parametrize("model", ["mri", "physics"])
-def test_predicted_table_holds_what_the_arrays_do(
+def test_csv_predictions_equal_npz_predictions(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     turned = model != "physics"  # The physics model was trained without headings, so it refuses them.
@@ -124,7 +123,7 @@ def test_table_of_spectra_is_refused(one_gateway: Record, tmp_path: Path, capsys
     refused(given, "no metrics.json, so no finished run", capsys)
 
 
-def test_comparison_shows_names_as_they_are(runs: dict[str, Path], tmp_path: Path) -> None:
+def test_comparison_shows_names_without_formulas(runs: dict[str, Path], tmp_path: Path) -> None:
     """Also those in which Matplotlib would see a formula, and a wrong one."""
     compare(list(runs.values()), tmp_path / "out")
     assert (tmp_path / "out" / "plain-samples.png").exists()

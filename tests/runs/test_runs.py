@@ -82,8 +82,8 @@ def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -
     assert heard == [s for s in range(5, 41, 5) if s > at]  # it went on, and did not start anew
 
 
-def test_resumed_run_is_the_same_bit_for_bit(folder: Path, tmp_path: Path) -> None:
-    """Stopped after a round of density control, and once more between two; parameters, moments, mean, scores."""
+def test_resumed_run_is_bit_identical(folder: Path, tmp_path: Path) -> None:
+    """Parameters, moments, running mean and scores, of a run stopped after a round of density control."""
     config = settings(*RESUMED, "deterministic=true")
     train(
         folder,
@@ -123,7 +123,7 @@ class PowerCut(BaseException):
 
 
 def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Path) -> None:
-    """Lines logged after that checkpoint are not there twice."""
+    """The log has no line twice."""
     config = settings("steps=40", "checkpoint_every=8", "deterministic=true")
 
     def kill(stage: str, share: float, progress: Progress) -> None:
@@ -144,7 +144,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
 def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The loss of one row is not a number; with that mended, the run goes on as if nothing had been."""
+    """The loss of one row is NaN; with finite losses the resumed run equals an uninterrupted run."""
     paper = Spectrum.loss
 
     def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, ssim_weight: float) -> Any:
@@ -192,7 +192,7 @@ def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(values, arrays[name])
 
 
-def test_run_folder_says_all(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
+def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     run = train(folder, tmp_path / "run", settings=settings("steps=10", "seed=3"), split="random", n_train=0.5)
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
     assert contents(run.folder) == files
@@ -251,7 +251,7 @@ def predictor(run: Path) -> Any:
     return open_run(run).predictor()
 
 
-def test_damaged_models(finished: Path, tmp_path: Path) -> None:
+def test_damaged_models_are_refused(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path / "run")
     path = run / "model.npz"
     whole = path.read_bytes()
@@ -272,7 +272,7 @@ def test_damaged_models(finished: Path, tmp_path: Path) -> None:
         predictor(run)
 
 
-def test_damaged_configurations(finished: Path, tmp_path: Path) -> None:
+def test_damaged_configurations_are_refused(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path / "run")
     path = run / "config.yaml"
     for content in ("settings: [1", "just text", "", "format: 2\ndataset: x\n"):
@@ -284,7 +284,7 @@ def test_damaged_configurations(finished: Path, tmp_path: Path) -> None:
         resume(tmp_path)
 
 
-def test_scores_are_found_again(finished: Path, tmp_path: Path, one_gateway: Record) -> None:
+def test_evaluation_reproduces_the_scores(finished: Path, tmp_path: Path, one_gateway: Record) -> None:
     run = copied(finished, tmp_path / "run")
     before = json.loads((run / "metrics.json").read_text())
     (run / "predictions.npz").unlink()
@@ -298,7 +298,7 @@ def test_scores_are_found_again(finished: Path, tmp_path: Path, one_gateway: Rec
     assert json.loads((run / "metrics.json").read_text()) == after
 
 
-def test_scores_on_another_split_leave_out_what_was_trained_on(finished: Path, one_gateway: Record) -> None:
+def test_scores_on_another_split_exclude_training_rows(finished: Path, one_gateway: Record) -> None:
     before = (finished / "metrics.json").read_bytes()
     split, other = load_split(finished / "split.npz"), make_splits(one_gateway, "random")[0]
     unseen = np.setdiff1d(other.test, split.all_train)
@@ -309,7 +309,7 @@ def test_scores_on_another_split_leave_out_what_was_trained_on(finished: Path, o
     assert (finished / "metrics.json").read_bytes() == before
 
 
-def test_no_unseen_row(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
+def test_split_without_unseen_rows_is_refused(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     """Official training rows hold all test rows of this random split."""
     split, other = official(one_gateway), make_splits(one_gateway, "random")[0]
     assert np.isin(other.test, split.all_train).all()
@@ -339,7 +339,7 @@ def test_damaged_metrics_are_written_anew(finished: Path, tmp_path: Path) -> Non
         assert after.keys() == before.keys()
 
 
-def test_rows_that_the_record_has_not(finished: Path, tmp_path: Path, one_gateway: Record) -> None:
+def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_gateway: Record) -> None:
     """Reading beyond the data would give anything."""
     split = official(one_gateway)
     for own in (replace(split, train=np.append(split.train, 24)), replace(split, test=np.array([-1]))):
@@ -395,7 +395,7 @@ def test_blocked_run_goes_on_in_the_fold_where_it_was_stopped(folder: Path, tmp_
     assert [e["step"] for e in log_of(tmp_path / "run" / "fold1")] == [5]
 
 
-def test_folders_that_hold_something_are_left_alone(folder: Path, tmp_path: Path) -> None:
+def test_folders_with_content_are_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine.txt").write_text("mine")
     for split in ("official", "blocked"):
@@ -406,7 +406,7 @@ def test_folders_that_hold_something_are_left_alone(folder: Path, tmp_path: Path
         train(folder, tmp_path / "run" / "mine.txt", settings=settings("steps=5"))
 
 
-def test_rows_of_ones_own_train(one_gateway: Record, tmp_path: Path) -> None:
+def test_custom_split_is_trained(one_gateway: Record, tmp_path: Path) -> None:
     """A record in memory and a split by hand, without validation rows."""
     split = Split("mine", 0, np.arange(10), np.arange(0), np.arange(20, 24))
     run = train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=split)

@@ -54,7 +54,7 @@ def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) ->
         (["scene=a/b,a b"], "two runs would be named scene=a-b"),
     ],
 )
-def test_what_cannot_be_planned_is_refused(vary: list[str], message: str, tmp_path: Path) -> None:
+def test_bad_plans_are_refused(vary: list[str], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         plan_sweep(tmp_path, vary, {"dataset": "x", "model": "wrf-gs"}, ["steps=3"])
 
@@ -97,7 +97,7 @@ def swept(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_table_holds_what_the_runs_scored(swept: Path) -> None:
+def test_table_contains_the_scores_of_the_runs(swept: Path) -> None:
     assert sorted(path.name for path in swept.iterdir() if path.is_dir()) == NAMES
     with (swept / "scores.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -121,7 +121,7 @@ def test_table_holds_what_the_runs_scored(swept: Path) -> None:
 def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
     folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The command on two workers, of which one is killed while it trains."""
+    """The command on two workers, one of which is killed while it trains."""
     out, killed = tmp_path / "sweep", []
 
     def kill_one() -> None:
@@ -140,19 +140,21 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
 
     killer = threading.Thread(target=kill_one)
     killer.start()
-    command = ["sweep", folder, *SET, "--deterministic", *VARY, "--out", out, "--scheduler", "local:2", "--json"]
+    varied = ["--set", "loss.ssim_weight=0.1", "--vary", "seed=0,1"]
+    command = ["sweep", folder, *SET, "--deterministic", *varied, "--out", out, "--scheduler", "local:2", "--json"]
     status, printed, err = call(command, capsys)
     killer.join()
     assert status == 0, err
     assert killed
     rows = json.loads(printed)
-    assert [Path(row["run"]).name for row in rows] == NAMES
-    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == NAMES
-    assert len(err.splitlines()) == 4
-    for name in NAMES:
-        one, other = read_run(swept / name), read_run(out / name)
-        np.testing.assert_array_equal(other.row, one.row)
-        np.testing.assert_array_equal(other.prediction, one.prediction)
+    names = ["seed=0", "seed=1"]
+    assert [Path(row["run"]).name for row in rows] == names
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == names
+    assert len(err.splitlines()) == 2
+    for name in names:
+        serial, parallel = read_run(swept / f"{name},loss.ssim_weight=0.1"), read_run(out / name)
+        np.testing.assert_array_equal(parallel.row, serial.row)
+        np.testing.assert_array_equal(parallel.prediction, serial.prediction)
         steps = [json.loads(line)["step"] for line in (out / name / "log.jsonl").read_text().splitlines()]
         assert steps == [2, 4]
 
@@ -177,9 +179,7 @@ def test_finished_runs_are_kept_and_others_added_or_done_again(
     refused([*command[:-2], folder], "holds no sweep", capsys)
 
 
-def test_sweep_goes_on_with_the_same_data_and_versions_alone(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = shutil.copytree(folder, tmp_path / "data")
     monkeypatch.setattr(module, "run_module", lambda *call: (1, "not run"))
 
@@ -204,7 +204,7 @@ def test_sweep_goes_on_with_the_same_data_and_versions_alone(
         again()
 
 
-def test_failed_run_is_told_and_the_others_go_on(
+def test_failed_run_is_reported_and_the_others_go_on(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan = plan_sweep(tmp_path / "sweep", ["seed=0,1"], {"dataset": str(folder)})

@@ -7,8 +7,6 @@ import time
 
 import numpy as np
 import pytest
-from wrf_mi_bench.scaling import rows, scale, verdict
-from wrf_mi_bench.scaling_axes import Axis
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.runs import timing
@@ -20,7 +18,6 @@ from wrf_mi.runs.timing import (
     larger_half,
     measure,
     memory_mb,
-    n_log_n,
     ratio,
     split,
 )
@@ -164,27 +161,6 @@ def test_exponent_is_less_sure_of_noisy_times() -> None:
     calm, noisy = (exponent(sizes, [n * rng.lognormal(0, s, 9) for n in sizes]) for s in (0.01, 0.5))
     assert noisy.high - noisy.low > 10 * (calm.high - calm.low)
     assert noisy.low < 1 < noisy.high
-
-
-def test_growth_beyond_n_log_n_is_said(clock: list[float]) -> None:
-    def axis(power: float) -> Axis:
-        def make(n: int):
-            def call() -> None:
-                clock[0] += 1e-7 * n**power
-
-            return call
-
-        return Axis("a", "made up", "things", (10, 100, 1000, 10000), make)
-
-    for power, said in ((1.0, "holds"), (2.0, "does not hold")):
-        found = scale(axis(power))
-        assert found["sizes"] == [10, 100, 1000, 10000]
-        assert rows([found])[0]["asked"].endswith(f": {said}")
-    assert verdict(Interval(1.1, 1.0, 1.3), n_log_n([100, 1000])) == "holds within its interval"
-    # What would take too long is left out, and said.
-    slow = scale(axis(2.0), call_s=1e-3)
-    assert slow["left_out"] == [1000, 10000]
-    assert "1,000 left out" in rows([slow])[0]["what"]
 
 
 @pytest.mark.parametrize("count", [12, 100, 5000])

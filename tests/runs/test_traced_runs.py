@@ -70,7 +70,7 @@ def test_line_of_sight_in_a_room_is_free_space_with_one_offset_each(flat_folder:
     assert read.metrics["abs_error_db"]["median"] == pytest.approx(np.median(read.score))
 
 
-def test_scoring_again_needs_no_tracing_and_says_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluation_reproduces_the_scores_without_tracing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = json.loads((run / "metrics.json").read_text())
     predictions = (run / "predictions.npz").read_bytes()
     again = evaluate_run(run)
@@ -82,7 +82,7 @@ def test_scoring_again_needs_no_tracing_and_says_the_same(run: Path, monkeypatch
     assert json.loads((run / "metrics.json").read_text())["split"] == "official"
 
 
-def test_saved_paths_are_those_of_the_record(flat_folder: Path, run: Path) -> None:
+def test_stored_paths_belong_to_the_record(flat_folder: Path, run: Path) -> None:
     stored = load_trace(run / "paths.npz")
     record = load(flat_folder)
     np.testing.assert_array_equal(stored.tx_pos_m, record.tx_pos_m)
@@ -137,7 +137,7 @@ def test_calibrated_run_reproduces_its_predictions_from_positions_and_headings(
         assert not np.allclose(stored["prediction"], read.prediction, atol=0.1)
 
 
-def test_headings_are_refused_where_unused_and_demanded_where_used(
+def test_headings_are_refused_where_unused_and_required_where_used(
     flat_folder: Path, run: Path, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record, out = load(flat_folder), tmp_path / "p.npz"
@@ -158,7 +158,7 @@ def test_headings_are_refused_where_unused_and_demanded_where_used(
 def test_calibrated_run_of_data_without_headings_predicts_without(
     flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its pattern is fitted in the frame of the world."""
+    """The pattern is fitted in the world frame."""
     record = replace(load(flat_folder), tx_heading_rad=None)
     monkeypatch.setattr("wrf_mi.synthetic.load_record", lambda name: record)
     run = train(record, tmp_path / "run", "ray-tracing", scene=room, settings=CALIBRATED).folder
@@ -195,7 +195,7 @@ def test_calibration_is_kept_and_scores_again(
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 
 
-def test_calibrated_planes_are_left_as_a_scene(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+def test_calibrated_planes_are_stored_as_a_scene(flat_folder: Path, room: Path, tmp_path: Path) -> None:
     run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=["calibration=planes", "steps=3"])
     before, after = (scene_surfaces(open_scene(place, 2.4e9)) for place in (room, run.folder / "corrected"))
     moved = np.abs(run.field.params["plane.shift"]).max()
@@ -205,10 +205,10 @@ def test_calibrated_planes_are_left_as_a_scene(flat_folder: Path, room: Path, tm
     train(flat_folder, tmp_path / "traced", "ray-tracing", scene=run.folder / "corrected")
 
 
-def test_rays_are_counted_once_for_a_run(
+def test_number_of_rays_is_searched_once_for_a_run(
     flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither single samples nor scoring again nor new positions search for another number."""
+    """Timed samples, evaluation and predictions at new positions use the stored number."""
     calls = []
     converged = solve.converged_rays
 
@@ -259,7 +259,7 @@ def test_command_traces_predicts_and_compares(
     assert "idw100" in page
 
 
-def test_train_and_trace_are_one_for_the_ray_tracer(
+def test_train_and_trace_give_equal_scores(
     flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = ["train", flat_folder, "--model", "ray-tracing", "--out", tmp_path / "run", "--json"]
@@ -276,7 +276,7 @@ def test_train_and_trace_are_one_for_the_ray_tracer(
         assert not (tmp_path / "other").exists()
 
 
-def test_comparison_shows_the_scene_while_it_is_there(
+def test_comparison_shows_the_scene_while_it_exists(
     flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7)
@@ -292,14 +292,14 @@ def test_comparison_shows_the_scene_while_it_is_there(
     assert err.count("\n") == 1
 
 
-def test_traced_spectra_are_those_of_the_array(folder: Path, tmp_path: Path) -> None:
-    """A spectrum's instrument is known only where the data state carrier and array."""
+def test_spectra_without_array_are_refused(folder: Path, tmp_path: Path) -> None:
+    """Ray tracing of spectra needs carrier and array of the data set."""
     with pytest.raises(InputError, match="carrier frequency unknown; state frequency_hz in its gateway_info"):
         train(folder, tmp_path / "run", "ray-tracing", scene="laboratory")
     assert not (tmp_path / "run").exists()
 
 
-def test_nothing_is_written_where_something_is_wrong(
+def test_refused_trace_writes_nothing(
     flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -325,7 +325,7 @@ def test_nothing_is_written_where_something_is_wrong(
     st.lists(st.floats(-90, -30), min_size=3, max_size=30),
     st.floats(-40, 40),
 )
-def test_offset_is_the_median_whatever_it_is(traced: list[float], shift: float) -> None:
+def test_fitted_offset_is_the_median(traced: list[float], shift: float) -> None:
     strength = np.array([traced, traced])
     measured = strength + shift
     measured[1, 0] = np.nan
@@ -364,7 +364,7 @@ def test_reflections_bound_the_paths_of_the_command(
     assert "max_reflections -3" in err
 
 
-def test_tracer_reports_as_the_record_does(flat_folder: Path, room: Path) -> None:
+def test_tracer_predicts_free_space_loss(flat_folder: Path, room: Path) -> None:
     record = load(flat_folder)
     tracer = RayTracer(room, instrument_of(record), DIRECT)
     np.testing.assert_allclose(tracer(record.tx_pos_m[:4]), friis_dbm(record)[:, :4], atol=FLOAT32_DB)

@@ -1,8 +1,5 @@
 """Plans with known walls: what is found of them, from maps, points, scans with wrong poses, and layouts."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from made_plans import (
@@ -23,10 +20,9 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.plan import floor_of, layout_walls, make_plan, plan_surfaces
 from wrf_mi.scene.plan_align import grid_from_scans, sensor_of
 from wrf_mi.scene.plan_lines import dominant_direction
-from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, grid_from_points, grid_from_probability, read_layout
+from wrf_mi.scene.plan_sources import PlanPoints, grid_from_points, grid_from_probability
 from wrf_mi.scene.plan_walls import find_walls, joined
 
-DATA = os.environ.get("WRF_MI_DATA")
 CLOSE_M = 0.1
 """Two cells of the maps made here."""
 SHARE = 0.97
@@ -221,25 +217,3 @@ def test_points_that_make_no_grid_are_refused():
     ):
         with pytest.raises(InputError, match=line):
             grid_from_points(points)
-
-
-@pytest.mark.skipif(
-    not DATA or not Path(DATA, "flat-ble", "lidar").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/lidar/"
-)
-def test_flat_from_the_robots_map():
-    from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
-
-    from wrf_mi.scene.plan_sources import read_plan
-    from wrf_mi.scene.register import register_walls
-    from wrf_mi.scene.register_search import sample_walls
-
-    home = Path(DATA, "flat-ble")
-    grid = read_plan(home / "lidar" / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0)
-    assert isinstance(grid, PlanGrid)
-    walls, true = find_walls(grid), layout_walls(read_layout(home / "layout.csv"))
-    registration = register_walls(sample_walls(walls), true)
-    # Measured 0.74 and 0.66; furniture hides 23 % of the layout from the robot, and its fronts look like walls.
-    found, right = wall_agreement(registration.apply(walls), true)
-    assert found > 0.70
-    assert right > 0.60
-    assert registration.scale == pytest.approx(1, abs=0.03)

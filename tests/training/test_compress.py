@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from made_fields import BATCH, COUNT, POSE, SIZE, Float64, fields, image
-from small_fits import QUICK
 from small_fits import settings as small
-from wrf_mi_bench.budget import Budget, budgets, rows_of
 
 from wrf_mi.backend import set_threads
 from wrf_mi.cli.main import main
@@ -221,24 +218,3 @@ def test_skip_settings_reach_predictions(run: Path, one_gateway: Record) -> None
     for name, values in say[0.0][0].items():
         np.testing.assert_array_equal(say[1.0][0][name], values, err_msg=name)
     assert 0 < np.abs(say[1.0][1] - say[0.0][1]).max() <= 1.0 + 1e-3
-
-
-def test_budgets_are_stored_and_compared(folder: Path, one_gateway: Record, tmp_path: Path) -> None:
-    record = replace(one_gateway, source=str(folder))
-    small_one = ("model=factorised", "network.terms=2", "network.width=8")
-    given = {
-        "large": Budget((), None),
-        "small, 8": Budget(small_one, Compression(precision="8bit")),
-        "fewer": Budget((), Compression(budget=5), of="large"),
-    }
-    schedule = (*QUICK, "steps=10", "holdout_steps_fraction=0")
-    found = budgets(record, tmp_path, schedule, given=given)
-    assert found["large"]["times_smaller"] == 1
-    assert found["small, 8"]["times_smaller"] > 10
-    assert found["small, 8"]["ssim_loss"] == found["large"]["ssim"]["median"] - found["small, 8"]["ssim"]["median"]
-    assert [one["gaussians"] for one in found.values()] == [8, 8, 5]
-    again = budgets(record, tmp_path, schedule, given=given)
-    assert again["small, 8"]["train_seconds"] == found["small, 8"]["train_seconds"]  # not fitted anew
-    rows = rows_of(found)
-    assert rows[0]["asked"] == ""
-    assert "times smaller" in rows[1]["value"]

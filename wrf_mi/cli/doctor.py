@@ -1,12 +1,7 @@
-"""What was found on this machine, what is missing, and the remedy for it.
-
-``python -m wrf_mi.cli.doctor [--install-llvm] [--json]`` works where the command is not installed yet.
-"""
+"""``wrf-mi doctor``: packages, backends and data on this machine, and remedies for what is missing."""
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import platform
 import shutil
@@ -15,19 +10,29 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from wrf_mi.backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
-from wrf_mi.backend.probe import Verdict, try_cuda, try_llvm
-from wrf_mi.backend.remedy import install_commands, package_manager
+from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
+from ..backend.probe import try_cuda, try_llvm
+from ..backend.remedy import install_commands, package_manager
+from .options import Arguments, add_command
+from .output import print_json
 
 _PACKAGES = ("wrf-mi", "mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image")
 _DATA_VARIABLE = "WRF_MI_DATA"
 
 
+def add_parser(commands: Any) -> None:
+    """Add ``doctor`` to the commands."""
+    text = "show which backend, LLVM, GPU and data were found, and the remedy for what is missing"
+    parser = add_command(commands, "doctor", doctor_command, text)
+    text = "first install LLVM with the system's package manager if no backend works"
+    parser.add_argument("--install-llvm", action="store_true", help=text)
+
+
 def report() -> dict[str, Any]:
-    """Looks at everything, and tries each LLVM and the GPU anew. Dr.Jit is not imported.
+    """State of this machine; each LLVM and the GPU are tried anew. Dr.Jit is not imported.
 
     Returns:
-        JSON-able: ``ok`` (a backend works and all packages are there), ``python``, ``system``, ``versions``
+        Values for JSON: ``ok`` (a backend works and all packages are installed), ``python``, ``system``, ``versions``
         (package to version or None), ``threads`` (cores this process may use), ``backend`` (the fields of
         `wrf_mi.backend.Backend`, or None), ``llvm`` (a list of path, version, usable, reason), ``gpu`` (driver,
         usable, reason, device), ``data`` (home, cache, sets: a list of name, task, folder or None) and ``problems`` (a
@@ -54,7 +59,7 @@ def report() -> dict[str, Any]:
         "python": f"{platform.python_version()} ({sys.executable})",
         "system": platform.platform(),
         "versions": versions,
-        "threads": _threads(),
+        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "backend": backend,
         "llvm": llvm,
         "gpu": gpu,
@@ -64,17 +69,15 @@ def report() -> dict[str, Any]:
 
 
 def render(found: dict[str, Any]) -> str:
-    """The report for a reader, several lines of text."""
+    """Report as text."""
     backend = found["backend"]
     lines = [
         ("backend", f"{backend['name']} ({backend['variant']}) on {backend['device']}" if backend else "none"),
         ("threads", str(found["threads"])),
         ("GPU", found["gpu"]["device"] or found["gpu"]["reason"]),
     ]
-    for library in found["llvm"] or [None]:
-        lines.append(("LLVM", _llvm_line(library, backend) if library else "none found"))
-    lines.append(("Python", found["python"]))
-    lines.append(("system", found["system"]))
+    lines += [("LLVM", _llvm_line(library, backend)) for library in found["llvm"]] or [("LLVM", "none found")]
+    lines += [("Python", found["python"]), ("system", found["system"])]
     lines += [(name, text or "not installed") for name, text in found["versions"].items()]
     lines.append(("data", found["data"]["home"]))
     lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in found["data"]["sets"]]
@@ -86,25 +89,25 @@ def render(found: dict[str, Any]) -> str:
 
 
 def install_llvm() -> None:
-    """Installs an LLVM that works, with apt, dnf or brew; does nothing if there is a working backend.
+    """Install an LLVM that works, with apt, dnf or brew, unless a backend works already.
 
-    Runs as root, or with a ``sudo`` that asks for no password. The package manager's own output appears.
+    Runs as root, or with a ``sudo`` that asks for no password. The package manager prints its output.
 
     Raises:
-        BackendError: it may not, or it did not help: one line with the command that a person can run.
+        BackendError: no permission, or no working LLVM afterwards: one line with the command to run by hand.
     """
     try:
         choose()
         return
     except BackendError as error:
-        # A library that the variable names is the user's own business, and no package takes its place.
+        # A library that the variable names is the user's choice: no package replaces it.
         if os.environ.get("DRJIT_LIBLLVM_PATH") or not install_commands():
             raise
         prefix = _privilege()
         if prefix is None:
             raise
         reason = error
-    # The second round is for package lists that are empty, or so old that their files are gone.
+    # The second round is for package lists that are empty or outdated.
     for refresh in (False, True):
         if refresh and package_manager() == "apt-get":
             _run([*prefix, "apt-get", "update"])
@@ -118,23 +121,15 @@ def install_llvm() -> None:
     raise BackendError(f"installing LLVM did not help: {reason}")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """The command line of this module; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m wrf_mi.cli.doctor", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--install-llvm", action="store_true", help="install LLVM if no backend works, and say nothing else"
-    )
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    options = parser.parse_args(arguments)
-    try:
-        if options.install_llvm:
-            install_llvm()
-            return 0
-    except BackendError as error:
-        print(error, file=sys.stderr)
-        return 1
+def doctor_command(a: Arguments) -> int:
+    """Report on this machine, after installing LLVM where that is asked for."""
+    if a.install_llvm:
+        install_llvm()
     found = report()
-    print(json.dumps(found, indent=2) if options.json else render(found))
+    if a.json:
+        print_json(found)
+    else:
+        print(render(found))
     return 0 if found["ok"] else 1
 
 
@@ -145,14 +140,10 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _verdict(verdict: Verdict) -> dict[str, Any]:
-    return {"usable": verdict.usable, "reason": verdict.reason}
-
-
 def _llvm(library: LlvmLibrary) -> dict[str, Any]:
     verdict = try_llvm(library, fresh=True)
     number = verdict.version or ".".join(map(str, library.version))
-    return {"path": str(library.path), "version": number, **_verdict(verdict)}
+    return {"path": str(library.path), "version": number, "usable": verdict.usable, "reason": verdict.reason}
 
 
 def _gpu() -> dict[str, Any]:
@@ -160,13 +151,12 @@ def _gpu() -> dict[str, Any]:
     if driver is None:
         return {"driver": None, "usable": False, "reason": "no NVIDIA GPU with its driver", "device": ""}
     verdict = try_cuda(driver, fresh=True)
-    return {"driver": str(driver), **_verdict(verdict), "device": verdict.device}
+    return {"driver": str(driver), "usable": verdict.usable, "reason": verdict.reason, "device": verdict.device}
 
 
 def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
-    """Where data sets are looked for and which of the known ones are there; a problem for what can be fetched."""
-    # Imported late: installing LLVM must not need the packages that read data.
-    from wrf_mi.datasets import data_home, datasets, user_cache
+    """Folders of data sets; a problem for each that can be fetched."""
+    from ..datasets import data_home, datasets, user_cache
 
     home = data_home()
     if os.environ.get(_DATA_VARIABLE) and not home.is_dir():
@@ -176,16 +166,9 @@ def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
         name, folder = entry.dataset.name, entry.location
         sets.append({"name": name, "task": entry.dataset.task, "folder": str(folder) if folder else None})
         if folder is None and entry.dataset.base_url is not None:
-            remedy = f"wrf-mi data fetch {name}"
-            problems.append({"problem": f"the data set {name} is not on this machine", "remedy": remedy})
+            problem = f"the data set {name} is not on this machine"
+            problems.append({"problem": problem, "remedy": f"wrf-mi data fetch {name}"})
     return {"home": str(home), "cache": str(user_cache()), "sets": sets}
-
-
-def _threads() -> int:
-    """Cores this process may use, which is how many threads Dr.Jit starts."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _llvm_line(library: dict[str, Any], backend: dict[str, Any] | None) -> str:
@@ -195,7 +178,7 @@ def _llvm_line(library: dict[str, Any], backend: dict[str, Any] | None) -> str:
 
 
 def _privilege() -> list[str] | None:
-    """What goes before a command that changes the system; None if it may not be changed from here."""
+    """Prefix of commands that change the system; None without permission."""
     if package_manager() == "brew" or os.geteuid() == 0:
         return []
     sudo = shutil.which("sudo")
@@ -208,7 +191,3 @@ def _run(command: list[str]) -> bool:
     print("+", *command, file=sys.stderr, flush=True)
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     return subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode == 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,8 +1,8 @@
-"""The learned fields: Gaussian parameters, starting values, networks."""
+"""Learned fields of Gaussians: parameters, starting values, networks, splatting and operators."""
 
 from ..backend import init
 
-# Dr.Jit loads an LLVM of its own choice when it is imported: ours must be chosen before.
+# Dr.Jit loads an LLVM when it is imported, so the choice must be made before.
 init()
 
 from .factorised import Factorised

@@ -1,7 +1,9 @@
 """Complex blending of footprints on the perception plane, and its hand-written derivative.
 
 The recurrence is that of `wrf_mi.gaussians.recurrence`; a lane of a vector register walks the list of its tile for a
-few pixels of one column.
+few pixels of one column. Under either rule a weight w_i T_i depends on geometry alone. Where transmitters share one
+geometry, a lane therefore keeps the sums of up to `GROUP` transmitters with one transmittance, and the reverse pass
+one Q: a further transmitter costs two products per pixel instead of a footprint's exponential.
 """
 
 from __future__ import annotations
@@ -14,20 +16,31 @@ import drjit as dr
 
 from ..backend.device import quads
 from .footprint import Footprints
-from .footprint_constants import CUTOFF, MIN_COSINE
-from .recurrence import Pair, Rest, Sum, ahead, before, behind, plus
+from .footprint_constants import CUTOFF, LOG2_E, MIN_COSINE
+from .recurrence import ForwardState, Pair, ReverseState, accumulate, forward_step, reverse_start, reverse_step
 from .tiles import LANE_ROWS, Plane, TileLists
 
 RECORD = 16
-"""Floats per Gaussian in the packed table: n, a, b (3 each), then blending attributes; one cache line."""
+"""Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, signal, reach."""
+
+GROUP = 4
+"""Transmitters whose sums a lane keeps: more would not fit into its registers."""
 
 MOST_COPIED = 1 << 16
-"""Floats of a gradient table of which each lane of each thread may sum into a copy of its own: some MB in all.
+"""Floats of a gradient table of which each lane of each thread may sum into its private copy: some MB in all.
 
 That takes a fifth less time than sums in place, but the copies of larger tables leave the cache.
 """
 
-LOG2_E = 1.4426950408889634
+
+def group_size(batch: int) -> int:
+    """The largest divisor of a batch that is no larger than `GROUP`."""
+    return next(k for k in range(min(GROUP, batch), 0, -1) if batch % k == 0)
+
+
+def columns_of(footprints: Footprints, blending: list[Any]) -> list[Any]:
+    """Per-Gaussian arrays of a table in the order of its records: footprint, then opacity or delta."""
+    return [*footprints.direction, *footprints.whitened[0], *footprints.whitened[1], *blending]
 
 
 def pack(columns: list[Any]) -> Any:
@@ -40,6 +53,12 @@ def pack(columns: list[Any]) -> Any:
     return table
 
 
+def unpack(table: Any, count: int) -> list[Any]:
+    """The first ``count`` columns of a table that `pack` makes."""
+    index = dr.arange(dr.uint32_array_t(type(table)), dr.width(table) // RECORD) * RECORD
+    return [dr.gather(type(table), table, index + k) for k in range(count)]
+
+
 def read(table: Any, i: Any, count: int) -> list[Any]:
     """The first ``count`` numbers of record i of the table that `pack` makes, four with each lookup."""
     kind = quads(type(table))
@@ -47,17 +66,17 @@ def read(table: Any, i: Any, count: int) -> list[Any]:
     return [value for part in parts for value in part][:count]
 
 
-def _along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
-    """What n . u, a . u and b . u are in terms of elevation: pairs (factor of its cosine, factor of its sine).
+def along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
+    """The products n . u, a . u and b . u as factors of the cosine and of the sine of the elevation.
 
-    All pixels of a lane share their azimuth.
+    All pixels of a lane share their azimuth (cosine, sine).
     """
     cosine, sine = azimuth
     return [[dr.fma(x, cosine, y * sine), z] for x, y, z in (record[0:3], record[3:6], record[6:9])]
 
 
-def _footprint(along: list[Any], elevation: list[Any]) -> tuple[Any, Any, Any, Any]:
-    """Footprint G' at one elevation, the whitened coordinates p, q and 1 / (n . u)."""
+def footprint_at(along: list[Any], elevation: list[Any]) -> tuple[Any, Any, Any, Any]:
+    """Footprint G' at one elevation (cosine, sine), the whitened coordinates p, q and 1 / (n . u)."""
     cosine, sine = elevation
     facing, p, q = (dr.fma(h, cosine, z * sine) for h, z in along)
     inverse = dr.rcp(facing)
@@ -67,53 +86,84 @@ def _footprint(along: list[Any], elevation: list[Any]) -> tuple[Any, Any, Any, A
     return dr.select(inside, dr.exp2(-0.5 * LOG2_E * square), 0), p, q, inverse
 
 
+def _signal_slots(n: int, batch: int, index_type: Any) -> Any:
+    """Position of each signal's real part, [batch * n], in a table [groups, n, 2 * group]."""
+    group, index = group_size(batch), dr.arange(index_type, batch * n)
+    b, i = index // n, index % n
+    return ((b // group) * n + i) * (2 * group) + (b % group) * 2
+
+
+def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
+    """Signals (re, im) [batch * n] as a table that gives those of a group with one lookup."""
+    slots = _signal_slots(n, batch, dr.uint32_array_t(type(signal[0])))
+    table = dr.zeros(type(signal[0]), 2 * batch * n)
+    for part in (0, 1):
+        dr.scatter(table, signal[part], slots + part)
+    return table
+
+
+def _read_signals(table: Any, slot: Any, group: int) -> list[Pair]:
+    """Signals of a group for one Gaussian."""
+    if group % 2:
+        values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
+    else:
+        packets = [dr.gather(quads(type(table)), table, slot * (group // 2) + k) for k in range(group // 2)]
+        values = [v for packet in packets for v in packet]
+    return list(zip(values[::2], values[1::2], strict=True))
+
+
 @dataclass
 class Lanes:
-    """The pixels of all transmitters, in lanes."""
+    """Pixels in lanes, for all groups of transmitters.
+
+    Attributes:
+        azimuth: cosine and sine, [lanes] each.
+        elevation: for each of a lane's pixels cosine and sine, [lanes] each.
+        pixel: for each of a lane's pixels its numbers in the images of the group's transmitters, [lanes] each.
+        active: for each of a lane's pixels a mask [lanes].
+        start: begin of the lane's list, [lanes].
+        end: length of the lane's list, [lanes].
+        group: number of the lane's group of transmitters, [lanes].
+    """
 
     azimuth: list[Any]
     elevation: list[list[Any]]
-    pixel: list[Any]
+    pixel: list[list[Any]]
     active: list[Any]
     start: Any
     end: Any
+    group: Any
 
 
-def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int) -> Lanes:
-    """Pixels and lists of ``batch`` transmitters with n Gaussians each."""
+def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = False) -> Lanes:
+    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
     index_type = type(lists.index)
-    lane = dr.arange(index_type, batch * plane.lanes)
-    inner, b = lane % plane.lanes, lane // plane.lanes
+    size = group_size(batch) if shared else 1
+    lane = dr.arange(index_type, batch // size * plane.lanes)
+    inner, group = lane % plane.lanes, lane // plane.lanes
 
-    def of(array: Any) -> Any:
+    def spread(array: Any) -> Any:
         return dr.gather(type(array), array, inner)
 
-    tile = b * plane.tiles + of(plane.tile)
+    tile = spread(plane.tile) if shared else group * plane.tiles + spread(plane.tile)
     return Lanes(
-        azimuth=[of(a) for a in plane.azimuth],
-        elevation=[[of(c) for c in e] for e in plane.elevation],
-        pixel=[b * plane.pixels + of(p) for p in plane.pixel],
-        active=[of(a) for a in plane.active],
+        azimuth=[spread(a) for a in plane.azimuth],
+        elevation=[[spread(c) for c in e] for e in plane.elevation],
+        pixel=[[(group * size + k) * plane.pixels + spread(p) for k in range(size)] for p in plane.pixel],
+        active=[spread(a) for a in plane.active],
         start=lists.begin(tile, n),
         end=dr.gather(index_type, lists.length, tile),
+        group=group,
     )
 
 
-def add(record: list[Any], own: list[Any], signals: list[Pair], lanes: Lanes, so_far: Sum) -> Sum:
-    """One more Gaussian, behind all before it.
-
-    Args:
-        record: begins with n, a and b.
-        own: opacity or delta, see `wrf_mi.gaussians.recurrence`.
-        signals: S of each transmitter.
-        lanes: the pixels.
-        so_far: of them.
-    """
-    along = _along_azimuth(record, lanes.azimuth)
-    result = Sum([], [])
-    for elevation, total, t in zip(lanes.elevation, so_far.total, so_far.t, strict=True):
-        weight, after = ahead(own, _footprint(along, elevation)[0], t)
-        result.total.append([plus(r, weight, s) for r, s in zip(total, signals, strict=True)])
+def _blend_one(record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ForwardState) -> ForwardState:
+    """State behind one more Gaussian, of ``fields`` numbers without its signal."""
+    along = along_azimuth(record, lanes.azimuth)
+    result = ForwardState([], [])
+    for elevation, total, t in zip(lanes.elevation, state.total, state.t, strict=True):
+        weight, after = forward_step(record[9:fields], footprint_at(along, elevation)[0], t)
+        result.total.append([accumulate(r, weight, s) for r, s in zip(total, signals, strict=True)])
         result.t.append(after)
     return result
 
@@ -125,95 +175,105 @@ def _brightest(t: list[Pair], product: bool) -> Any:
 
 @dr.syntax
 def _forward(
-    table: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, early: bool = False
+    table: Any, signals: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, early: bool
 ) -> tuple[Any, Any]:
+    """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
     float_type, index_type = type(table), type(lists.index)
-    lanes = lanes_of(plane, lists, n, batch)
-    fields = 13 if product else 12
-    state = Sum.start(float_type, LANE_ROWS)
+    shared, fields = signals is not None, 11 if product else 10
+    size = group_size(batch) if shared else 1
+    lanes = lanes_of(plane, lists, n, batch, shared)
+    state = ForwardState.start(float_type, LANE_ROWS, size)
     j, end = index_type(0), index_type(lanes.end)
     while j < end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
         if dr.hint(early, mode="scalar"):
-            # This Gaussian is the lane's last once it and all behind it can send no more than what is allowed.
-            reach = dr.gather(float_type, table, i * RECORD + fields)
+            # This Gaussian is the lane's last once it and all behind it can send no more than the tolerance.
+            reach = dr.gather(float_type, table, i * RECORD + fields + 2)
             end = dr.select(_brightest(state.t, product) * reach * reach <= 1, j, end)
-        record = read(table, i, fields)
-        state = add(record, record[11:], [(record[9], record[10])], lanes, state)
+        record = read(table, i, fields if shared else fields + 2)
+        sent = _read_signals(signals, lanes.group * n + i, size) if shared else [tuple(record[fields:])]
+        state = _blend_one(record, fields, sent, lanes, state)
         j += 1
-    # Each scatter below is a kernel of its own, which would run the loop again.
+    # Each scatter below is a kernel that would run the loop again.
     dr.eval(state.total)
     out_re, out_im = dr.zeros(float_type, batch * plane.pixels), dr.zeros(float_type, batch * plane.pixels)
-    for k in range(LANE_ROWS):
-        dr.scatter(out_re, state.total[k][0][0], lanes.pixel[k], lanes.active[k])
-        dr.scatter(out_im, state.total[k][0][1], lanes.pixel[k], lanes.active[k])
+    for row in range(LANE_ROWS):
+        for k in range(size):
+            dr.scatter(out_re, state.total[row][k][0], lanes.pixel[row][k], lanes.active[row])
+            dr.scatter(out_im, state.total[row][k][1], lanes.pixel[row][k], lanes.active[row])
     return out_re, out_im
 
 
-def take_away(
-    record: list[Any], own: list[Any], signals: list[Pair], lanes: Lanes, rest: Rest, slopes: list[list[Pair]]
-) -> tuple[list[Any], list[Any], list[Pair], Any, Rest]:
-    """One Gaussian's derivatives, summed over a lane's pixels: of n, a and b, of ``own`` and of each signal.
+def _derivatives(
+    record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ReverseState, slopes: list[list[Pair]]
+) -> tuple[list[Any], list[Any], Any, ReverseState]:
+    """One Gaussian's derivatives by its record and by its signals, summed over a lane's pixels.
 
-    Arguments as of `add`, and the rest and gradients of `wrf_mi.gaussians.recurrence.before`. Also returned: whether
-    any pixel sees the Gaussian, and the rest behind it.
+    Also returned: whether any pixel sees the Gaussian, and the state behind it.
     """
-    along = _along_azimuth(record, lanes.azimuth)
+    along = along_azimuth(record, lanes.azimuth)
     sums: list[list[Any]] = [[0, 0] for _ in range(3)]
-    by_own: list[Any] = [0 for _ in own]
+    by_blending: list[Any] = [0] * (fields - 9)
     by_signal: list[Pair] = [(0, 0) for _ in signals]
-    after, seen = Rest([], []), False
+    after, seen = ReverseState([], []), False
     for k, elevation in enumerate(lanes.elevation):
-        g, x, y, inverse = _footprint(along, elevation)
-        by_g, d_own, d_signal, t, q = behind(own, g, rest.t[k], rest.q[k], signals, slopes[k])
+        g, x, y, inverse = footprint_at(along, elevation)
+        by_g, d_blending, d_signal, t, q = reverse_step(record[9:fields], g, state.t[k], state.q[k], signals, slopes[k])
         after.t.append(t)
         after.q.append(q)
         f = dr.select(g > 0, -by_g * g * inverse, 0)
         d_x, d_y = f * x, f * y
         for pair, d in zip(sums, (-(d_x * x + d_y * y), d_x, d_y), strict=True):
             pair[0], pair[1] = dr.fma(d, elevation[0], pair[0]), dr.fma(d, elevation[1], pair[1])
-        by_own = [a + b for a, b in zip(by_own, d_own, strict=True)]
+        by_blending = [a + b for a, b in zip(by_blending, d_blending, strict=True)]
         by_signal = [(a + c, b + d) for (a, b), (c, d) in zip(by_signal, d_signal, strict=True)]
         seen |= g > 0
     cosine, sine = lanes.azimuth
     vectors = [c for level, up in sums for c in (level * cosine, level * sine, up)]
-    return vectors, by_own, by_signal, seen, after
+    return [*vectors, *by_blending], [part for pair in by_signal for part in pair], seen, after
 
 
 @dr.syntax
 def _backward(
-    table: Any,
+    table: Any,  # [batch * n * RECORD], or [n * RECORD] of a shared geometry
+    signals: Any,  # [2 * batch * n] of a shared geometry, else None
     lists: TileLists,
     plane: Plane,
     n: int,
     product: bool,
     batch: int,
-    total: tuple[Any, Any],
-    gradient: tuple[Any, Any],
-) -> Any:
-    """Gradient table [batch * n * RECORD] in the layout of ``table``."""
+    total: tuple[Any, Any],  # re, im, [batch * pixels] each
+    gradient: tuple[Any, Any],  # re, im, [batch * pixels] each
+) -> tuple[Any, Any]:
+    """Gradients of both tables, in their layouts."""
     float_type, index_type = type(table), type(lists.index)
-    lanes = lanes_of(plane, lists, n, batch)
-    slopes, rest = before([[pixel] for pixel in lanes.pixel], lanes.active, total, gradient)
-    fields = 13 if product else 12
+    shared, fields = signals is not None, 11 if product else 10
+    size = group_size(batch) if shared else 1
+    lanes = lanes_of(plane, lists, n, batch, shared)
+    slopes, state = reverse_start(lanes.pixel, lanes.active, total, gradient)
     out = dr.zeros(float_type, dr.width(table))
-    dr.eval(out)
-    mode = dr.ReduceMode.Auto if dr.width(table) <= MOST_COPIED else dr.ReduceMode.Local
+    out_signals = dr.zeros(float_type, dr.width(signals)) if shared else None
+    dr.eval(out, out_signals, (slopes, state) if shared else None)
+    copied = dr.width(table) + (dr.width(signals) if shared else 0) <= MOST_COPIED
+    mode = dr.ReduceMode.Auto if copied else dr.ReduceMode.Local
     j = index_type(0)
     while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
-        record = read(table, i, fields)
-        signals = [(record[9], record[10])]
-        vectors, by_own, by_signal, seen, rest = take_away(record, record[11:], signals, lanes, rest, slopes)
-        values = [*vectors, *by_signal[0], *by_own]
-        for k in range(fields):
+        slot = lanes.group * n + i
+        record = read(table, i, fields if shared else fields + 2)
+        sent = _read_signals(signals, slot, size) if shared else [tuple(record[fields:])]
+        values, by_signal, seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
+        values, by_signal = (values, by_signal) if shared else (values + by_signal, [])
+        for k in range(len(values)):
             dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=mode)
+        for k in range(len(by_signal)):
+            dr.scatter_reduce(dr.ReduceOp.Add, out_signals, by_signal[k], slot * (2 * size) + k, seen, mode=mode)
         j += 1
-    return out
+    return out, out_signals
 
 
 class _Blend(dr.CustomOp):
-    """Blending as one differentiable operation over per-Gaussian columns."""
+    """Blending as one differentiable operation over per-Gaussian columns and signals."""
 
     def eval(
         self,
@@ -222,24 +282,33 @@ class _Blend(dr.CustomOp):
         n: int,
         product: bool,
         batch: int,
+        shared: bool,
         columns: list[Any],
+        signal: list[Any],
         reach: Any | None,
     ) -> Any:
-        self.parts = (lists, plane, n, product, batch)
+        self.arguments = (lists, plane, n, product, batch)
         self.count = len(columns)
-        self.table = pack(columns if reach is None else [*columns, reach])
-        dr.eval(self.table)
-        self.total = _forward(self.table, *self.parts, reach is not None)
+        self.table = pack([*columns, *([] if shared else signal), *([] if reach is None else [reach])])
+        self.signals = _pack_signals(signal, n, batch) if shared else None
+        dr.eval(self.table, self.signals)
+        self.total = _forward(self.table, self.signals, *self.arguments, reach is not None)
         dr.eval(self.total)
         return self.total
 
     def backward(self) -> None:
         gradient: Any = self.grad_out()
         dr.eval(gradient)
-        out = _backward(self.table, *self.parts, self.total, gradient)
-        dr.eval(out)
-        index = dr.arange(dr.uint32_array_t(type(out)), dr.width(out) // RECORD) * RECORD
-        self.set_grad_in("columns", [dr.gather(type(out), out, index + k) for k in range(self.count)])
+        out, out_signals = _backward(self.table, self.signals, *self.arguments, self.total, gradient)
+        dr.eval(out, out_signals)
+        columns = unpack(out, self.count + 2)
+        if out_signals is None:
+            by_signal = columns[self.count :]
+        else:
+            slots = _signal_slots(self.arguments[2], self.arguments[4], dr.uint32_array_t(type(out)))
+            by_signal = [dr.gather(type(out), out_signals, slots + part) for part in (0, 1)]
+        self.set_grad_in("columns", columns[: self.count])
+        self.set_grad_in("signal", by_signal)
 
     def name(self) -> str:
         return "wrf_mi blending"
@@ -251,36 +320,38 @@ def blend(
     lists: TileLists,
     plane: Plane,
     batch: int,
-    opacity: Any | None = None,
-    attenuation: list[Any] | None = None,
+    blending: list[Any],
     reach: Any | None = None,
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel.
 
     Args:
-        footprints: of ``batch * n`` Gaussians.
-        signal: complex signal (re, im), two arrays [batch * n].
-        lists: Gaussians of each tile, near to far.
+        footprints: footprints of ``batch * n`` Gaussians, or of n that all transmitters share.
+        signal: complex signal (re, im), two arrays [batch * n], batch-major.
+        lists: Gaussians of each tile, near to far; of one transmitter where footprints are shared.
         plane: the perception plane.
         batch: number of transmitters.
-        opacity: array [batch * n] in [0, 1); alpha blending.
-        attenuation: complex factor delta (re, im), |delta| < 1; product blending.
-        reach: bound of what a Gaussian and all behind it send (`wrf_mi.gaussians.skip.behind`) in units of the error
-            that is allowed, [batch * n]; a pixel's walk then ends once T times it is below 1. None: walk to the end.
+        blending: one array of opacities in [0, 1) (alpha blending), or real and imaginary part of delta, |delta| < 1
+            (product blending), as many numbers as footprints.
+        reach: bound of the signal of a Gaussian and all behind it (`wrf_mi.gaussians.skip.signal_bounds`) divided by
+            the tolerated error, [batch * n]; the walk of a pixel then ends once T times it is below 1. None: all
+            Gaussians are visited.
 
     Returns:
         Real and imaginary part of R, arrays [batch * height * width], row-major. Differentiable in
-        footprints, signal, and opacity or attenuation.
+        footprints, signal and ``blending``.
 
     Raises:
         ValueError: gradients of walks that end early, which are not bounded.
     """
-    product = attenuation is not None
     n = dr.width(signal[0]) // batch
-    own = attenuation if attenuation is not None else [opacity]
-    columns = [*footprints.direction, *footprints.whitened[0], *footprints.whitened[1], *signal, *own]
-    if reach is not None and dr.grad_enabled(columns):
+    columns = columns_of(footprints, blending)
+    if reach is not None and dr.grad_enabled(columns, signal):
         raise ValueError(
             "blend: walks that end early give no gradients; leave skip.early_stop_tolerance at 0 in training"
         )
-    return dr.custom(_Blend, lists, plane, n, product, batch, columns, reach)
+    shared = batch > 1 and dr.width(footprints.radius) == n
+    result: tuple[Any, Any] = dr.custom(
+        _Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal, reach
+    )
+    return result

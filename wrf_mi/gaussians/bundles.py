@@ -1,19 +1,18 @@
 """Rays from one point, in bundles of similar direction that share one list of Gaussians.
 
-A lane of a vector register owns a few rays of a bundle, and what it reads of a Gaussian serves them all.
+A lane of a vector register owns a few rays of a bundle, and each record of a Gaussian that it reads serves them all.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.device import on_device
+from .tiles import LANE_ROWS, TILE_COLUMNS, TILE_ROWS, tiling
 
 
 @dataclass
@@ -21,17 +20,15 @@ class Bundles:
     """Rays from one point, in bundles of similar direction.
 
     Attributes:
-        count: number of rays.
         direction: for each of a lane's rays its unit vector, receiver's frame, three arrays [lanes].
         ray: for each of a lane's rays its number, [lanes].
         active: for each of a lane's rays: False where it only fills the bundle, [lanes].
-        place: for each ray where it stands among all first rays of lanes, then all second ones and so on, [rays].
+        place: for each ray its position among all first rays of lanes, then all second ones and so on, [rays].
         bundle: bundle of each lane, [lanes].
         axis: middle direction of each bundle, unit vectors, three arrays [bundles].
         margin_rad: largest angle between a ray and the axis of its bundle, and room for rounding.
     """
 
-    count: int
     direction: list[list[Any]]
     ray: list[Any]
     active: list[Any]
@@ -46,37 +43,21 @@ class RayLists:
     """For each bundle the Gaussians that its rays may meet, from near to far.
 
     Attributes:
-        index: numbers of Gaussians, all lists behind each other.
-        start: where each list begins, [bundles + 1].
+        index: numbers of Gaussians, all lists concatenated.
+        begin: begin of each list in ``index``, [bundles].
+        end: end of each list, [bundles].
     """
 
     index: Any
-    start: Any
+    begin: Any
+    end: Any
 
 
-TILES = ((10, 8, 5), (1, 1, 1))
-"""Rows and columns of pixels in a bundle, and rows in a lane: the first whose bundles are narrow enough is taken."""
+TILES = ((TILE_ROWS, TILE_COLUMNS, LANE_ROWS), (1, 1, 1))
+"""Rows and columns of pixels in a bundle, and rows in a lane: the first with bundles narrow enough is taken."""
 
 WIDEST_RAD = np.radians(15.0)
-"""Largest margin of a bundle. Its list holds what any ray within the margin meets, so wide ones read in vain."""
-
-
-@lru_cache(maxsize=32)
-def _tiling(height: int, width: int, tile: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Rays of each bundle [bundles, rays], of each lane [rows, lanes] (clamped to the image), and which are in it."""
-    rows, columns, group = tile
-    down, across = -(-height // rows), -(-width // columns)
-    row = np.arange(down * rows).reshape(down, 1, rows, 1)
-    column = np.arange(across * columns).reshape(1, across, 1, columns)
-    inside = ((row < height) & (column < width)).reshape(-1)
-    number = np.minimum(row, height - 1) * width + np.minimum(column, width - 1)
-    number = np.broadcast_to(number, (down, across, rows, columns)).astype(np.uint32)
-    inside = np.broadcast_to((row < height) & (column < width), number.shape)
-    by_lane = [
-        a.reshape(down * across, rows // group, group, columns).transpose(2, 0, 1, 3).reshape(group, -1)
-        for a in (number, inside)
-    ]
-    return number.reshape(down * across, rows * columns), by_lane[0], by_lane[1]
+"""Largest margin of a bundle. Its list holds all Gaussians within the margin, most of them in vain in a wide one."""
 
 
 def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
@@ -90,15 +71,15 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
     float_type: Any = type(direction[0])
     index_type, mask_type = dr.uint32_array_t(float_type), dr.mask_t(float_type)
     for tile in TILES:
-        members, lanes, inside = _tiling(height, width, tile)
+        members, lanes, inside = tiling(height, width, tile)
         size = members.shape[1]
         index = on_device(members, index_type)
-        own = [dr.gather(float_type, c, index) for c in direction]
-        axis = [dr.block_sum(c, size) for c in own]
+        rays = [dr.gather(float_type, c, index) for c in direction]
+        axis = [dr.block_sum(c, size) for c in rays]
         norm = dr.rsqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
         axis = [c * norm for c in axis]
         repeated = [dr.repeat(c, size) for c in axis]
-        chord = dr.max(sum((a - b) ** 2 for a, b in zip(own, repeated, strict=True)))
+        chord = dr.max(sum((a - b) ** 2 for a, b in zip(rays, repeated, strict=True)))
         dr.eval(axis, chord)
         # Rays that point everywhere have no middle: NaN, which is not narrow.
         margin = float(2 * np.arcsin(min(np.sqrt(chord[0]) / 2, 1.0)))
@@ -106,7 +87,6 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
             break
     ray = [on_device(r, index_type) for r in lanes]
     result = Bundles(
-        count=height * width,
         direction=[[dr.gather(float_type, c, r) for c in direction] for r in ray],
         ray=ray,
         active=[on_device(i, mask_type) for i in inside],
@@ -128,4 +108,5 @@ def all_lists(order: Any, bundles: Bundles) -> RayLists:
         bundles: the rays.
     """
     count, n = dr.width(bundles.axis[0]), dr.width(order)
-    return RayLists(dr.tile(order, count), dr.arange(type(order), count + 1) * n)
+    begin = dr.arange(type(order), count) * n
+    return RayLists(dr.tile(order, count), begin, begin + n)

@@ -1,9 +1,9 @@
 """Adaptive density control: clone, split, prune, opacity reset (Kerbl et al. 2023, section 5.2).
 
-Works on parameters as NumPy arrays with the Gaussians in the last axis, between two steps. What it measures is
-how strongly the loss asks a Gaussian to move: the gradient by its centre times its distance from the
-receiver, which is the gradient by its direction. Where the paper is silent, the Gaussians that grow are those
-with the largest such mean, a fixed share of all in a round, so that no threshold depends on the loss's scale.
+Works on parameters as NumPy arrays with the Gaussians in the last axis, between two steps. The criterion is the mean
+gradient of the loss by a Gaussian's direction: the gradient by its centre times its distance from the receiver. Where
+the paper is silent, a fixed share of the Gaussians with the largest mean grows in a round, so that no threshold depends
+on the scale of the loss.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 
 from ..core import rotation_matrix
 
 Arrays = dict[str, NDArray[np.float32]]
 
 SPLIT_SHRINK = 1.6
-"""A split Gaussian's parts are smaller by this factor (Kerbl et al. 2023)."""
+"""Ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,11 @@ class DensityChange:
 
     Attributes:
         parameters: per-Gaussian parameters of the new set, [k, m].
-        source: the old Gaussian from which each new one comes, [m].
+        source: old Gaussian of each new one, [m].
         fresh: new Gaussians whose optimiser moments start at zero, [m].
-        cloned: how many were cloned.
-        split: how many were split.
-        pruned: how many were removed.
+        cloned: number of cloned Gaussians.
+        split: number of split Gaussians.
+        pruned: number of removed Gaussians.
     """
 
     parameters: Arrays
@@ -40,11 +41,6 @@ class DensityChange:
     cloned: int
     split: int
     pruned: int
-
-
-def logit(p: float) -> float:
-    """Inverse of the logistic function."""
-    return float(np.log(p / (1 - p)))
 
 
 def adapt(
@@ -64,10 +60,10 @@ def adapt(
             Under alpha blending also ``opacity`` (logits).
         view_gradient_norm: mean gradient of the loss by each Gaussian's direction since the last round, [n]; zero: no
             pixel saw it.
-        distance_m: of each Gaussian from the nearest receiver, [n].
-        rng: draws where the parts of a split Gaussian go.
+        distance_m: distance of each Gaussian from the nearest receiver, [n].
+        rng: generator of the positions of split Gaussians.
         growth_fraction: share of the Gaussians that are cloned or split.
-        max_gaussians: number of Gaussians that is never passed.
+        max_gaussians: largest number of Gaussians.
         split_rad: angular size from which a Gaussian is split rather than cloned.
         least_opacity: Gaussians below it are removed.
     """
@@ -85,7 +81,7 @@ def adapt(
     source = np.concatenate([alive, growing])
     fresh = np.concatenate([np.isin(alive, split), np.ones(len(growing), bool)])
     new = {name: values[:, source].copy() for name, values in parameters.items()}
-    # Both parts of a split one move, each to a point drawn from the old Gaussian, and shrink.
+    # Both parts of a split Gaussian move, each to a point drawn from it, and shrink.
     parts = np.flatnonzero(np.isin(source, split))
     old = source[parts]
     axes = rotation_matrix(parameters["rotation"][:, old].T)
@@ -93,15 +89,15 @@ def adapt(
     new["position"][:, parts] += np.einsum("nij,nj->in", axes, draw).astype(np.float32)
     new["log_scale"][:, parts] -= np.float32(np.log(SPLIT_SHRINK))
     if "opacity" in parameters:
-        # Two copies of this opacity blend to what one was (Rota Bulo et al. 2024, "Revising densification").
+        # Two copies of this opacity blend to the old one (Rota Bulo et al. 2024, "Revising densification").
         doubled = np.isin(source, growing)
-        alpha = 1 / (1 + np.exp(-parameters["opacity"][0, source[doubled]].astype(float)))
+        alpha = expit(parameters["opacity"][0, source[doubled]].astype(float))
         each = np.clip(1 - np.sqrt(1 - alpha), 1e-6, 1 - 1e-6)
-        new["opacity"][0, doubled] = np.log(each / (1 - each))
+        new["opacity"][0, doubled] = logit(each)
     pruned = len(keep) - len(alive)
     return DensityChange(new, source, fresh, len(growing) - len(split), len(split), pruned)
 
 
 def reset_opacity(opacity_logits: NDArray[np.float32], at_most: float) -> NDArray[np.float32]:
-    """Opacity logits that leave no Gaussian more opaque than ``at_most``."""
+    """Opacity logits, limited to an opacity of ``at_most``."""
     return np.minimum(opacity_logits, np.float32(logit(at_most)))

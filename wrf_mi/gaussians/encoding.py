@@ -5,8 +5,8 @@
 The paper sets L = 9, ten octaves, and does not say on what scale of coordinates. Here ``t`` is the
 coordinate in metres divided by ``scale_m``, so the shortest period is ``2 * scale_m / 2^L``: 4 mm for L = 9
 and one metre. A field changes over about half a wavelength, which for 915 MHz is 0.16 m: shorter periods
-let a network memorise its training positions, which is why fewer octaves serve better (see `docs/model.md`).
-The longest period is ``2 * scale_m``: transmitters that are so far apart along an axis are one to a network.
+let a network memorise its training positions, which is why fewer octaves predict better (see `docs/model.md`).
+The longest period is ``2 * scale_m``: transmitters at that distance along an axis have equal features.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from numpy.typing import ArrayLike
 Tensor = TypeVar("Tensor", bound=dr.ArrayBase)
 
 
-def telling_scale(points_m: ArrayLike, least_m: float) -> float:
-    """A scale with which no two of some points are encoded alike: their extent is within the longest period.
+def unambiguous_scale(points_m: ArrayLike, least_m: float) -> float:
+    """Scale at which all of some points have different encodings: their extent is within the longest period.
 
     Args:
         points_m: positions [n, 3], metres.
-        least_m: scale, more than 0, that is doubled until it is large enough.
+        least_m: smallest scale, more than 0, which is doubled until it is large enough.
 
     Returns:
-        Metres that make one unit.
+        Length of the unit, metres.
     """
     extent = float(np.ptp(np.asarray(points_m, float), axis=0).max(initial=0.0))
     scale = least_m
@@ -48,14 +48,14 @@ def encode(points: Tensor, octaves: int, scale_m: float) -> Tensor:
     Args:
         points: tensor [3, n], metres. Differentiable.
         octaves: number of octaves, L + 1 in the paper.
-        scale_m: metres that make one unit of ``t``.
+        scale_m: unit of ``t``, metres.
 
     Returns:
         Tensor [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
     """
     if octaves == 0:
         return dr.zeros(type(points), (0, points.shape[1]))
-    # Whole periods are taken off in each octave before the sine sees it: exact, because the factors are
+    # Whole periods are subtracted in each octave before the sine: exact, because the factors are
     # powers of two, and sin() in float32 loses digits of large arguments.
     octave = [points * (2.0**k / (2.0 * scale_m)) for k in range(octaves)]
     turns = dr.concat([t - dr.round(dr.detach(t)) for t in octave], axis=0)

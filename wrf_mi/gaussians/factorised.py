@@ -1,14 +1,12 @@
-"""A field whose Gaussians stand still and whose signals are mixtures of a few functions of the transmitter.
+"""A field of static Gaussians whose signals are mixtures of a few functions of the transmitter.
 
     S_i(tx) = sum_k C_ik phi_k(tx),   k = 1..K
 
-phi is one small network of the encoded transmitter, C_ik are complex parameters of the Gaussians. Everything that a
-receiver sees is so a mixture of K fixed fields: with B the map from signals to the receiver
-(`wrf_mi.gaussians.operator`) the products B C are K fixed images (or element signals), computed once, and a prediction
-costs one small network and K terms a pixel, however many Gaussians there are. Any signals of N transmitters have rank
-N at most; how many terms a room needs goes by the degrees of freedom of its field, not by its Gaussians. Source:
-truncated singular value decomposition (Eckart and Young 1936), with the right-hand factor given by a network instead
-of stored.
+phi is a small network of the encoded transmitter, C_ik are complex parameters of the Gaussians. The received field is
+therefore a mixture of K fixed fields: with B the map from signals to the receiver (`wrf_mi.gaussians.operator`) the
+products B C are K fixed images (or element signals), computed once, and a prediction costs one small network and K
+terms per pixel, for any number of Gaussians. Source: truncated singular value decomposition (Eckart and Young 1936),
+with the right-hand factor given by a network.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from ..core import InputError
 from .fields import GEOMETRY, Encoding
 from .initial import InitialGaussians
 from .network import Params, Weights, dense, init_layer, linear
-from .parameters import Gaussians, rows
+from .parameters import Gaussians, common_geometry, logistic
 
 
 @dataclass(frozen=True)
@@ -30,11 +28,11 @@ class Factorised:
     """Static Gaussians with opacity and K complex coefficients each; alpha blending (WRF-GS+, eq. 14).
 
     Attributes:
-        encoding: of the transmitter; Gaussians are not encoded.
-        terms: K.
+        encoding: encoding of the transmitter; Gaussians are not encoded.
+        terms: number of functions K.
         layers: hidden layers of the network.
-        width: their neurons.
-        components: complex signals of a Gaussian, each with K coefficients of its own.
+        width: neurons of a hidden layer.
+        components: complex signals of a Gaussian, with K coefficients each.
     """
 
     encoding: Encoding = field(default_factory=Encoding)
@@ -49,7 +47,7 @@ class Factorised:
     signal_parameters = ("signal", "terms.")
 
     def __post_init__(self) -> None:
-        """Refuse an encoding that tells no transmitters apart.
+        """Refuse an encoding without features of the transmitter.
 
         Raises:
             InputError: no octaves.
@@ -68,7 +66,7 @@ class Factorised:
             inputs = {"hidden": self.width} if i else {"transmitter": self.encoding.sizes["transmitter"]}
             weights |= init_layer(f"terms.{i}", inputs, self.width, rng)
         weights |= init_layer("terms.out", {"hidden": self.width}, 2 * self.terms, rng, gain=1.0)
-        # The first term starts as what is the same for all transmitters.
+        # The first term starts as a constant.
         weights["terms.out.bias"][0] = 1.0
         return weights
 
@@ -81,21 +79,17 @@ class Factorised:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
-        batch, k, own = tx_pos.shape[1], self.terms, params["signal"]
-        n = own.shape[1]
-        blocks = [own[i * k : (i + 1) * k, :] for i in range(2 * self.components)]
+        batch, k, factors = tx_pos.shape[1], self.terms, params["signal"]
+        n = factors.shape[1]
+        blocks = [factors[i * k : (i + 1) * k, :] for i in range(2 * self.components)]
         c_re, c_im = (dr.concat(blocks[half::2], axis=1) if len(blocks) > 2 else blocks[half] for half in (0, 1))
-        # One real product of everything. In the derivative of four, Dr.Jit 1.5 on two threads now and then read a
-        # part before it was written, and lost what reached phi by it.
+        # One real product instead of four, in whose derivative Dr.Jit 1.5 on two threads sometimes lost a part.
         both = dr.concat([dr.concat([c_re, c_im], axis=1), dr.concat([-c_im, c_re], axis=1)], axis=0)
         signal = dr.moveaxis(self.functions(params, tx_pos), 0, 1) @ both
-        opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
         return Gaussians(
-            position=rows(params["position"]),
-            scale=[dr.exp(s) for s in rows(params["log_scale"])],
-            rotation=rows(params["rotation"]),
+            **common_geometry(params),
             signal=[signal[:, i * n : (i + 1) * n].array for i in range(2 * self.components)],
-            opacity=opacity,
+            opacity=logistic(params["opacity"].array),
             attenuation=None,
             batch=batch,
         )

@@ -16,17 +16,17 @@ from scipy.constants import speed_of_light
 from .encoding import encode, encoded_size
 from .initial import InitialGaussians
 from .network import Params, Weights, dense, dense_of_pairs, init_layer, linear
-from .parameters import Gaussians, rows
+from .parameters import Gaussians, common_geometry, logistic, rows
 
 GEOMETRY = ("position", "log_scale", "rotation")
 """Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
 
-A field whose geometry and attenuation are the same for all transmitters says so by ``static_geometry``, and by
-``signal_parameters`` which of its parameters, by the start of their names, reach its signals alone.
+A field whose geometry and attenuation do not depend on the transmitter has ``static_geometry`` true, and lists in
+``signal_parameters`` the prefixes of the parameters that affect only its signals.
 """
 
 NEAREST_M = 1e-3
-"""Distances of a phase are not taken below that: where an image lies in a Gaussian's centre their slope has no end."""
+"""Smallest distance of a phase: the gradient is unbounded where an image lies in a Gaussian's centre."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class Encoding:
     The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.gaussians.encoding`.
 
     Attributes:
-        position_octaves: of Gaussian centres.
-        position_scale_m: metres that make their unit.
-        tx_octaves: of transmitter positions.
-        tx_scale_m: metres that make their unit.
-        features: number of features that take the encoded transmitter's place, as they are (the uplink channel in the
-            second case study of WRF-GS+); 0: the transmitter's position is encoded.
+        position_octaves: octaves of Gaussian centres.
+        position_scale_m: unit of Gaussian centres, metres.
+        tx_octaves: octaves of transmitter positions.
+        tx_scale_m: unit of transmitter positions, metres.
+        features: number of features that replace the encoded transmitter (the uplink channel in the second case study
+            of WRF-GS+); 0: the transmitter's position is encoded.
     """
 
     position_octaves: int = 10
@@ -53,13 +53,13 @@ class Encoding:
     def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
         """Encoded Gaussian centres [6 * octaves, n], detached.
 
-        The network sees where a Gaussian is but does not move it: its gradient through the fast
-        octaves would drown the one through the footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
+        The network does not move Gaussians: its gradient through the fast octaves would outweigh the one through the
+        footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
         """
         return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
 
     def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
-        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch] themselves."""
+        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch]."""
         return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
 
     @property
@@ -120,9 +120,7 @@ class WrfGs:
         seen = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
         signal = linear(params, "signal.out", dense(params, "signal.1", seen))
         return Gaussians(
-            position=rows(params["position"]),
-            scale=[dr.exp(s) for s in rows(params["log_scale"])],
-            rotation=rows(params["rotation"]),
+            **common_geometry(params),
             signal=rows(signal),
             opacity=None,
             attenuation=[re * norm, im * norm],
@@ -136,13 +134,13 @@ class WrfGsPlus:
 
     The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
     three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
-    With ``static_geometry`` the first head is the only one: Gaussians then stand as they are for every transmitter,
-    and the map from their signals to the receiver is the same for all.
+    With ``static_geometry`` only the first head is present: the map from the Gaussians' signals to the receiver is then
+    common to all transmitters.
     With ``phase_hz`` each signal turns as a wave does on its way from the transmitter's image, x' = A x + b, to the
-    Gaussian: exp(-j 2 pi f abs(x' - position) / c), which a network need not learn; A and b stay as they started.
+    Gaussian: exp(-j 2 pi f abs(x' - position) / c), which the network then need not learn; A and b are not trained.
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
     rotation's to the quaternion before it is normalised; the heads start small, so that the static
-    field is what training sees first.
+    field dominates at first.
     With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
@@ -159,7 +157,7 @@ class WrfGsPlus:
 
     @property
     def per_gaussian(self) -> tuple[str, ...]:
-        """Names of the parameters that each Gaussian has of its own."""
+        """Names of the per-Gaussian parameters."""
         return (*GEOMETRY, "opacity", "signal", *(("image",) if self.phase_hz else ()))
 
     @property
@@ -201,14 +199,13 @@ class WrfGsPlus:
             static = [dr.tile(a, batch) for a in rows(params[name])]
             return [a + d for a, d in zip(static, offset[head], strict=True)]
 
-        opacity = dr.rcp(1 + dr.exp(-params["opacity"].array))
+        opacity = logistic(params["opacity"].array)
+        signal = deformed("signal", "signal")
         return Gaussians(
             position=rows(params["position"]),
             scale=[dr.exp(s) for s in deformed("log_scale", "scale")],
             rotation=deformed("rotation", "rotation"),
-            signal=self._turned(deformed("signal", "signal"), params, tx_pos)
-            if self.phase_hz
-            else deformed("signal", "signal"),
+            signal=self._turned(signal, params, tx_pos) if self.phase_hz else signal,
             opacity=opacity if self.static_geometry else dr.tile(opacity, batch),
             attenuation=None,
             batch=batch,
@@ -224,7 +221,7 @@ class WrfGsPlus:
             away.append(a * x[0] + b * x[1] + c * x[2] + d - dr.tile(position[k], batch))
         square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
         turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
-        # Whole turns off first: sines of large arguments have no digits left in float32.
+        # Subtract whole turns first: sines of large arguments have no digits left in float32.
         sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
         re, im = signal
         return [re * cosine - im * sine, re * sine + im * cosine]

@@ -1,13 +1,13 @@
-"""From 3D Gaussians to footprints on the sphere of directions around a receiver.
+"""Footprints of 3D Gaussians on the sphere of directions around a receiver.
 
 The paper projects to an equirectangular ("Mercator") plane and takes the covariance there. The azimuth
-derivative of that map grows as 1 / cos(elevation), so the plane's Gaussian is wrong near the zenith, where the
-strongest lobe of real data sits. Here the covariance stands in the tangent plane at the Gaussian's direction
+derivative of that map grows as 1 / cos(elevation), so the plane's Gaussian is wrong near the zenith, the direction of
+the strongest lobe of real data. Here the covariance is taken in the tangent plane at the Gaussian's direction
 n, and the footprint is evaluated at each pixel's unit vector u:
 
     v = (e1 . u, e2 . u) / (n . u),   G' = exp(-v^T C^-1 v / 2),   C = [e1 e2]^T Sigma [e1 e2] / d^2 + low-pass
 
-which equals the paper's form to first order at low elevation and knows neither seam nor pole.
+which equals the paper's form to first order at low elevation and has neither seam nor pole.
 """
 
 from __future__ import annotations
@@ -32,6 +32,10 @@ class Pose:
         """A world vector in the receiver's frame (R^T v)."""
         return [sum((self.to_world[k][i] * v[k] for k in (1, 2)), self.to_world[0][i] * v[0]) for i in range(3)]
 
+    def from_local(self, v: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
+        """A vector of the receiver's frame in the world frame (R v)."""
+        return [sum((row[k] * v[k] for k in (1, 2)), row[0] * v[0]) for row in self.to_world]
+
 
 @dataclass
 class Footprints:
@@ -42,8 +46,8 @@ class Footprints:
         whitened: two vectors a, b with v^T C^-1 v = ((a . u)^2 + (b . u)^2) / (n . u)^2.
         radius: angular radius that holds the whole footprint, radians; detached.
         visible: far enough from the receiver to have a footprint; detached.
-        depth: distance from the receiver, metres, [n] (the same for all transmitters); detached, float64: it decides
-            the order, and depths that differ by less than a float32's last digit must not change places by chance.
+        depth: distance from the receiver, metres, [n], common to all transmitters; detached. Float64, because it
+            decides the order, which rounding to float32 would change for nearly equal depths.
     """
 
     direction: list[dr.ArrayBase]
@@ -67,8 +71,8 @@ def tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.Ar
     return [dr.fma(sign * x * x, a, 1), sign * b, -sign * x], [b, dr.fma(y * y, a, sign), -y]
 
 
-def own_axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
-    """World directions of the three own axes (columns of the rotation) of unnormalised quaternions x, y, z, w."""
+def principal_axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
+    """World directions of a Gaussian's axes (columns of the rotation) from unnormalised quaternions x, y, z, w."""
     x, y, z, w = quaternion
     f = 2 / (x * x + y * y + z * z + w * w)
     return [
@@ -99,18 +103,18 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
 
     # Columns of [e1 e2]^T R diag(s) / d: C = sum of their outer products + low-pass.
     columns = []
-    for scale, axis in zip(gaussians.scale, own_axes(gaussians.rotation), strict=True):
+    for scale, axis in zip(gaussians.scale, principal_axes(gaussians.rotation), strict=True):
         m, f = pose.to_local(axis), scale * inverse
         columns.append((dot(e1, m) * f, dot(e2, m) * f))
     low = LOW_PASS_RAD**2
-    own11 = sum((p * p for p, _ in columns[1:]), columns[0][0] ** 2)
-    own22 = sum((q * q for _, q in columns[1:]), columns[0][1] ** 2)
+    s11 = sum((p * p for p, _ in columns[1:]), columns[0][0] ** 2)
+    s22 = sum((q * q for _, q in columns[1:]), columns[0][1] ** 2)
     c12 = sum((p * q for p, q in columns[1:]), columns[0][0] * columns[0][1])
-    c11, c22 = own11 + low, own22 + low
+    c11, c22 = s11 + low, s22 + low
     # det C by Lagrange's identity: a sum of squares, where c11 c22 - c12^2 would cancel for needles.
     (p0, q0), (p1, q1), (p2, q2) = columns
     minors = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
-    determinant = minors + low * (own11 + own22) + low * low
+    determinant = minors + low * (s11 + s22) + low * low
     # C = L L^T; the rows of L^-1 [e1 e2]^T whiten the tangent plane.
     l11 = dr.rsqrt(c11)
     l22 = dr.sqrt(c11) * dr.rsqrt(determinant)

@@ -1,4 +1,4 @@
-"""The numbers that fix a footprint, shared by every evaluation of a field and by the oracle."""
+"""Constants of a footprint, common to every evaluation of a field and to the oracle."""
 
 import math
 
@@ -16,3 +16,6 @@ MIN_COSINE = 0.1
 
 The central projection onto the tangent plane diverges at 90 degrees and would mirror what lies behind.
 """
+
+LOG2_E = math.log2(math.e)
+"""Footprints are powers of two, which processors compute faster than exp."""

@@ -1,4 +1,4 @@
-"""Where Gaussians start: at random around the receivers, or on a point cloud."""
+"""Starting values of Gaussians: at random around the receivers, or on a point cloud."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import logit
 
 from ..core import InputError, Receiver, unit_vectors
 from .network import Weights
@@ -20,8 +21,8 @@ class InitialGaussians:
     Attributes:
         position_m: shape [n, 3], world frame.
         scale_m: standard deviation of each (isotropic) Gaussian, shape [n].
-        opacity: alpha at the centre, the same for all, in (0, 1).
-        signal: deviation of the random starting signals.
+        opacity: alpha at the centre, common to all, in (0, 1).
+        signal: standard deviation of the random starting signals.
     """
 
     position_m: NDArray[np.float64]
@@ -46,16 +47,16 @@ class InitialGaussians:
 
     def opacity_logit(self) -> NDArray[np.float32]:
         """The parameter ``opacity``, shape [1, n], as a logit."""
-        return np.full((1, self.count), np.log(self.opacity / (1 - self.opacity)), np.float32)
+        return np.full((1, self.count), logit(self.opacity), np.float32)
 
     def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
-        """The parameter ``signal`` [2, n] of a field that keeps a static one: real and imaginary parts."""
+        """The parameter ``signal`` [2, n] of a field with a static signal: real and imaginary parts."""
         return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
 
     def image(self) -> NDArray[np.float32]:
         """The parameter ``image``: the affine map A, b of the transmitter to its image, rows [A b], shape [12, n].
 
-        Where nothing is known each Gaussian sees the transmitter itself.
+        It starts as the identity.
         """
         return np.tile(np.eye(3, 4).reshape(12, 1), self.count).astype(np.float32)
 
@@ -72,25 +73,24 @@ def random_gaussians(
 ) -> InitialGaussians:
     """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere or full sphere.
 
-    The paper draws points "within a specified range". What a receiver sees is directions, so the range
-    here is one of directions and distances: distances are uniform in ``distance_m`` and scales such that a
-    Gaussian seen from its receiver has the standard deviation ``size_deg``.
+    The paper draws points "within a specified range". Here directions are uniform, distances are uniform in
+    ``distance_m``, and scales give each Gaussian the standard deviation ``size_deg`` as seen from its receiver.
     """
     share = np.array_split(np.arange(count), len(receivers))
     position, scale = np.empty((count, 3)), np.empty(count)
-    for receiver, own in zip(receivers, share, strict=True):
+    for receiver, index in zip(receivers, share, strict=True):
         # A margin below the horizon: footprints of Gaussians there reach above it.
         lowest = -1.0 if sphere else -np.sin(np.radians(size_deg))
-        elevation = np.arcsin(rng.uniform(lowest, 1.0, len(own)))
-        direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(own)), elevation)
-        distance = rng.uniform(*distance_m, len(own))
-        position[own] = receiver.position_m + (direction * distance[:, None]) @ receiver.to_world.T
-        scale[own] = distance * np.tan(np.radians(size_deg))
+        elevation = np.arcsin(rng.uniform(lowest, 1.0, len(index)))
+        direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(index)), elevation)
+        distance = rng.uniform(*distance_m, len(index))
+        position[index] = receiver.position_m + (direction * distance[:, None]) @ receiver.to_world.T
+        scale[index] = distance * np.tan(np.radians(size_deg))
     return InitialGaussians(position, scale, opacity, signal)
 
 
 def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.random.Generator) -> InitialGaussians:
-    """Gaussians on a point cloud: ``count`` of its points, each as large as the gap to its neighbours.
+    """Gaussians at ``count`` points of a cloud, each as large as the gap to its neighbours.
 
     The scale is the root mean square distance to the three nearest chosen points (3D Gaussian splatting,
     Kerbl et al. 2023, section 5.1).
@@ -98,7 +98,7 @@ def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.ran
     Args:
         points_m: shape [m, 3] with m >= count, world frame, metres.
         count: number of Gaussians, at least 4.
-        rng: chooses the points.
+        rng: generator that chooses the points.
 
     Raises:
         InputError: too few points, or a coordinate that is not a number.

@@ -38,24 +38,26 @@ def linear(params: Params, name: str, x: dr.ArrayBase, part: str = "hidden") -> 
 
 
 class _Rectified(dr.CustomOp):
-    """max(product + own + what Gaussians add, 0) with a derivative that sums whole rows.
+    """max(product + per-transmitter + per-Gaussian part, 0) with a derivative that sums whole rows.
 
-    Dr.Jit's own derivative of a bias is a scatter of all columns into one number a row, which takes five times as long.
+    Dr.Jit's derivative of a bias is a scatter of all columns into one number a row, which takes five times as long.
     """
 
-    def eval(self, product: Any, per_gaussian: Any, own: Any) -> Any:
-        outputs, self.batch = own.shape
+    def eval(self, product: Any, per_gaussian: Any, per_transmitter: Any) -> Any:
+        outputs, self.batch = per_transmitter.shape
         self.columns = per_gaussian.shape[1] if per_gaussian is not None else product.shape[1] // self.batch
-        total = dr.repeat(own.array, self.columns)
+        total = dr.repeat(per_transmitter.array, self.columns)
         if per_gaussian is not None and self.batch > 1:
-            wide = dr.reshape(per_gaussian, (outputs, 1, self.columns)) + dr.zeros(type(own), (1, self.batch, 1))
+            wide = dr.reshape(per_gaussian, (outputs, 1, self.columns)) + dr.zeros(
+                type(per_transmitter), (1, self.batch, 1)
+            )
             total += wide.array
         elif per_gaussian is not None:
             total += per_gaussian.array
         if product is not None:
             total += product.array
         self.given = product is not None, per_gaussian is not None
-        self.out = type(own)(dr.maximum(total, 0), (outputs, self.batch * self.columns))
+        self.out = type(per_transmitter)(dr.maximum(total, 0), (outputs, self.batch * self.columns))
         return self.out
 
     def backward(self) -> None:
@@ -63,7 +65,7 @@ class _Rectified(dr.CustomOp):
         gradient: Any = self.grad_out()
         slope = kind(dr.select(self.out.array > 0, gradient.array, 0), self.out.shape)
         dr.eval(slope)
-        self.set_grad_in("own", kind(dr.block_sum(slope.array, self.columns), (outputs, self.batch)))
+        self.set_grad_in("per_transmitter", kind(dr.block_sum(slope.array, self.columns), (outputs, self.batch)))
         if self.given[1]:
             parts: Any = dr.reshape(slope, (outputs, self.batch, self.columns))
             self.set_grad_in("per_gaussian", slope if self.batch == 1 else dr.sum(parts, axis=1))
@@ -89,12 +91,12 @@ def dense_of_pairs(
 ) -> dr.ArrayBase:
     """A hidden layer of the concatenation of parts, for every pair of a transmitter and a Gaussian.
 
-    W [x; y] + b = W_x x + W_y y + b: what depends on the Gaussian alone is multiplied once for all
-    transmitters and the other way round.
+    W [x; y] + b = W_x x + W_y y + b: products of parts that depend on the Gaussian only are computed once for all
+    transmitters, and vice versa.
 
     Args:
         params: the layer's weights, one matrix for each part.
-        name: of the layer.
+        name: name of the layer.
         per_gaussian: parts [size, n].
         per_transmitter: parts [size, batch].
         hidden: a part [size, batch * n] that depends on both, batch-major; its matrix is ``name.hidden``.
@@ -107,9 +109,9 @@ def dense_of_pairs(
     # An encoding of zero octaves has no rows and no matrix.
     gaussian = [params[f"{name}.{k}"] @ v for k, v in per_gaussian.items() if v.shape[0]]
     transmitter = [params[f"{name}.{k}"] @ v for k, v in per_transmitter.items() if v.shape[0]]
-    own = sum(transmitter, bias) if transmitter else bias + dr.zeros(type(bias), (1, batch))
+    biased = sum(transmitter, bias) if transmitter else bias + dr.zeros(type(bias), (1, batch))
     product = None if hidden is None else params[f"{name}.hidden"] @ hidden
-    rectified: dr.ArrayBase = dr.custom(_Rectified, product, sum(gaussian[1:], gaussian[0]), own)
+    rectified: dr.ArrayBase = dr.custom(_Rectified, product, sum(gaussian[1:], gaussian[0]), biased)
     return rectified
 
 

@@ -1,7 +1,6 @@
-"""Projection, footprint and blending in float64 NumPy, written for reading.
+"""Projection, footprint and blending in float64 NumPy: the reference of the fast kernels' tests.
 
-What the fast kernels are tested against: one loop over the Gaussians, no tiles, no culling. It fixes what
-the WRF-GS papers leave open:
+One loop over the Gaussians, no tiles, no culling. It fixes choices that the WRF-GS papers leave open:
 
 * the covariance is taken in the tangent plane at the Gaussian's direction and evaluated at each pixel's
   unit vector through the central projection, so that neither the azimuth seam nor the zenith is special;
@@ -27,7 +26,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Projection:
-    """The Gaussians as a receiver sees them, in its own frame.
+    """Gaussians in a receiver's frame and on its sphere of directions.
 
     Attributes:
         centre_m: shape [n, 3], metres.
@@ -76,12 +75,12 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
         receiver: pose of the receiver.
 
     Returns:
-        The projection; its order leaves out Gaussians nearer than ``NEAR_M``.
+        The projection; its order omits Gaussians nearer than ``NEAR_M``.
     """
     mean = np.asarray(mean_m, float)
     to_world = receiver.to_world
     centre = (mean - receiver.position_m) @ to_world  # each row R^T (mu - x_rx)
-    # Of the offset as it is: turned into the receiver's frame, equal depths differ in the last digit.
+    # In the world frame: after rotation equal depths differ in the last digit.
     depth = np.linalg.norm(mean - receiver.position_m, axis=-1)
     near = depth < NEAR_M
     direction = np.where(near[:, None], [1.0, 0.0, 0.0], centre / np.where(near, 1.0, depth)[:, None])
@@ -149,13 +148,8 @@ def blend_alpha(footprints: ArrayLike, signal: ArrayLike, opacity: ArrayLike) ->
 
     Source: WRF-GS+, complex-valued alpha blending.
     """
-    g = np.asarray(footprints, float)
-    received, passed = np.zeros(g.shape[1:], complex), np.ones(g.shape[1:])
-    for g_i, s_i, o_i in zip(g, np.asarray(signal), np.asarray(opacity), strict=True):
-        alpha = o_i * g_i
-        received += s_i * alpha * passed
-        passed *= 1 - alpha
-    return received
+    o = np.asarray(opacity)
+    return blend_product(footprints, o * np.asarray(signal), 1 - o)
 
 
 def render(
@@ -195,26 +189,3 @@ def render(
     if opacity is not None:
         return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[seen.order])
     return blend_product(footprints, sorted_signal, np.asarray(attenuation)[seen.order])
-
-
-def paper_jacobian_covariance(centre_m: ArrayLike, covariance_m2: ArrayLike, height: int, width: int) -> FloatArray:
-    """The papers' form: J Sigma J^T of the equirectangular map at the centres, without any low-pass.
-
-    Args:
-        centre_m: shape [n, 3], receiver's frame, metres, not on the z axis.
-        covariance_m2: shape [n, 3, 3], receiver's frame.
-        height: rows over 90 degrees of elevation.
-        width: columns over 360 degrees of azimuth.
-
-    Returns:
-        Shape [n, 2, 2], axes (column, row), pixels squared. The column's variance grows as
-        1 / cos^2(elevation): the map stretches the azimuth, and J is its tangent at one point only.
-
-    Source: WRF-GS+, the projection model; Zwicker et al., "EWA splatting" (2002), for J Sigma J^T.
-    """
-    x, y, z = np.moveaxis(np.asarray(centre_m, float), -1, 0)
-    ground, distance = np.hypot(x, y), np.sqrt(x * x + y * y + z * z)
-    longitude = np.stack([-y, x, np.zeros_like(x)], axis=-1) / ground[:, None] ** 2
-    latitude = np.stack([-x * z, -y * z, ground**2], axis=-1) / (ground * distance**2)[:, None]
-    jacobian = np.stack([longitude * width / (2 * np.pi), latitude * height / (np.pi / 2)], axis=-2)
-    return jacobian @ np.asarray(covariance_m2, float) @ np.swapaxes(jacobian, -1, -2)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
+
+PER_PAIR = ("scale", "rotation", "opacity", "attenuation")
+"""Attributes beside the signal that may differ between transmitters."""
 
 
 @dataclass
@@ -13,17 +17,20 @@ class Gaussians:
     """Gaussians for a batch of transmitters, batch-major: column ``b * n + i`` is Gaussian i for transmitter b.
 
     Attributes:
-        position: three arrays [n], world frame, metres; the same for all transmitters.
-        scale: three arrays [batch * n], standard deviations along the Gaussian's own axes, metres.
-        rotation: four arrays [batch * n], quaternion x, y, z, w, own axes to world; need not be normalised.
+        position: three arrays [n], world frame, metres; common to all transmitters.
+        scale: three arrays [batch * n], standard deviations along the Gaussian's axes, metres.
+        rotation: four arrays [batch * n], quaternion x, y, z, w, Gaussian's axes to world; need not be normalised.
         opacity: array [batch * n], alpha at the footprint's centre, in [0, 1); None under product blending.
         attenuation: complex factor delta (re, im), two arrays [batch * n], |delta| < 1; None under alpha blending.
         signal: complex signal (re, im), two arrays [batch * n]. Signed; nothing clamps it. Of a field with several
-            signals a Gaussian all real parts, then all imaginary ones, until `by_component` sorts them.
+            signals per Gaussian all real parts, then all imaginary ones, until `by_component` sorts them.
         batch: number of transmitters.
 
-    Where geometry and blending are the same for all transmitters, scale, rotation, opacity and attenuation may have
-    one number a Gaussian, [n]: ``shared`` then, and `spread` repeats them.
+    Where geometry and blending do not depend on the transmitter, scale, rotation, opacity and attenuation may have
+    width n: ``shared`` then, and `spread` repeats them.
+
+    Raises:
+        ValueError: neither or both of opacity and attenuation.
     """
 
     position: list[dr.ArrayBase]
@@ -35,7 +42,7 @@ class Gaussians:
     batch: int
 
     def __post_init__(self) -> None:
-        """One of opacity and attenuation says how the Gaussians are blended."""
+        """Refuse Gaussians without a blending rule."""
         if (self.opacity is None) == (self.attenuation is None):
             raise ValueError("Gaussians need either an opacity (alpha blending) or an attenuation (product blending)")
 
@@ -45,25 +52,30 @@ class Gaussians:
         return dr.width(self.position[0])
 
     @property
+    def blending(self) -> list[Any]:
+        """Parameters of the blending rule: [opacity], or real and imaginary part of the attenuation."""
+        alpha: Any = self.opacity
+        return list(self.attenuation or [alpha])
+
+    @property
     def shared(self) -> bool:
         """Whether several transmitters have one set of geometry, opacity or attenuation."""
         return self.batch > 1 and dr.width(self.scale[0]) == self.count
 
     def spread(self) -> Gaussians:
-        """The same with all arrays [batch * n]."""
-        if not self.shared:
-            return self
+        """The Gaussians with all arrays [batch * n]."""
+        return self.mapped(lambda a: dr.tile(a, self.batch)) if self.shared else self
 
-        def wide(arrays: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
-            return [dr.tile(a, self.batch) for a in arrays]
+    def mapped(self, function: Callable[[Any], Any], **changes: Any) -> Gaussians:
+        """A function applied to each array of the attributes `PER_PAIR`, and other attributes replaced."""
+        return replace(self, **{name: each(function, getattr(self, name)) for name in PER_PAIR}, **changes)
 
-        return replace(
-            self,
-            scale=wide(self.scale),
-            rotation=wide(self.rotation),
-            opacity=None if self.opacity is None else dr.tile(self.opacity, self.batch),
-            attenuation=None if self.attenuation is None else wide(self.attenuation),
-        )
+
+def each(function: Callable[..., Any], *values: Any) -> Any:
+    """A function of arrays applied to arrays, lists of arrays (element by element) or None."""
+    if values[0] is None:
+        return None
+    return [function(*a) for a in zip(*values, strict=True)] if isinstance(values[0], list) else function(*values)
 
 
 def rows(tensor: dr.ArrayBase) -> list[dr.ArrayBase]:
@@ -71,12 +83,26 @@ def rows(tensor: dr.ArrayBase) -> list[dr.ArrayBase]:
     return [tensor[i, :].array for i in range(tensor.shape[0])]
 
 
+def common_geometry(params: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Position, scale and rotation of Gaussians from a field's parameters, common to all transmitters."""
+    return {
+        "position": rows(params["position"]),
+        "scale": [dr.exp(s) for s in rows(params["log_scale"])],
+        "rotation": rows(params["rotation"]),
+    }
+
+
+def logistic(logit: Any) -> Any:
+    """Logistic function."""
+    return dr.rcp(1 + dr.exp(-logit))
+
+
 def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     """Gaussians with one signal each: those of a transmitter come ``components`` times, a signal at a time.
 
     Args:
-        gaussians: with 2 * ``components`` signals: real parts, then imaginary ones.
-        components: how many.
+        gaussians: Gaussians with 2 * ``components`` signals: real parts, then imaginary ones.
+        components: number of complex signals per Gaussian.
 
     Returns:
         A batch of ``batch * components``, components of a transmitter one after the other.
@@ -86,22 +112,10 @@ def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     n, batch = gaussians.count, gaussians.batch
     kind: Any = type(gaussians.signal[0])
     slot = dr.arange(dr.uint32_array_t(kind), batch * components * n)
-    own, component = (slot // (n * components)) * n + slot % n, (slot // n) % components
-
-    def each(arrays: Any) -> Any:
-        return None if arrays is None else [dr.gather(kind, one, own) for one in arrays]
-
+    pair, component = (slot // (n * components)) * n + slot % n, (slot // n) % components
     parts = [dr.concat(gaussians.signal[half * components : (half + 1) * components]) for half in (0, 1)]
-    signal = [dr.gather(kind, part, component * (batch * n) + own) for part in parts]
+    signal = [dr.gather(kind, part, component * (batch * n) + pair) for part in parts]
+    changes: dict[str, Any] = {"signal": signal, "batch": batch * components}
     if dr.width(gaussians.scale[0]) == n:  # one geometry serves all of them
-        return replace(gaussians, signal=signal, batch=batch * components)
-    opacity = each(None if gaussians.opacity is None else [gaussians.opacity])
-    return replace(
-        gaussians,
-        scale=each(gaussians.scale),
-        rotation=each(gaussians.rotation),
-        signal=signal,
-        opacity=None if opacity is None else opacity[0],
-        attenuation=each(gaussians.attenuation),
-        batch=batch * components,
-    )
+        return replace(gaussians, **changes)
+    return gaussians.mapped(lambda a: dr.gather(kind, a, pair), **changes)

@@ -1,20 +1,20 @@
 """Response of 3D Gaussians along rays from a receiver: the footprint without the projection.
 
 The traced evaluation takes, for each direction u, the largest value of the Gaussian on the ray x_rx + t u, t >= 0.
-The splatted one takes the covariance in the tangent plane at the Gaussian's direction n. Both are the same in one
-frame. Let M be the map that makes the Gaussian round (Sigma^-1 = M^T M) and turn it such that M n points along its
-third axis. With D the distance of the centre, L = |M n| D its Mahalanobis distance and g3 the third row of M / |M n|,
+Splatting takes the covariance in the tangent plane at the Gaussian's direction n. Both are expressed in one frame:
+let M be the map that makes the Gaussian round (Sigma^-1 = M^T M), turned such that M n points along its third axis.
+With D the distance of the centre, L = |M n| D its Mahalanobis distance and g3 the third row of M / |M n|,
 
     a, b = D times the first two rows of M,  both perpendicular to n
     r^2 = (a . u)^2 + (b . u)^2
     splatted: m^2 = r^2 / (n . u)^2
     traced:   m^2 = r^2 / ((g3 . u)^2 + r^2 / L^2),   g3 = n + k1 a + k2 b
 
-(Lagrange's identity |o x d|^2 / |d|^2 for the distance of the ray from the centre, which does not cancel as
-o . o - (o . d)^2 / d . d would). So what the projection leaves out is the Gaussian's lean, k1 and k2, and its extent in
-depth, 1 / L^2: both vanish with its size in angle. The low-pass is that of the splatted way, which adds (low D)^2 to
-each squared scale; the cut-off too, G' = 0 where m >= CUTOFF or n . u <= MIN_COSINE. A ray whose largest value lies
-behind the receiver (g3 . u < 0) takes the value at the receiver, m = L.
+(by Lagrange's identity |o x d|^2 / |d|^2 for the distance of the ray from the centre, which does not cancel as
+o . o - (o . d)^2 / d . d would). The projection thus neglects the Gaussian's lean, k1 and k2, and its extent in depth,
+1 / L^2: both vanish with its angular size. As in splatting, the low-pass adds (low D)^2 to each squared scale and G'
+= 0 where m >= CUTOFF or n . u <= MIN_COSINE. A ray whose largest value lies behind the receiver (g3 . u < 0) takes
+the value at the receiver, m = L.
 """
 
 from __future__ import annotations
@@ -24,19 +24,17 @@ from typing import Any
 
 import drjit as dr
 
-from .footprint import Pose, centre_distance, dot, own_axes, tangent_basis
-from .footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from .footprint import Pose, centre_distance, dot, principal_axes, tangent_basis
+from .footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from .parameters import Gaussians
 
-LOG2_E = 1.4426950408889634
-
 RAY_FIELDS = 12
-"""Numbers that give one Gaussian's response along any ray: n, a, b (3 each), k1, k2 and 1 / L^2."""
+"""Numbers of one Gaussian's response along any ray: n, a, b (3 each), k1, k2 and 1 / L^2."""
 
 
 @dataclass
 class RayFootprints:
-    """Gaussians as the rays of a receiver meet them, in its own frame, arrays [n].
+    """Gaussians as the rays of a receiver meet them, in the receiver's frame, arrays [n].
 
     Attributes:
         direction: unit vector n to the centre; zero for a Gaussian nearer than ``NEAR_M``, which no ray meets.
@@ -61,17 +59,23 @@ class RayFootprints:
 
 @dataclass
 class Hulls:
-    """Ellipsoids that hold all of a Gaussian that a ray may meet, arrays [n], metres; detached.
+    """Ellipsoids around the part of a Gaussian that a ray may meet, arrays [n], metres; detached.
 
     Attributes:
         centre: three arrays, from the receiver, along the world's axes.
-        radius: three arrays, semi-axes along the Gaussian's own axes.
-        rotation: four arrays, unit quaternion x, y, z, w, own axes to world.
+        radius: three arrays, semi-axes along the Gaussian's axes.
+        rotation: four arrays, unit quaternion x, y, z, w, Gaussian's axes to world.
     """
 
     centre: list[Any]
     radius: list[Any]
     rotation: list[Any]
+
+    def at(self, index: Any) -> Hulls:
+        """The ellipsoids at ``index``, gathered."""
+        return Hulls(
+            *([dr.gather(type(c), c, index) for c in part] for part in (self.centre, self.radius, self.rotation))
+        )
 
 
 def _combine(weights: list[Any], vectors: list[list[Any]]) -> list[Any]:
@@ -83,14 +87,15 @@ def _cross(a: list[Any], b: list[Any]) -> list[Any]:
 
 
 def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
-    """What the rays of a receiver need of Gaussians. Differentiable in position, scale, rotation and pose.
+    """Responses of Gaussians along a receiver's rays. Differentiable in position, scale, rotation and pose.
 
-    Computed in float64 and rounded at the end: a Gaussian of axes 1e5 to 1 has a and b of as unlike lengths, and a lean
-    that multiplies the shorter one's errors. So that rounding hurts neither, they are turned to be perpendicular.
+    Computed in float64 and rounded at the end: a Gaussian of axes 1e5 to 1 has a and b of equally unequal lengths,
+    and a lean that multiplies the errors of the shorter. They are turned to be perpendicular, so rounding harms
+    neither.
 
     Args:
-        gaussians: for one transmitter (batch 1).
-        pose: of the receiver.
+        gaussians: Gaussians for one transmitter (batch 1).
+        pose: pose of the receiver.
     """
     single: Any = type(gaussians.position[0])
     double: Any = dr.float64_array_t(single)
@@ -100,19 +105,19 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     pose = Pose(place, [[double(c) for c in row] for row in pose.to_world])
     local = pose.to_local([p - x for p, x in zip(position, pose.position, strict=True)])
     depth = dr.sqrt(dot(local, local))
-    # As in `project`: what is a tie there is one here.
+    # As in `project`, so that ties are equal.
     exact = centre_distance(position, pose.position)
     visible = exact >= NEAR_M
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
-    # Any unit vector serves where nothing is seen; its direction is set to zero at the end.
+    # Any unit vector where nothing is seen; its direction is set to zero at the end.
     safe = [*n[:2], dr.select(visible, n[2], 1)]
     distance = dr.maximum(depth, NEAR_M)
 
     low = (LOW_PASS_RAD * distance) ** 2
     whiten = [
         [m * dr.rsqrt(scale * scale + low) for m in pose.to_local(axis)]
-        for scale, axis in zip(scales, own_axes(rotation), strict=True)
+        for scale, axis in zip(scales, principal_axes(rotation), strict=True)
     ]
     seen = [dot(row, safe) for row in whiten]
     length = dr.sqrt(dot(seen, seen))
@@ -136,10 +141,7 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
 
 
 def _perpendicular(a: list[Any], b: list[Any]) -> tuple[list[Any], list[Any]]:
-    """The same pair of vectors turned into each other until they are perpendicular, the longer one first.
-
-    By an angle without a derivative: what is made of them does not depend on it.
-    """
+    """Two vectors turned in their plane until they are perpendicular, the longer one first, by a detached angle."""
     p, q = [dr.detach(c) for c in a], [dr.detach(c) for c in b]
     sine, cosine = dr.sincos(0.5 * dr.atan2(2 * dot(p, q), dot(p, p) - dot(q, q)))
     turned = [cosine * x + sine * y for x, y in zip(a, b, strict=True)]
@@ -147,15 +149,15 @@ def _perpendicular(a: list[Any], b: list[Any]) -> tuple[list[Any], list[Any]]:
 
 
 def hulls(gaussians: Gaussians, pose: Pose, margin_rad: float) -> Hulls:
-    """Ellipsoids that a ray u meets, or one within an angle of u does, wherever the response along u is not zero.
+    """Ellipsoids that a ray within an angle of u meets wherever the response along u is not zero.
 
     The cut-off ellipsoid (low-pass included) grown by a ball of radius (D + its largest semi-axis) sin(margin): no
     point of it is farther from the receiver, so no ray within the margin is farther from one that meets it. The sum of
     ellipsoid and ball lies in the one with squared semi-axes (1 + 1/p) r^2 + (1 + p) ball^2 for each p > 0.
 
     Args:
-        gaussians: for one transmitter (batch 1).
-        pose: of the receiver.
+        gaussians: Gaussians for one transmitter (batch 1).
+        pose: pose of the receiver.
         margin_rad: largest angle between a ray and the one traced for it, below a quarter turn.
     """
     centre = [dr.detach(p) - dr.detach(x) for p, x in zip(gaussians.position, pose.position, strict=True)]
@@ -173,7 +175,7 @@ def hulls(gaussians: Gaussians, pose: Pose, margin_rad: float) -> Hulls:
 
 
 def response(record: list[Any], u: list[Any]) -> tuple[Any, Any, Any, Any, Any]:
-    """Footprint G' along one ray, and what its derivative needs.
+    """Footprint G' along one ray, and intermediate values for its derivative.
 
     Args:
         record: the ``RAY_FIELDS`` numbers of a Gaussian.
@@ -196,10 +198,10 @@ def response_slope(record: list[Any], u: list[Any], parts: tuple[Any, Any, Any, 
     """Derivative by the ``RAY_FIELDS`` numbers, times ``slope``, the derivative by G'.
 
     Args:
-        record: as for `response`.
-        u: likewise.
-        parts: what `response` returned.
-        slope: array like G'.
+        record: the ``RAY_FIELDS`` numbers of a Gaussian.
+        u: unit vector of the ray, receiver's frame.
+        parts: result of `response`.
+        slope: derivative by G'.
     """
     g, p, q, z, inverse = parts
     k1, k2, extent = record[9:RAY_FIELDS]
@@ -215,10 +217,10 @@ def response_slope(record: list[Any], u: list[Any], parts: tuple[Any, Any, Any, 
 
 
 def peak_distance(depth: Any, parts: tuple[Any, Any, Any, Any, Any]) -> Any:
-    """Where on the ray the Gaussian is strongest, metres from the receiver.
+    """Distance of the Gaussian's strongest point on the ray from the receiver, metres.
 
     Args:
         depth: distance D of the centre, metres.
-        parts: what `response` returned.
+        parts: result of `response`.
     """
     return depth * parts[3] * parts[4]

@@ -5,16 +5,16 @@ Alpha blending (WRF-GS+, paper eq. 14) and product blending (WRF-GS, eq. 12 and 
     R = sum_i w_i S_i T_i,   T_{i+1} = T_i b_i
 
 with weight w = o G', factor b = 1 - o G' (real) for the first and w = G', b = 1 - G' (1 - delta)
-(complex) for the second. With Q_i = sum_{k > i} w_k S_k T_k, what lies behind i, the derivatives are
+(complex) for the second. With Q_i = sum_{k > i} w_k S_k T_k, the sum behind i, the derivatives are
 
     dR/dw_i = S_i T_i,   dR/db_i = Q_i / b_i,   dR/dS_i = w_i T_i.
 
-The reverse pass walks front to back again and keeps Q as the rest of the stored sum, so that its memory
-does not grow with the number of layers. Where several transmitters share one geometry, T is common to them, and so is
-Q, times the conjugate of the gradient and summed over them.
+The reverse pass walks front to back again and obtains Q by subtraction from the stored sum, so its memory does not
+grow with the number of layers. Transmitters that share one geometry share T and one Q, which is summed over them after
+multiplication by the conjugate of each gradient.
 
-Numbers are Dr.Jit values of any float type; a complex one is a pair (re, im), a real one a tuple of one. ``own`` is
-what blending knows of a Gaussian beside its footprint, and says which rule it is: [o], or [re, im] of delta.
+Numbers are Dr.Jit values of any float type; a complex one is a pair (re, im), a real one a tuple of one. ``blending``
+holds the parameters of a Gaussian beside its footprint, and their number selects the rule: [o], or [re, im] of delta.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is go
 
 
 @dataclass
-class Sum:
-    """Blending so far, for each pixel of a lane: sums of its transmitters, and the transmittance T."""
+class ForwardState:
+    """State of the forward pass for each pixel of a lane: sums of its transmitters, and the transmittance T."""
 
     total: list[list[Pair]]
     t: list[Pair]
 
     @classmethod
-    def start(cls, float_type: Any, pixels: int, transmitters: int = 1) -> Sum:
-        """Before the first Gaussian."""
+    def start(cls, float_type: Any, pixels: int, transmitters: int = 1) -> ForwardState:
+        """State before the first Gaussian."""
         zero = [[(float_type(0), float_type(0)) for _ in range(transmitters)] for _ in range(pixels)]
         return cls(zero, [(float_type(1), float_type(0)) for _ in range(pixels)])
 
 
 @dataclass
-class Rest:
-    """The reverse pass so far, for each pixel of a lane: the transmittance T, and Q times the gradient's conjugate."""
+class ReverseState:
+    """State of the reverse pass for each pixel of a lane: T, and Q times the gradient's conjugate."""
 
     t: list[Pair]
     q: list[Pair]
@@ -68,41 +68,43 @@ def times(a: Sequence[Any], b: Pair) -> Pair:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-def plus(total: Pair, weight: Sequence[Any], signal: Pair) -> Pair:
-    """The sum R with one Gaussian more, of weight w T."""
+def accumulate(total: Pair, weight: Sequence[Any], signal: Pair) -> Pair:
+    """The sum R after one more Gaussian of weight w T."""
     re, im = dr.fma(weight[0], signal[0], total[0]), dr.fma(weight[0], signal[1], total[1])
     return (re, im) if len(weight) == 1 else (dr.fma(-weight[1], signal[1], re), dr.fma(weight[1], signal[0], im))
 
 
-def ahead(own: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...], Pair]:
+def forward_step(blending: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...], Pair]:
     """Weight w T of a Gaussian with footprint G', and the transmittance behind it."""
-    if len(own) == 1:
-        alpha = own[0] * g
+    if len(blending) == 1:
+        alpha = blending[0] * g
         return (t[0] * alpha,), (dr.fma(-t[0], alpha, t[0]), t[1])
-    return (g * t[0], g * t[1]), times(_factor(own, g), t)
+    return (g * t[0], g * t[1]), times(_factor(blending, g), t)
 
 
 def _factor(delta: list[Any], g: Any) -> Pair:
     return 1 - g * (1 - delta[0]), g * delta[1]
 
 
-def before(pixels: list[list[Any]], active: list[Any], total: Pair, gradient: Pair) -> tuple[list[list[Pair]], Rest]:
-    """Gradients of each pixel of a lane, and the rest before the first Gaussian.
+def reverse_start(
+    pixels: list[list[Any]], active: list[Any], total: Pair, gradient: Pair
+) -> tuple[list[list[Pair]], ReverseState]:
+    """Gradients of each pixel of a lane, and the state before the first Gaussian.
 
     Args:
         pixels: for each of a lane's pixels its numbers in the images of its transmitters.
-        active: for each: False where it only fills the lane; it has no gradient then and so adds nothing.
+        active: for each pixel, False where it only fills the lane; its gradient is then zero.
         total: R, (re, im) of all images.
-        gradient: derivative of the loss by both.
+        gradient: derivative of the loss with respect to both.
     """
     float_type: Any = type(total[0])
-    slopes, rest = [], Rest([], [])
+    slopes, state = [], ReverseState([], [])
     for numbers, seen in zip(pixels, active, strict=True):
         g, r = ([tuple(dr.gather(float_type, a, i, seen) for a in pair) for i in numbers] for pair in (gradient, total))
         slopes.append(g)
-        rest.q.append(_summed(g, r))
-        rest.t.append((float_type(1), float_type(0)))
-    return slopes, rest
+        state.q.append(_summed(g, r))
+        state.t.append((float_type(1), float_type(0)))
+    return slopes, state
 
 
 def _summed(slopes: list[Any], values: list[Any]) -> Pair:
@@ -111,34 +113,34 @@ def _summed(slopes: list[Any], values: list[Any]) -> Pair:
     return sum((re for re, _ in parts[1:]), parts[0][0]), sum((im for _, im in parts[1:]), parts[0][1])
 
 
-def behind(
-    own: list[Any], g: Any, t: Pair, q: Pair, signals: list[Pair], slopes: list[Pair]
+def reverse_step(
+    blending: list[Any], g: Any, t: Pair, q: Pair, signals: list[Pair], slopes: list[Pair]
 ) -> tuple[Any, list[Any], list[Pair], Pair, Pair]:
     """Derivatives of the loss by one Gaussian in one pixel.
 
     Args:
-        own: opacity or delta.
+        blending: opacity or delta.
         g: footprint G'.
-        t: T before it.
-        q: Q before it, times the gradient's conjugate. Alpha blending reads and changes the real part alone.
+        t: T before the Gaussian.
+        q: Q before it, times the gradient's conjugate. Alpha blending uses the real part only.
         signals: S of each transmitter.
-        slopes: gradient of each.
+        slopes: gradient of each transmitter.
 
     Returns:
-        Derivatives by G', by ``own`` and by each S; T and Q behind it.
+        Derivatives by G', by ``blending`` and by each S; T and Q behind the Gaussian.
     """
-    weight, after = ahead(own, g, t)
+    weight, after = forward_step(blending, g, t)
     by_signal = [conjugate_times(weight, slope) for slope in slopes]
     h = _summed(slopes, signals)
-    if len(own) == 1:
-        alpha, c_re = own[0] * g, h[0] * t[0]
+    if len(blending) == 1:
+        alpha, c_re = blending[0] * g, h[0] * t[0]
         q_re = q[0] - alpha * c_re
         by_alpha = c_re - q_re * dr.rcp(dr.maximum(1 - alpha, SMALLEST_FACTOR))
-        return by_alpha * own[0], [by_alpha * g], by_signal, after, (q_re, q[1])
+        return by_alpha * blending[0], [by_alpha * g], by_signal, after, (q_re, q[1])
     # Re(c) is the derivative by a real weight.
     c_re, c_im = times(h, t)
-    q, b = (q[0] - g * c_re, q[1] - g * c_im), _factor(own, g)
+    q, b = (q[0] - g * c_re, q[1] - g * c_im), _factor(blending, g)
     scale = dr.rcp(dr.maximum(b[0] * b[0] + b[1] * b[1], SMALLEST_FACTOR**2))
     f_re, f_im = (x * scale for x in conjugate_times(b, q))
-    by_g = c_re - f_re * (1 - own[0]) - f_im * own[1]
+    by_g = c_re - f_re * (1 - blending[0]) - f_im * blending[1]
     return by_g, [g * f_re, -g * f_im], by_signal, after, q

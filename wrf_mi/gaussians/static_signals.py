@@ -1,7 +1,7 @@
-"""Signals of fields whose Gaussians stand still, in NumPy: what a prediction by operator computes for a transmitter.
+"""Signals of fields of static geometry in NumPy, for a prediction by operator.
 
-What depends on the Gaussians alone is computed once. The arithmetic is that of the fields themselves; starting a
-recorded Dr.Jit function takes longer than these few small products.
+Parts that depend on the Gaussians alone are computed once. The arithmetic is that of the fields; the start of a
+recorded Dr.Jit function takes longer than these small products.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class Signals(Protocol):
     """Signals S = C c(tx) of a field.
 
     Attributes:
-        factors: C, [n, K]; None: one for all, c are the signals themselves.
+        factors: C, [n, K]; None: c are the signals.
     """
 
     factors: ComplexArray | None
 
     def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """The c of transmitters [m, 3] in metres: [m, K], or [m, n] without factors."""
+        """Coefficients c of transmitters [m, 3] in metres: [m, K], or [m, n] without factors."""
         ...
 
 
@@ -55,12 +55,7 @@ def _relu(x: Any) -> Any:
 
 
 class FactorisedSignals:
-    """Of `Factorised`: c are its functions phi.
-
-    Args:
-        field: the model.
-        params: its parameters.
-    """
+    """Signals of a `Factorised` field with its parameters: c are its functions phi."""
 
     def __init__(self, field: Factorised, params: Mapping[str, Array]) -> None:
         self._field, self._params = field, params
@@ -68,7 +63,7 @@ class FactorisedSignals:
         self.factors: ComplexArray | None = (re + 1j * im).T.astype(np.complex64)
 
     def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """See `Signals`."""
+        """Coefficients of `Signals`."""
         field, e = self._field, self._field.encoding
         encoded = encode(np.asarray(tx_pos_m, np.float32).T, e.tx_octaves, e.tx_scale_m)
         hidden = _relu(_layer(self._params, "terms.0", encoded, "transmitter"))
@@ -79,12 +74,7 @@ class FactorisedSignals:
 
 
 class WrfGsSignals:
-    """Of `WrfGs`: the first network, which sees Gaussians alone, and its part of the second's first layer run once.
-
-    Args:
-        field: the model.
-        params: its parameters.
-    """
+    """Signals of a `WrfGs` field with its parameters; the products of the Gaussians' features are computed once."""
 
     factors: ComplexArray | None = None
 
@@ -95,18 +85,18 @@ class WrfGsSignals:
         for i in range(1, field.layers):
             hidden = _relu(_layer(params, f"attenuation.{i}", hidden))
         self._encoding, self._params = e, params
-        self._own = _layer(params, "signal.0", hidden, "feature")
+        self._products = _layer(params, "signal.0", hidden, "feature")
 
     def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """See `Signals`."""
+        """Coefficients of `Signals`."""
         tx = np.asarray(tx_pos_m, np.float32)
-        count = self._own.shape[1]
+        count = self._products.shape[1]
         out = np.empty((len(tx), count), np.complex64)
         step = max(1, PAIRS_PER_CHUNK // count)
         for first in range(0, len(tx), step):
             part = slice(first, first + step)
             encoded = encode(tx[part].T, self._encoding.tx_octaves, self._encoding.tx_scale_m)
-            seen = self._own[None]
+            seen = self._products[None]
             if len(encoded):
                 seen = seen + (self._params["signal.0.transmitter"] @ encoded).T[:, :, None]
             hidden = _relu(_layer(self._params, "signal.1", np.maximum(seen, 0)))
@@ -116,7 +106,9 @@ class WrfGsSignals:
 
 
 def host_signals(field: Any, params: Mapping[str, Array]) -> Signals | None:
-    """The signals of a field in NumPy; None for one that has no such form, as a subclass may compute them otherwise."""
+    """The signals of a field in NumPy; None for other classes, subclasses included, which may compute them
+    otherwise.
+    """
     if type(field) is Factorised:
         return FactorisedSignals(field, params)
     if type(field) is WrfGs:

@@ -1,1 +1,1 @@
-"""The differentiable program: Gaussians and traced paths, and what receivers report of the two."""
+"""The differentiable graph of Gaussians, traced paths and receiver models."""

@@ -1,8 +1,8 @@
-"""How the traced and the learned field become what a receiver reports.
+"""Receiver models: the combination of the traced and the learned field, and the report of the receiver.
 
-The traced field arrives as paths, the learned one as a complex signal R(u) on directions. Each side is summed
-coherently in itself; ``how`` says whether the two, T and L, then add as complex numbers (``coherent``: abs(T + L)) or
-as powers (``power``: sqrt(abs(T)^2 + abs(L)^2)).
+The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each side is summed
+coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
+(``how="power"``: sqrt(abs(T)^2 + abs(L)^2)).
 
 | receiver | T | L | reports |
 | --- | --- | --- | --- |
@@ -28,26 +28,25 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import on_device
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import TracedPaths
-from .ports import Ports, Steering, direction_weights, matrix, path_sum, weighted
+from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
 
 How = Literal["coherent", "power"]
 
 LEAST_POWER = 1e-20
-"""Added to a power before its logarithm: the report ends at -200 dB."""
+"""Constant added to a power before its logarithm: the lowest report is -200 dB."""
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = SQUARED_MAGNITUDE_EPS) -> Any:
-    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is a side that is not there."""
+    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent side."""
     return dr.sqrt(power(traced, learned, how) + dark)
 
 
 def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; None is a side that is not there.
+    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; None is an absent side.
 
     Raises:
         ValueError: neither side, or another ``how``.
@@ -67,9 +66,9 @@ def add(*sides: Complex) -> Complex:
 
 
 def scaled(image: Any, pixels: int) -> Any:
-    """Each image of ``pixels`` values scaled to its own minimum and maximum, 0..1, as the instrument does.
+    """Each image of ``pixels`` values scaled to its minimum and maximum, 0..1, as the instrument does.
 
-    Differentiable, the two extremes included; an image without contrast becomes 0.
+    Differentiable, extremes included; an image without contrast becomes 0.
     """
     index = dr.arange(dr.uint32_array_t(type(image)), dr.width(image)) // pixels
     low, high = (dr.block_reduce(op, image, pixels) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
@@ -78,16 +77,20 @@ def scaled(image: Any, pixels: int) -> Any:
     return (image - dr.gather(type(image), low, index)) * dr.gather(type(image), inverse, index)
 
 
+def _float_type(learned: Complex | None) -> Any:
+    return mi.Float if learned is None else type(learned[0])
+
+
 @dataclass(frozen=True)
 class PixelReceiver:
-    """A receiver that reports the field's magnitude at each direction of the upper hemisphere: the paper's.
+    """The papers' receiver: magnitude of the field at each direction of the upper hemisphere.
 
     Attributes:
         height: elevations of the plane.
         width: azimuths of the plane.
-        elements_m: the array through which traced paths are seen, [m, 3], receiver's frame, metres.
-        frequency_hz: of the carrier.
-        how: how the sides add.
+        elements_m: elements of the array that receives traced paths, [m, 3], receiver's frame, metres.
+        frequency_hz: carrier.
+        how: sum of the sides.
     """
 
     height: int
@@ -100,19 +103,19 @@ class PixelReceiver:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one report."""
+        """Shape of a report."""
         return self.height, self.width
 
     @cached_property
-    def _steering(self) -> Steering:
-        return Steering(self.elements_m, pixel_directions(self.height, self.width).reshape(-1, 3), self.frequency_hz)
+    def _steering(self) -> ComplexMatrix:
+        return steering(self.elements_m, pixel_directions(self.height, self.width).reshape(-1, 3), self.frequency_hz)
 
     @cached_property
     def _ports(self) -> Ports:
         return Ports(self.elements_m, np.full(len(self.elements_m), self.frequency_hz))
 
     def arrays(self, float_type: Any) -> list[Any]:
-        """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
+        """Constants on the device that a report of a float type reads, inputs of a recording."""
         weights = direction_weights(self.height, self.width, 1, float_type)
         return [*self._ports.arrays, *self._steering.arrays(float_type), weights]
 
@@ -123,12 +126,11 @@ class PixelReceiver:
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Magnitudes [batch * height * width] of the two sides; either may be None."""
-        float_type: Any = mi.Float if learned is None else type(learned[0])
-        image = None if traced is None else self._steering.to_directions(self.elements(traced, float_type))
+        image = None if traced is None else self._steering.forward(self.elements(traced, _float_type(learned)))
         return magnitude(image, learned, self.how)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the amplitude by which a report is too weak: of mean magnitudes."""
+        """Logarithm of the missing amplitude of a report, by mean magnitudes."""
         return float(np.log(np.nanmean(observed) / np.mean(report)))
 
 
@@ -144,27 +146,24 @@ class ArrayReceiver(PixelReceiver):
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Spectra [batch * height * width] of the two sides; either may be None."""
-        float_type: Any = mi.Float if learned is None else type(learned[0])
-        sides = [
-            None if traced is None else self.elements(traced, float_type),
-            None
-            if learned is None
-            else self._steering.to_ports(weighted(learned, direction_weights(self.height, self.width, 1, float_type))),
-        ]
+        sides: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
+        if learned is not None:
+            weights = direction_weights(self.height, self.width, 1, _float_type(learned))
+            sides[1] = self._steering.adjoint(weighted(learned, weights))
         present = [side for side in sides if side is not None]
         if self.how == "coherent" and present:
             sides = [add(*present), None]
-        images = [None if side is None else self._steering.to_directions(side) for side in sides]
+        images = [None if side is None else self._steering.forward(side) for side in sides]
         spectrum = magnitude(images[0], images[1], self.how)
         return scaled(spectrum, self.height * self.width) if self.instrument_scale else spectrum
 
     @property
     def unscaled(self) -> ArrayReceiver:
-        """The same without the instrument's scaling."""
+        """The receiver without the instrument's scaling."""
         return replace(self, instrument_scale=False)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the amplitude by which an unscaled report is too weak: its peaks are to be 1 if scaled."""
+        """Logarithm of the missing amplitude of an unscaled report, whose peaks are to be 1 if scaled."""
         if not self.instrument_scale:
             return super().missing_gain(report, observed)
         return float(-np.log(np.asarray(report).reshape(len(observed), -1).max(axis=1).mean()))
@@ -174,16 +173,15 @@ class ArrayReceiver(PixelReceiver):
 class CsiReceiver:
     """One or several antennas that report their complex channel on each subcarrier.
 
-    The learned field is one on the full sphere. Without a basis it and the paths' gains are alike at all antennas and
-    on all subcarriers, the travelling phase of paths is that of each. With a basis the field has several signals in
-    each direction, whose sums over directions are the coefficients of its vectors. Complex numbers are added, so there
-    is no choice of ``how``.
+    The learned field covers the full sphere. Without a basis it and the paths' gains are equal at all antennas and on
+    all subcarriers; the phase of paths differs between them. With a basis the field has several signals in each
+    direction, whose sums over directions are the coefficients of its vectors. The sides add as complex numbers.
 
     Attributes:
         height: elevations of each hemisphere.
         width: azimuths.
-        frequencies_hz: of the subcarriers, [k].
-        elements_m: places of several antennas [m, 3], receiver's frame, metres; None: one antenna in its origin.
+        frequencies_hz: frequencies of the subcarriers, [k].
+        elements_m: positions of several antennas [m, 3], receiver's frame, metres; None: one antenna at the origin.
         basis: complex [components, k] or [components, m * k], antennas slowest; None: one component, all ones.
     """
 
@@ -197,7 +195,7 @@ class CsiReceiver:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one report: antennas where there are several, subcarriers, real and imaginary part."""
+        """Shape of a report: antennas where there are several, subcarriers, real and imaginary part."""
         antennas = () if self.elements_m is None else (len(self.elements_m),)
         return *antennas, len(self.frequencies_hz), 2
 
@@ -213,25 +211,17 @@ class CsiReceiver:
         return Ports(np.repeat(places, count, axis=0), np.tile(self.frequencies_hz, len(places)))
 
     @cached_property
-    def _vectors(self) -> dict[Any, tuple[Any, Any]]:
-        return {}
-
-    def _basis(self, float_type: Any) -> tuple[Any, Any]:
-        """Real and imaginary part of the basis on the device, [components, outputs]."""
-        if float_type not in self._vectors:
-            basis = np.asarray(self.basis)
-            re, im = (matrix(on_device(part, float_type), basis.shape[1]) for part in (basis.real, basis.imag))
-            self._vectors[float_type] = re, im
-        return self._vectors[float_type]
+    def _basis(self) -> ComplexMatrix:
+        return ComplexMatrix(np.asarray(self.basis))
 
     def arrays(self, float_type: Any) -> list[Any]:
-        """Constants on the device that a report of a float type reads: a recording takes them as inputs."""
-        basis = [] if self.basis is None else list(self._basis(float_type))
+        """Constants on the device that a report of a float type reads, inputs of a recording."""
+        basis = [] if self.basis is None else self._basis.arrays(float_type)
         return [*self._ports.arrays, direction_weights(self.height, self.width, 2, float_type), *basis]
 
     def signals(self, traced: TracedPaths | None, learned: Complex | None) -> tuple[Complex | None, Complex | None]:
         """Both sides at the antennas, [batch * outputs]; None where a side is None."""
-        float_type: Any = mi.Float if learned is None else type(learned[0])
+        float_type = _float_type(learned)
         here, there = None, None
         if traced is not None:
             re, im = path_sum(traced, self._ports)
@@ -239,16 +229,11 @@ class CsiReceiver:
         if learned is not None:
             parts = weighted(learned, direction_weights(self.height, self.width, 2, float_type))
             re, im = (dr.block_reduce(dr.ReduceOp.Add, part, 2 * self.height * self.width) for part in parts)
-            there = self._outputs(re, im)
+            count = self._ports.count
+            there = (
+                (dr.repeat(re, count), dr.repeat(im, count)) if self.basis is None else self._basis.forward((re, im))
+            )
         return here, there
-
-    def _outputs(self, re: Any, im: Any) -> Complex:
-        """Learned signals at all outputs, from coefficients, flat [batch * components]."""
-        if self.basis is None:
-            return dr.repeat(re, self._ports.count), dr.repeat(im, self._ports.count)
-        b_re, b_im = self._basis(type(re))
-        re, im = (matrix(part, self.components) for part in (re, im))
-        return (re @ b_re - im @ b_im).array, (re @ b_im + im @ b_re).array
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Channels [batch * outputs * 2], real and imaginary part in turn, of the two sides; either may be None.
@@ -264,7 +249,7 @@ class CsiReceiver:
         return dr.ravel(pair(re, im))
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the amplitude by which a report is too weak: of root mean squares."""
+        """Logarithm of the missing amplitude of a report, by root mean squares."""
         return float(np.log(_mean_square(observed) / _mean_square(report)) / 2)
 
 
@@ -274,13 +259,13 @@ def _mean_square(values: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class PowerReceiver(CsiReceiver):
-    """A single antenna that reports its power in dB: RSSI. The learned field is one on the full sphere.
+    """A single antenna that reports its power in dB: RSSI. The learned field covers the full sphere.
 
     Attributes:
-        how: how the sides add.
-        interference: traced paths interfere with each other; False: their powers add, what remains after averaging
-            over positions of a wavelength or over a wide band. Such a mean has no phase; added to the learned side as
-            a complex number (``coherent``) it is its root, a positive real, which that side raises or lowers.
+        how: sum of the sides.
+        interference: traced paths interfere with each other; False: their powers add, as in an average over positions
+            within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
+            side its root enters as a positive real number.
     """
 
     how: How = "coherent"
@@ -288,11 +273,11 @@ class PowerReceiver(CsiReceiver):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one report."""
+        """Shape of a report."""
         return ()
 
     def _mean_field(self, traced: TracedPaths, float_type: Any) -> Complex:
-        """Root of the sum of paths' powers, alike at all frequencies, as a complex signal of phase zero."""
+        """Root of the sum of paths' powers, equal at all frequencies, as a complex signal of phase zero."""
         re, im = traced.gain
         amplitude = float_type(dr.sqrt(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, traced.each) + LEAST_POWER))
         wide = dr.repeat(amplitude, self._ports.count)
@@ -303,10 +288,10 @@ class PowerReceiver(CsiReceiver):
         count = self._ports.count
         here, there = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
-            here = self._mean_field(traced, mi.Float if learned is None else type(learned[0]))
+            here = self._mean_field(traced, _float_type(learned))
         received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
         return 10 * dr.log2(received + LEAST_POWER) / math.log2(10)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the amplitude by which a report is too weak: of mean powers in dB."""
+        """Logarithm of the missing amplitude of a report, by mean powers in dB."""
         return float((np.nanmean(observed) - np.mean(report)) * math.log(10) / 20)

@@ -1,40 +1,46 @@
-"""Ways to evaluate the Gaussians of a graph on a receiver's directions, by name.
+"""Evaluation of the Gaussians of a graph on a receiver's directions, by name.
 
 `Splatted` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
-`wrf_traced`; the plugins import this package, so they are imported where they are asked for.
+`wrf_traced`; the plugins import this package, so they are imported on request.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
+
+import drjit as dr
+import numpy as np
 
 from ..core import InputError
+from ..core.angles import FloatArray, pixel_directions
 from ..core.registry import resolve
 from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
+from ..gaussians.render import splat
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
 from ..tracing.field_calculator import Complex
-from .learned import learned_field
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {
     SPLATTED: "wrf_mi.graph.evaluations:Splatted",
     TRACED: "wrf_mi_plugins.evaluation:Traced",
 }
-"""Addresses of classes of (scene or None, `TracedConfig`) whose objects are an `Evaluation`."""
+"""Addresses of subclasses of `Evaluation`, with arguments (scene or None, `TracedConfig`)."""
 
 
-class Evaluation(Protocol):
+class Evaluation(ABC):
     """Complex signal of Gaussians on a receiver's directions.
 
     Attributes:
         recordable: whether Dr.Jit can record a call (`dr.freeze`).
     """
 
-    recordable: bool
+    recordable = True
 
+    @abstractmethod
     def __call__(
         self,
         gaussians: Gaussians,
@@ -44,27 +50,23 @@ class Evaluation(Protocol):
         params: Mapping[str, Any],
         skip: Skip = NOTHING,
     ) -> Complex:
-        """Real and imaginary part [batch * directions], see `wrf_mi.graph.learned.learned_field`.
+        """Real and imaginary part [batch * directions], see `learned_field`.
 
         Args:
-            gaussians: of one field for a batch of transmitters.
-            pose: of the receiver.
+            gaussians: Gaussians of one field for a batch of transmitters.
+            pose: pose of the receiver.
             plane: pixels of a hemisphere.
             sphere: the lower hemisphere too.
             params: parameters of the graph by name, those of the scene's materials among them.
-            skip: what is not evaluated; ``traced`` has none.
+            skip: parts that are not evaluated; ``traced`` evaluates all.
         """
-        ...
 
-    def release(self) -> None:
-        """Let go of what the last call kept for its reverse pass."""
-        ...
+    def release(self) -> None:  # noqa: B027
+        """Drop the references that the last call kept for its reverse pass."""
 
 
-class Splatted:
-    """Gaussians splatted on the plane of directions (`wrf_mi.gaussians`); walls of a scene are no part of it."""
-
-    recordable = True
+class Splatted(Evaluation):
+    """Gaussians splatted on the plane of directions (`wrf_mi.gaussians`); walls of a scene have no effect."""
 
     def __init__(self, scene: Any | None, traced: TracedConfig) -> None:
         pass
@@ -78,11 +80,8 @@ class Splatted:
         params: Mapping[str, Any],
         skip: Skip = NOTHING,
     ) -> Complex:
-        """See `Evaluation`."""
+        """Signal of `learned_field`."""
         return learned_field(gaussians, pose, plane, sphere, skip)
-
-    def release(self) -> None:
-        """See `Evaluation`: nothing is kept."""
 
 
 def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluation:
@@ -90,8 +89,8 @@ def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluat
 
     Args:
         name: a key of `EVALUATIONS`.
-        scene: from `wrf_mi.tracing.open_scene`; None: none.
-        traced: what of the scene is trained.
+        scene: scene from `wrf_mi.tracing.open_scene`; None: no scene.
+        traced: parameters of the scene that are trained.
 
     Raises:
         InputError: no evaluation of that name, or one that cannot serve the scene.
@@ -100,3 +99,47 @@ def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluat
         raise InputError(f"setting evaluation: {name!r} is unknown; choose from {', '.join(EVALUATIONS)}")
     made: Evaluation = resolve(EVALUATIONS[name])(scene, traced)
     return made
+
+
+def learned_field(
+    gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False, skip: Skip = NOTHING
+) -> Complex:
+    """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
+
+    Args:
+        gaussians: Gaussians of one field for a batch of transmitters.
+        pose: pose of the receiver.
+        plane: pixels of a hemisphere.
+        sphere: the lower hemisphere too, as seen by the receiver after half a turn about its x axis.
+        skip: parts that are not evaluated, with bounds on the error of each direction's signal.
+
+    Returns:
+        Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
+        hemisphere, then those of the lower one, see `hemisphere_pair`.
+    """
+    upper = splat(gaussians, pose, plane, skip)
+    if not sphere:
+        return upper
+    lower = splat(gaussians, facing_down(pose), plane, skip)
+    tensor_type: Any = dr.tensor_t(type(upper[0]))
+    shape = (gaussians.batch, plane.pixels)
+    re, im = (
+        dr.concat([tensor_type(half, shape) for half in halves], axis=1).array
+        for halves in zip(upper, lower, strict=True)
+    )
+    return re, im
+
+
+def facing_down(pose: Pose) -> Pose:
+    """The pose after half a turn about the receiver's x axis: its upper hemisphere is the lower one of ``pose``."""
+    return Pose(pose.position, [[row[0], -row[1], -row[2]] for row in pose.to_world])
+
+
+def hemisphere_pair(height: int, width: int) -> FloatArray:
+    """Unit vectors [2 * height * width, 3] of the pixels of the upper, then the lower hemisphere, receiver's frame.
+
+    The lower hemisphere is the upper one after half a turn about x, in the order of `wrf_mi.core.pixel_directions`; for
+    one grid over the full sphere see `wrf_mi.core.angles.equirectangular_sphere`.
+    """
+    upper = pixel_directions(height, width).reshape(-1, 3)
+    return np.concatenate([upper, upper * [1, -1, -1]])

@@ -42,22 +42,22 @@ Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
 """Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
 SHARE = 0.1
-"""Unit of the learned side beside paths, as a share of their amplitude: it begins as a correction."""
+"""Unit of the learned side as a share of the paths' amplitude: it begins as a correction."""
 MATCHING = 3
 """Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
 
 
 @dataclass
 class Batch:
-    """Transmitters that one receiver hears, on the device.
+    """A batch of transmitters and their receiver, on the device.
 
     Attributes:
         condition: positions [3, batch], metres, or features [features, batch] in their place.
         slots: rows of the traced side [batch].
-        receiver: its number from 0.
-        pose: of the receiver.
-        plane: directions of its learned signal.
-        weight: of the learned signal [batch], 0 to 1; None: 1.
+        receiver: number of the receiver, from 0.
+        pose: pose of the receiver.
+        plane: directions of the learned signal.
+        weight: factor of the learned signal [batch], 0 to 1; None: 1.
     """
 
     condition: Any
@@ -76,16 +76,16 @@ class Graph:
     """Gaussians, the traced paths of a scene, and receivers.
 
     Args:
-        field: the Gaussians; None: the traced paths alone.
+        field: field of Gaussians; None: only traced paths.
         receivers: poses, antennas and arrays.
-        form: what observations are made of.
-        scene: from `wrf_mi.tracing.open_scene`, at the carrier; None: Gaussians alone.
-        traced: what is traced, and rates.
+        form: form of the observations.
+        scene: scene from `wrf_mi.tracing.open_scene`, at the carrier; None: only Gaussians.
+        traced: options of tracing, and learning rates.
         tx_antenna: antenna of the transmitters.
-        evaluation: of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
+        evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
 
     Raises:
-        InputError: a receiver model or a scene for which array or carrier are not known, or nothing to evaluate.
+        InputError: a receiver model or a scene without the array or carrier it needs, or nothing to evaluate.
     """
 
     def __init__(
@@ -99,29 +99,29 @@ class Graph:
         evaluation: str = SPLATTED,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
-        array = self.kind.needs_array and any(one.array_m is None for one in receivers)
+        array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
         carrier = form.frequencies_hz is None and (self.kind.needs_carrier or scene is not None)
         if array or carrier:
             what = "a scene" if scene is not None else f"setting receiver: {form.receiver}"
             needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
             raise InputError(f"{what} needs {needed}; state array and frequency_hz in the data")
         if scene is not None and form.features:
-            raise InputError("paths are traced from positions, not from an uplink; leave the scene away")
+            raise InputError("paths are traced from positions, not from an uplink; omit the scene")
         if field is None and scene is None:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.form, self.tx_antenna = form, tx_antenna
         self.evaluation = evaluation_of(evaluation, scene, traced)
-        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, one) for one in receivers)
+        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, receiver) for receiver in receivers)
 
     @property
     def sphere(self) -> bool:
-        """Whether receivers see the full sphere, or else the upper hemisphere."""
+        """Whether receivers cover the full sphere instead of the upper hemisphere."""
         return self.models[0].sphere
 
     @property
     def corrects(self) -> bool:
-        """Whether observations are something without the Gaussians, which correct it: paths, or a channel of zero."""
+        """Whether the Gaussians correct a report without them: paths, or a channel of zero."""
         return self.field is not None and (
             self.scene is not None or (self.kind.complex_valued and not self.form.features)
         )
@@ -136,13 +136,13 @@ class Graph:
         """Refuse transmitters [n, 3] and receivers inside the scene's solids, warn of those near surfaces.
 
         Raises:
-            InputError: naming the transmitter or receiver, and the solid.
+            InputError: a transmitter or receiver inside a solid, both named.
         """
         if self.scene is not None:
             self._prepared.check(tx_pos_m, self.receivers)
 
     def check_polarization(self, tx_pos_m: FloatArray) -> None:
-        """Warn of receivers that are polarised across what arrives of transmitters [n, 3]."""
+        """Warn of receivers polarised orthogonally to the waves of transmitters [n, 3]."""
         if self.scene is not None:
             from ..tracing.polarization import check_polarization
 
@@ -156,20 +156,23 @@ class Graph:
         from ..tracing.traced_field import TracedField, TracedOptions
 
         t = self.traced
-        what = TraceOptions(
+        trace = TraceOptions(
             transmission=t.transmission,
             max_depth=t.depth,
             max_reflections=min(t.reflections, t.depth),
             reflection=t.reflections > 0,
             rays=t.rays,
         )
-        ends: dict[str, Any] = {"tx_antenna": self.tx_antenna, "materials": t.materials, "planes": t.moves_planes}
-        options = TracedOptions(what, t.pattern_degree, faint=t.faint, **ends)
+        antenna, materials, planes = self.tx_antenna, t.materials, t.moves_planes
+        options = TracedOptions(
+            trace, t.pattern_degree, faint=t.faint, tx_antenna=antenna, materials=materials, planes=planes
+        )
         receiver = self.receivers[number]
         return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the parameters beside the field's that a rate moves, by name; sides of all receivers.
+        """Starting values of the trained parameters beside the field's, by name, from the traced sides of all
+        receivers.
 
         Raises:
             InputError: without Gaussians, a receiver that no path reaches.
@@ -185,15 +188,16 @@ class Graph:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
 
-    def moved(self, number: int) -> bool:
-        """Whether training moves a receiver."""
+    @property
+    def moves_receivers(self) -> bool:
+        """Whether training moves receivers."""
         return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
     def gaussians(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Gaussians:
         """Gaussians of a batch in the receiver's unit, one signal each.
 
-        Where observations have a unit of their own it is exp(``level``), and beside paths at least a share of their
-        amplitude: what a mesh leaves out goes with what it tells, near and far.
+        Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
+        error of a mesh scales with its paths, near and far.
         """
         assert self.field is not None
         gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
@@ -215,34 +219,34 @@ class Graph:
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
     def report(self, number: int, side: TracedField | None, learned: bool = True, skip: Skip = NOTHING) -> Report:
-        """What a receiver reports, as a function of parameters, for transmitters of a traced side.
+        """Reports of a receiver as a function of parameters, for transmitters of a traced side.
 
         Args:
-            number: of the receiver.
+            number: number of the receiver.
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
-            skip: what of the Gaussians is not evaluated.
+            skip: parts of the Gaussians that are not evaluated.
         """
-        model, receiver, moved = self.models[number], self.receivers[number], self.moved(number)
+        model, receiver = self.models[number], self.receivers[number]
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             paths = None if side is None else side(params, batch.slots)
             if self.field is None or not learned:
                 return model(paths, None)
-            here = receiver_pose(receiver, params, mi.Float) if moved else batch.pose
+            here = receiver_pose(receiver, params, mi.Float) if self.moves_receivers else batch.pose
             gaussians = self.gaussians(params, batch, paths)
             return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
 
         return report
 
     def arrays(self, number: int, side: TracedField | None) -> list[Any]:
-        """What a report reads on the device beside its arguments: a recording takes it as inputs."""
+        """Constants on the device that a report reads beside its arguments, inputs of a recording."""
         if side is None and self.form.receiver == "pixel":
             return []
         return [self.models[number].arrays(mi.Float), [] if side is None else side.arrays]
 
     def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
-        """Logarithm of the amplitude that paths bring, by their mean power over all transmitters of a side."""
+        """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""
         with dr.suspend_grad():
             re, im = side(params).gain
             power = float(dr.sum(re * re + im * im)[0]) / len(side)
@@ -251,21 +255,21 @@ class Graph:
     def match_gain(
         self, number: int, side: TracedField, params: Mapping[str, Any], observed: NDArray[Any]
     ) -> dict[str, NDArray[np.float32]]:
-        """The receiver's starting gain, with which the traced side alone reports what was observed, on average.
+        """The receiver's starting gain, which matches the mean of the traced reports to the observations.
 
         Args:
-            number: of the receiver.
-            side: the traced side of the observed transmitters.
-            params: values by name, in place of those stated.
-            observed: [n, *shape of a report], NaN where nothing was received.
+            number: number of the receiver.
+            side: traced side of the observed transmitters.
+            params: values by name, in place of the stated ones.
+            observed: observations [n, *shape of a report], NaN where nothing was received.
         """
         model = self.models[number]
-        alone: Any = getattr(model, "unscaled", model)
+        unscaled: Any = getattr(model, "unscaled", model)
         known = np.isfinite(observed).reshape(len(observed), -1).all(axis=1)
         gain = np.zeros(2, np.float32)
         for _ in range(MATCHING):
             with dr.suspend_grad():
-                report = alone(side({**params, side.gain_name: mi.TensorXf(gain)}), None).numpy()
+                report = unscaled(side({**params, side.gain_name: mi.TensorXf(gain)}), None).numpy()
             report = report.astype(float).reshape(np.shape(observed))
             gain[0] += model.missing_gain(report[known], observed[known]) if known.any() else 0.0
         return {side.gain_name: gain}

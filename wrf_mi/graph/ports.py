@@ -1,4 +1,4 @@
-"""Signals at a receiver's ports: places, each with a frequency; from traced paths and from directions.
+"""Signals at a receiver's ports, positions with a frequency each, from traced paths and from directions.
 
 Everything is a Dr.Jit array of one float type with derivatives; complex numbers are pairs (re, im).
 """
@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.constants import speed_of_light
 
 from ..backend.device import on_device
@@ -31,11 +32,11 @@ def direction_weights(height: int, width: int, halves: int, float_type: Any) -> 
 
 
 class Ports:
-    """Where and at what frequency a receiver takes m complex signals, kept on the device.
+    """Positions and frequencies of a receiver's m complex signals, kept on the device.
 
     Args:
-        offset_m: places in the receiver's frame, [m, 3], metres.
-        frequency_hz: of each, [m].
+        offset_m: positions in the receiver's frame, [m, 3], metres.
+        frequency_hz: frequency of each port, [m].
     """
 
     def __init__(self, offset_m: FloatArray, frequency_hz: FloatArray) -> None:
@@ -45,7 +46,7 @@ class Ports:
 
     @property
     def arrays(self) -> list[Any]:
-        """All that it keeps on the device."""
+        """Arrays on the device."""
         return [*self.offset_m, self.wavenumber]
 
 
@@ -53,12 +54,12 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     """Coherent sum of a receiver's paths at m ports: sum over paths of g (d / d_m) exp(-j k_m d_m).
 
     Each path is a spherical wave from its image source, at the unfolded length d in the direction of arrival; for flat
-    mirrors that is exact, near field included. What it leaves out: a path may be blocked for some elements only, and
-    reflects at the angle of the array's origin.
+    mirrors that is exact, near field included. It neglects that a path may be blocked for some elements only; all
+    reflect at the angle of the array's origin.
 
     Args:
-        paths: of a batch of transmitters.
-        ports: of the receiver.
+        paths: paths of a batch of transmitters.
+        ports: ports of the receiver.
 
     Returns:
         Real and imaginary part, float64 [batch * m]. A fixed order of summation: the same in every run.
@@ -85,56 +86,58 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     return tuple(dr.block_reduce(dr.ReduceOp.Add, term, each) for term in terms)
 
 
-class Steering:
-    """The complex matrix E = exp(+j k p . u) of m ports and n directions, kept on the device.
+class ComplexMatrix:
+    """A complex matrix M [m, n] on the device, for rows of complex numbers as pairs of flat arrays.
+
+    Args:
+        values: complex matrix [m, n].
+    """
+
+    def __init__(self, values: ArrayLike) -> None:
+        self._values = np.asarray(values, complex)
+        self._device: dict[Any, tuple[Any, Any]] = {}
+
+    def arrays(self, float_type: Any) -> tuple[Any, Any]:
+        """Real and imaginary part on the device, [m, n]."""
+        if float_type not in self._device:
+            columns = self._values.shape[1]
+            re, im = (matrix(on_device(part, float_type), columns) for part in (self._values.real, self._values.imag))
+            self._device[float_type] = re, im
+        return self._device[float_type]
+
+    def forward(self, x: Complex) -> Complex:
+        """Products x M of rows, flat [batch * m], to flat [batch * n]."""
+        c, s = self.arrays(type(x[0]))
+        re, im = (matrix(part, len(self._values)) for part in x)
+        return (re @ c - im @ s).array, (re @ s + im @ c).array
+
+    def adjoint(self, x: Complex) -> Complex:
+        """Products x M^H of rows, flat [batch * n], to flat [batch * m]."""
+        c, s = (dr.moveaxis(part, 0, 1) for part in self.arrays(type(x[0])))
+        re, im = (matrix(part, self._values.shape[1]) for part in x)
+        return (re @ c + im @ s).array, (im @ c - re @ s).array
+
+
+def steering(offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> ComplexMatrix:
+    """Matrix exp(-j k p . u) [m, n] of ports and directions: forward gives the Bartlett sum, its adjoint port signals.
 
     Args:
         offset_m: ports [m, 3] in the receiver's frame, metres.
         directions: unit vectors [n, 3] in that frame.
-        frequency_hz: of the carrier.
+        frequency_hz: carrier.
     """
-
-    def __init__(self, offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> None:
-        phase = wavenumber(frequency_hz) * np.asarray(offset_m, float) @ np.asarray(directions, float).T
-        self._parts: FloatArray = np.stack([np.cos(phase), np.sin(phase)])
-        self._device: dict[Any, tuple[Any, Any]] = {}
-
-    def arrays(self, float_type: Any) -> list[Any]:
-        """All that it keeps on the device for signals of a float type."""
-        return list(self._matrices(float_type))
-
-    def _matrices(self, float_type: Any) -> tuple[Any, Any]:
-        if float_type not in self._device:
-            c, s = (matrix(on_device(part, float_type), part.shape[1]) for part in self._parts)
-            self._device[float_type] = c, s
-        return self._device[float_type]
-
-    def to_ports(self, signal: Complex) -> Complex:
-        """sum_u R(u) exp(+j k p_m . u): from directions, flat [batch * n], to ports, flat [batch * m]."""
-        c, s = self._matrices(type(signal[0]))
-        re, im = (matrix(part, self._parts.shape[2]) for part in signal)
-        c, s = _transposed(c), _transposed(s)
-        return (re @ c - im @ s).array, (re @ s + im @ c).array
-
-    def to_directions(self, ports: Complex) -> Complex:
-        """sum_m h_m exp(-j k p_m . u): from ports, flat [batch * m], to directions, flat [batch * n] (Bartlett)."""
-        c, s = self._matrices(type(ports[0]))
-        re, im = (matrix(part, self._parts.shape[1]) for part in ports)
-        return (re @ c + im @ s).array, (im @ c - re @ s).array
+    phase = wavenumber(frequency_hz) * np.asarray(offset_m, float) @ np.asarray(directions, float).T
+    return ComplexMatrix(np.cos(phase) - 1j * np.sin(phase))
 
 
 def matrix(flat: Any, columns: int) -> Any:
-    """A flat array as a tensor of so many columns."""
+    """A flat array as a tensor with this number of columns."""
     tensor_type: Any = dr.tensor_t(type(flat))
     return tensor_type(flat, (dr.width(flat) // columns, columns))
 
 
-def _transposed(matrix: Any) -> Any:
-    return dr.moveaxis(matrix, 0, 1)
-
-
 def weighted(signal: Complex, weight: Any) -> Complex:
-    """A signal on directions, flat [batch * n], times a weight of each, [n] of the same float type."""
+    """A signal on directions, flat [batch * n], times weights [n] of the same float type."""
     index = dr.arange(dr.uint32_array_t(type(weight)), dr.width(signal[0])) % dr.width(weight)
     factor = dr.gather(type(weight), weight, index)
     return signal[0] * factor, signal[1] * factor

@@ -1,8 +1,8 @@
-"""Receiver models by name, and what of the observations they need to know.
+"""Receiver models by name, and the form of observations that they need.
 
 A receiver model is a callable of two sides, the paths of a batch and the learned signal on directions, either of which
-may be None, that gives flat observations (see `wrf_mi.graph.combine`). Another package adds one by an entry point of
-the group `ENTRY_POINTS` that names a `ReceiverKind`.
+may be None; it returns flat observations (see `wrf_mi.graph.combine`). Another package adds a model by an entry point
+of the group `ENTRY_POINTS` that names a `ReceiverKind`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..core.registry import Registry
 from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
-"""Group of the entry points by which other packages add receiver models."""
+"""Group of entry points of receiver models."""
 PIXEL = "pixel"
 """The receiver model of the papers."""
 AUTO = "auto"
@@ -28,21 +28,16 @@ AUTO = "auto"
 
 
 class ReceiverModel(Protocol):
-    """How two sides become what an instrument reports.
-
-    Attributes:
-        sphere: whether directions are those of the full sphere, or else of the upper hemisphere.
-        shape: of one report; complex numbers as a last axis of real and imaginary part.
-    """
+    """Combination of two sides to the report of an instrument."""
 
     @property
     def sphere(self) -> bool:
-        """See above."""
+        """Whether directions cover the full sphere instead of the upper hemisphere."""
         ...
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """See above."""
+        """Shape of a report; complex numbers as a last axis of real and imaginary part."""
         ...
 
     def arrays(self, float_type: Any) -> list[Any]:
@@ -54,22 +49,22 @@ class ReceiverModel(Protocol):
         ...
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the amplitude by which reports are too weak."""
+        """Logarithm of the missing amplitude of reports."""
         ...
 
 
 @dataclass(frozen=True)
 class Form:
-    """What observations are made of, beside the receivers' poses, antennas and arrays.
+    """Form of observations, beside the receivers' poses, antennas and arrays.
 
     Attributes:
         receiver: name of the receiver model, a key of `RECEIVERS`.
         size: elevations and azimuths of the learned signal's directions; for spectra those of the image.
-        frequencies_hz: of the carrier [1] or of subcarriers [k]; None: not known.
+        frequencies_hz: carrier [1] or subcarriers [k]; None: unknown.
         outputs: shape of a channel: subcarriers, or antennas and subcarriers; () for other observations.
         basis: complex [components, outputs] that learned channels are sums of; None: no channels.
-        features: number of features that tell of a transmitter in place of its position; 0: its position.
-        headings: whether the transmitters' antenna turns with their headings, which then are known.
+        features: number of features that describe a transmitter in place of its position; 0: its position.
+        headings: whether the transmitters' antenna turns with their (known) headings.
     """
 
     receiver: str
@@ -81,7 +76,7 @@ class Form:
     headings: bool = False
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """As arrays, for a file."""
+        """Arrays for a file."""
         hz = np.array([np.nan]) if self.frequencies_hz is None else np.asarray(self.frequencies_hz, float)
         return {
             "form/receiver": np.asarray(self.receiver),
@@ -95,7 +90,7 @@ class Form:
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Form:
-        """What `arrays` described."""
+        """The form that `arrays` describes."""
         height, width = map(int, arrays["form/size"])
         hz, basis = np.asarray(arrays["form/frequencies_hz"], float), np.asarray(arrays["form/basis"])
         return cls(
@@ -110,12 +105,12 @@ class Form:
 
     @property
     def components(self) -> int:
-        """Complex signals of a Gaussian."""
+        """Number of complex signals of a Gaussian."""
         return 1 if self.basis is None else len(self.basis)
 
     @property
     def carrier_hz(self) -> float:
-        """The middle of the frequencies; NaN where they are not known."""
+        """Mean of the frequencies; NaN where they are unknown."""
         return float("nan") if self.frequencies_hz is None else float(np.mean(self.frequencies_hz))
 
 
@@ -124,12 +119,12 @@ class ReceiverKind:
     """A receiver model that a setting can name.
 
     Attributes:
-        name: as in the setting ``receiver``.
-        tasks: whose observations it reports.
-        make: ``make(form, receiver)``: the model of one receiver.
+        name: value of the setting ``receiver``.
+        tasks: tasks whose observations it reports.
+        make: ``make(form, receiver)``, the model of a receiver.
         needs_array: whether it needs the receiver's antenna array.
-        needs_carrier: whether it needs the carrier, without a scene too.
-        levels: whether the learned side has a level at each receiver: what it reports has a unit of its own.
+        needs_carrier: whether it needs the carrier even without a scene.
+        levels: whether the learned side has a level at each receiver, because reports have a unit.
         complex_valued: whether reports are complex: a last axis of real and imaginary part.
     """
 
@@ -142,8 +137,8 @@ class ReceiverKind:
     complex_valued: bool = False
 
 
-def _elements(receiver: Receiver) -> FloatArray:
-    return np.zeros((0, 3)) if receiver.array_m is None else np.asarray(receiver.array_m, float)
+def _elements(receiver: Receiver, count: int = 0) -> FloatArray:
+    return np.zeros((count, 3)) if receiver.array_m is None else np.asarray(receiver.array_m, float)
 
 
 def _pixel(form: Form, receiver: Receiver) -> PixelReceiver:
@@ -161,31 +156,30 @@ def _power(form: Form, receiver: Receiver) -> PowerReceiver:
 
 
 def _csi(form: Form, receiver: Receiver) -> CsiReceiver:
-    # Where frequencies are not known no path is evaluated. Narrow channels may come with their carrier alone.
+    # Without frequencies no path is evaluated. Narrow channels may state their carrier alone.
     known = 0.0 if form.frequencies_hz is None else form.frequencies_hz
     tones = tuple(map(float, np.broadcast_to(known, form.outputs[-1:])))
-    elements = None
-    if len(form.outputs) > 1 and not form.features:  # by uplink each antenna is a condition of its own
-        elements = np.zeros((form.outputs[0], 3)) if receiver.array_m is None else np.asarray(receiver.array_m, float)
-    return CsiReceiver(*form.size, tones, elements, form.basis)
+    # With features (uplink) each antenna has a condition, so the model has one antenna.
+    several = len(form.outputs) > 1 and not form.features
+    return CsiReceiver(*form.size, tones, _elements(receiver, form.outputs[0]) if several else None, form.basis)
 
 
-_OWN = (
+_BUILT_IN = (
     ReceiverKind(PIXEL, ("spectrum",), _pixel),
     ReceiverKind("array", ("spectrum",), _array, needs_array=True, needs_carrier=True),
     ReceiverKind("power", ("rssi",), _power, levels=True),
     ReceiverKind("csi", ("csi",), _csi, levels=True, complex_valued=True),
 )
-_RECEIVERS = Registry[ReceiverKind]("receiver model", ENTRY_POINTS, {kind.name: kind for kind in _OWN})
+_RECEIVERS = Registry[ReceiverKind]("receiver model", ENTRY_POINTS, {kind.name: kind for kind in _BUILT_IN})
 RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS
-"""Every receiver model by its name."""
+"""All receiver models by name."""
 
 
 def register(kind: ReceiverKind) -> None:
     """Add a receiver model for this process; an installed package names it by an entry point of `ENTRY_POINTS`.
 
     Raises:
-        InputError: a name that is taken.
+        InputError: the name is taken.
     """
     _RECEIVERS.add(kind.name, kind)
 
@@ -194,7 +188,7 @@ def receiver_kind(name: str, task: str) -> ReceiverKind:
     """The receiver model of a name, for a task.
 
     Raises:
-        InputError: none of that name, or one of another task.
+        InputError: an unknown name, or a model of another task.
     """
     able = [known for known in RECEIVERS if task in RECEIVERS[known].tasks]
     if name not in RECEIVERS:

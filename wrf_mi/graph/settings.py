@@ -11,30 +11,30 @@ from ..core.settings import ShareBelow1
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 
 EvaluationName = Literal["splatted", "traced"]
-"""Ways to evaluate Gaussians (`wrf_mi.graph.evaluations`)."""
+"""Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.")
-"""Beginnings of the traced side's parameters (`wrf_mi.tracing.traced_field.TracedField.parameters`)."""
+"""Prefixes of the traced side's parameters (`wrf_mi.tracing.traced_field.TracedField.parameters`)."""
 
 
 @dataclass(frozen=True)
 class TracedConfig:
-    """Paths of a scene that are trained together with the Gaussians: what is traced, and learning rates.
+    """Paths of a scene that are trained together with the Gaussians: options of tracing, and learning rates.
 
-    A parameter of rate 0 is held at its stated value and costs nothing.
+    A parameter of rate 0 stays at its stated value and costs nothing.
 
     Attributes:
-        depth: interactions of a path at most, transmissions included.
-        reflections: of these at most so many reflections.
-        transmission: paths through surfaces.
-        rays: that search from each receiver.
-        faint: the weakest paths of a transmitter are left out while their amplitudes add up to less than this share of
-            those of all paths, with the scene's stated materials; 0: none are.
+        depth: largest number of interactions of a path, transmissions included.
+        reflections: largest number of reflections among them.
+        transmission: whether paths pass through surfaces.
+        rays: number of rays that search from each receiver.
+        faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share of
+            those of all paths, with the scene's stated materials; 0: none.
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
         materials: ``named``: each named material has a permittivity and a conductivity; ``surface``: each surface has
-            its own, the faces of one object in one plane, started from the named material.
-        alone: share of the steps for which the paths are trained alone, before the Gaussians.
+            its own, the faces of one object in one plane, initialised from the named material.
+        alone: share of the steps in which only the paths are trained, before the Gaussians.
         material: rate of permittivities and conductivities (of their logarithms).
         gain: rate of each receiver's gain (of its logarithm, and of its phase in rad).
         pattern: rate of the patterns' coefficients.

@@ -1,1 +1,1 @@
-
+"""Run folders: training, evaluation, prediction, comparison, sweeps."""

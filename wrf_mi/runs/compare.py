@@ -1,11 +1,9 @@
-"""Several runs side by side: a table, score distributions, samples with their truth, training curves."""
+"""Comparison of runs: table, score distributions, samples with their truth, training curves."""
 
 from __future__ import annotations
 
 import base64
-import csv
 import html
-import io
 import re
 import sys
 from collections.abc import Sequence
@@ -21,11 +19,11 @@ from ..models.ray_tracing import PATHS
 from ..tasks import TASKS
 from . import figures
 from .folder import FITTED
-from .results import Results, read_runs
+from .results import Results, read_runs, write_csv
 from .scene_view import scene_view
 
 QUANTILES = (0.1, 0.5, 0.9)
-"""Test rows that are shown of spectra: those at these quantiles of the first run's score."""
+"""Quantiles of the first run's score at which spectra of test rows are shown."""
 
 COLUMNS = {
     "run": "run",
@@ -52,13 +50,12 @@ Picture = tuple[str, str, Figure]
 
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
-    """Write the comparison of several runs.
+    """Write a comparison of runs.
 
-    Runs on the same data set stand beside each other on the same test rows, and beside the reference method that needs
-    no model (`wrf_mi.tasks.TASKS`). Writes into ``out`` (made if need be): ``compare.csv``, one row per run
-    and reference; for each data set ``<data set>-cdf.png``, ``<data set>-samples.png`` with the truth beside each
-    method, ``<data set>-scene.png`` if one was traced and ``<data set>-training.png`` if one was trained; and
-    ``index.html``, one file with all of it.
+    Runs on the same data set are compared on the same test rows, with their references (`wrf_mi.tasks.TASKS`). Writes
+    into ``out`` (made if need be): ``compare.csv``, one row per run and reference; for each data set
+    ``<data set>-cdf.png``, ``<data set>-samples.png`` with the truth beside each prediction, ``<data set>-scene.png``
+    if one was traced and ``<data set>-training.png`` if one was trained; and ``index.html``, one file with all of it.
 
     Args:
         run_dirs: run folders.
@@ -68,18 +65,17 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
         Path of ``index.html``.
 
     Raises:
-        InputError: no run, or a folder that is not one.
+        InputError: no run, or a folder that is not a run.
     """
     groups = _groups(read_runs(run_dirs))
     table = [row for runs in groups.values() for row in _rows(runs)]
-    sections = [(_heading(runs), _pictures(slug, runs)) for slug, runs in groups.items()]
+    sections = [
+        (f"{Path(runs[0].dataset).name}: {TASKS[runs[0].task].heading}", _pictures(slug, runs))
+        for slug, runs in groups.items()
+    ]
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(COLUMNS), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    write_atomically(folder / "compare.csv", text.getvalue())
+    write_csv(folder / "compare.csv", table, list(COLUMNS))
     for _, pictures in sections:
         for name, _, figure in pictures:
             figures.save(figures.without_formulas(figure), folder / name)
@@ -88,7 +84,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
 
 
 def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
-    """Runs by task and data set, under names that can begin a file's name."""
+    """Runs by task and data set; the keys are prefixes of file names."""
     by_data: dict[tuple[str, str], list[Results]] = {}
     for run in runs:
         by_data.setdefault((run.task, run.dataset), []).append(run)
@@ -101,32 +97,25 @@ def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
     return groups
 
 
-def _heading(runs: Sequence[Results]) -> str:
-    return f"{Path(runs[0].dataset).name}: {TASKS[runs[0].task].heading}"
-
-
 def _rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
-    """The table's rows of one data set: each run, and each reference once."""
-    task = TASKS[runs[0].task]
-    rows = []
-    for run in runs:
-        known = {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
-        own = {"run": run.name, "dataset": run.dataset, "seed": run.seed, "metric": task.label}
-        rows.append(known | own | _summary(run.metrics[task.block]))
+    """Rows of the table for a data set: each run, and each reference once."""
+    label, block_name = TASKS[runs[0].task].label, TASKS[runs[0].task].block
+    named = [
+        ({key: run.metrics[key] for key in COLUMNS if key in run.metrics} | {"run": run.name, "seed": run.seed}, block)
+        for run in runs
+        for block in [run.metrics[block_name]]
+    ]
     for name, (run, key) in _references(runs).items():
-        block = run.metrics["reference"][key]
         kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
-        own = {"run": name, "model": key, "dataset": run.dataset, "metric": task.label}
-        rows.append(kept | own | _summary(block))
+        named.append((kept | {"run": name, "model": key}, run.metrics["reference"][key]))
+    common = {"dataset": runs[0].dataset, "metric": label}
+    scores = ("median", "mean", "p10", "p90")
+    rows = [row | common | {key: block.get(key) for key in scores} for row, block in named]
     return [{key: row.get(key) for key in COLUMNS} for row in rows]
 
 
-def _summary(block: dict[str, Any]) -> dict[str, Any]:
-    return {key: block.get(key) for key in ("median", "mean", "p10", "p90")}
-
-
 def _references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
-    """Each reference by its name: a run that has it and its key, once for runs with the same training and test rows."""
+    """A run and the key of each reference by name, once for runs with the same training and test rows."""
     found: dict[str, tuple[Results, str]] = {}
     for run in runs:
         for key, scores in run.reference_scores.items():
@@ -145,7 +134,7 @@ def _pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         {name: run.reference_scores[key] for name, (run, key) in _references(runs).items()},
         task.label,
     )
-    samples = _spectra(runs) if TASKS[runs[0].task].image else _maps(runs)
+    samples = _spectra(runs) if task.image else _maps(runs)
     pictures: list[Picture] = [
         (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
         (f"{slug}-samples.png", *samples),
@@ -177,76 +166,83 @@ def _scene(runs: Sequence[Results]) -> Figure | None:
 def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
     first = runs[0]
-    shared = np.array([all(_position(run, first, m) is not None for run in runs) for m in range(len(first.row))])
+    positions = _positions(runs)
+    shared = (positions >= 0).all(axis=0)
     candidates = np.flatnonzero(shared if shared.any() else np.ones_like(shared))
     score = first.score[:, candidates]
     order = np.argsort(score, axis=None, kind="stable")
     rows = []
     for quantile in QUANTILES:
         receiver, chosen = np.unravel_index(order[round(quantile * (len(order) - 1))], score.shape)
-        m = int(candidates[chosen])
-        places = [_position(run, first, m) for run in runs]
+        m = candidates[chosen]
         name = f"row {first.row[m]}" + (f", {first.receivers[receiver]}" if len(first.truth) > 1 else "")
-        predictions = [None if p is None else run.prediction[receiver, p] for run, p in zip(runs, places, strict=True)]
-        rows.append((name, [first.truth[receiver, m], *predictions, first.reference[receiver, m]]))
-    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
+        found = [None if p < 0 else run.prediction[receiver, p] for run, p in zip(runs, positions[:, m], strict=True)]
+        rows.append((name, [first.truth[receiver, m], *found, first.reference[receiver, m]]))
     percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
     heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"
-    return heading, figures.spectrum_table(rows, columns)
+    return heading, figures.spectrum_table(rows, _columns(runs))
+
+
+def _columns(runs: Sequence[Results]) -> list[str]:
+    return ["truth", *(run.name for run in runs), f"{runs[0].reference_name} ({runs[0].metrics['split']})"]
 
 
 def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
     first = runs[0]
-    columns = ["truth", *(run.name for run in runs), f"{first.reference_name} ({first.metrics['split']})"]
-    rows = []
-    for r, receiver in enumerate(first.receivers):
-        aligned = [_aligned(run, first, r) for run in runs]
-        maps = [first.truth[r], *aligned, first.reference[r]]
-        rows.append((receiver, [None if values is None else _power_db(values) for values in maps]))
+    aligned = [_aligned(run, indices) for run, indices in zip(runs, _positions(runs), strict=True)]
+    maps = [first.truth, *aligned, first.reference]
+    rows = [
+        (name, [None if values is None else _power_db(values[r]) for values in maps])
+        for r, name in enumerate(first.receivers)
+    ]
+    quantity = TASKS[first.task].quantity
     if not np.isfinite(first.tx_pos_m).all():
         heading = f"Power at each receiver over the test rows of {first.name}"
-        return heading, figures.row_table(rows, columns, first.row, TASKS[first.task].quantity)
+        return heading, figures.row_table(rows, _columns(runs), first.row, quantity)
     heading = f"Power at each receiver over the test positions of {first.name}"
-    return heading, figures.position_table(rows, columns, first.tx_pos_m, TASKS[first.task].quantity)
+    return heading, figures.position_table(rows, _columns(runs), first.tx_pos_m, quantity)
 
 
 def _power_db(values: np.ndarray) -> np.ndarray:
-    """RSSI as it is; the power of a channel's coefficients, summed over antennas and subcarriers, in dB."""
+    """RSSI unchanged; the power of channel coefficients, summed over antennas and subcarriers, in dB."""
     if not np.iscomplexobj(values):
         return values
     power = np.square(np.abs(values)).reshape(len(values), -1).sum(axis=-1)
     return 10 * np.log10(np.where(power > 0, power, np.nan))
 
 
-def _aligned(run: Results, first: Results, receiver: int) -> np.ndarray | None:
-    """Predictions of ``run`` in the order of the test rows of ``first``, NaN where it has none; None without any."""
-    places = [_position(run, first, m) for m in range(len(first.row))]
-    if all(p is None for p in places):
+def _aligned(run: Results, positions: np.ndarray) -> np.ndarray | None:
+    """Predictions of a run at the given indices, NaN where that is -1; None where all are."""
+    if (positions < 0).all():
         return None
-    values = run.prediction[receiver]
-    missing = np.full(values.shape[1:], np.nan, values.dtype)
-    return np.stack([missing if p is None else values[p] for p in places])
+    values = run.prediction[:, positions]
+    values[:, positions < 0] = np.nan
+    return values
 
 
-def _position(run: Results, first: Results, m: int) -> int | None:
-    """Where ``run`` keeps test row ``m`` of ``first``; None if it has not, or if it is another measurement."""
-    found = np.flatnonzero(run.row == first.row[m])
-    if len(found) != 1 or len(run.truth) != len(first.truth):
-        return None
-    same = np.array_equal(run.truth[:, found[0]], first.truth[:, m], equal_nan=True)
-    return int(found[0]) if same else None
+def _positions(runs: Sequence[Results]) -> np.ndarray:
+    """Index in each run of each test row of the first, [n, m]; -1 where it is absent or another measurement."""
+    first = runs[0]
+    found = np.full((len(runs), len(first.row)), -1)
+    for index, run in zip(found, runs, strict=True):
+        for m, row in enumerate(first.row) if len(run.truth) == len(first.truth) else ():
+            same = np.flatnonzero(run.row == row)
+            if len(same) == 1 and np.array_equal(run.truth[:, same[0]], first.truth[:, m], equal_nan=True):
+                index[m] = same[0]
+    return found
 
 
 def _page(table: Sequence[dict[str, Any]], sections: Sequence[tuple[str, Sequence[tuple[Path, str]]]]) -> str:
-    """A page that needs no other file: the table, and each data set's pictures within it."""
+    """HTML page with the table, and each data set's pictures embedded."""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in COLUMNS.values())
     body = "\n".join("<tr>" + "".join(f"<td>{_cell(row[key])}</td>" for key in COLUMNS) + "</tr>" for row in table)
     images = "\n".join(
         f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(_image(path, title) for path, title in pictures)
         for heading, pictures in sections
     )
-    notes = "\n".join(f"<li>{html.escape(task.note)}</li>" for task in TASKS.values() if _shows(table, task.label))
+    shown = {row["metric"] for row in table}
+    notes = "\n".join(f"<li>{html.escape(task.note)}</li>" for task in TASKS.values() if task.label in shown)
     return f"""<!DOCTYPE html>
 <html lang="en">
 <meta charset="utf-8">
@@ -271,17 +267,13 @@ img {{ max-width: 100%; }}
 """
 
 
-def _shows(table: Sequence[dict[str, Any]], label: str) -> bool:
-    return any(row["metric"] == label for row in table)
-
-
 def _image(path: Path, title: str) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
     return f'<h3>{html.escape(title)}</h3>\n<img src="data:image/png;base64,{data}" alt="{html.escape(title)}">'
 
 
 def _cell(value: Any) -> str:
-    """A value of the table as text: four significant digits, nothing for what is unknown."""
+    """Text of a value: four significant digits, empty where unknown."""
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))

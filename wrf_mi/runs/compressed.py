@@ -1,4 +1,4 @@
-"""A run made smaller: its folder, its size, and what that costs."""
+"""Compression of a run, with the change of size, speed and accuracy."""
 
 from __future__ import annotations
 
@@ -26,20 +26,15 @@ from .folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_conf
 from .timing import interleaved, ratio
 
 COMPRESSION = "compression.json"
-"""What was done to the run, from which one, and what it cost."""
+"""File of settings, source and results of a compression."""
 REPEATS = 60
-"""Interleaved pairs of spectra that are timed."""
+"""Number of interleaved pairs of spectra that are timed."""
 
 OnProgress = Callable[[str, int, Progress], None]
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
-    """Times of single spectra, warm, of several fields that take turns.
-
-    Args:
-        predictors: by name; the first is what the others are compared with.
-        tx_pos_m: transmitter positions [m, 3], metres.
-        repeats: rounds.
+    """Times of single warm spectra of several predictors called in turn at positions [m, 3] in metres.
 
     Returns:
         By name: ``ms`` (median), ``ms_least``, and ``times_faster`` than the first: median of the rounds' ratios and
@@ -47,17 +42,17 @@ def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: 
     """
     positions = np.asarray(tx_pos_m, float)
 
-    def call(one: Predictor) -> Callable[[], Any]:
+    def call(predictor: Predictor) -> Callable[[], Any]:
         turn = itertools.cycle(positions[:, None])
-        return lambda: one(next(turn))
+        return lambda: predictor(next(turn))
 
-    taken = interleaved({name: call(one) for name, one in predictors.items()}, repeats)
+    taken = interleaved({name: call(predictor) for name, predictor in predictors.items()}, repeats)
     first = next(iter(taken.values()))
     result: dict[str, Any] = {}
-    for name, own in taken.items():
-        faster = ratio(first, own)
-        times = {"ms": float(np.median(own)), "ms_least": float(own.min())}
-        result[name] = times | {"times_faster": [faster.value, faster.low, faster.high]}
+    for name, times in taken.items():
+        faster = ratio(first, times)
+        interval = [faster.value, faster.low, faster.high]
+        result[name] = {"ms": float(np.median(times)), "ms_least": float(times.min()), "times_faster": interval}
     return result
 
 
@@ -68,21 +63,21 @@ def compress_run(
     record: Record | None = None,
     on_progress: OnProgress = lambda stage, steps, progress: None,
 ) -> dict[str, Any]:
-    """Make a smaller run of a run and score it on the same held-out rows.
+    """Make a smaller run from a run and score it on the same held-out rows.
 
     Args:
-        run: folder of a learned field (WRF-GS or WRF-GS+).
+        run: run folder of a learned field (WRF-GS or WRF-GS+).
         out: run folder to make; must not exist or be empty.
-        how: what is made smaller.
-        record: the data set of the run; None: loaded by its name.
-        on_progress: hears of progress.
+        how: target sizes and precision.
+        record: data set of the run; None: loaded by its name.
+        on_progress: progress callback.
 
     Returns:
-        What ``compression.json`` says: ``before`` and ``after`` with ``gaussians``, ``bytes``, ``ssim`` (median) and
+        Content of ``compression.json``: ``before`` and ``after`` with ``gaussians``, ``bytes``, ``ssim`` (median) and
         the times of `spectrum_times`; ``times_smaller``, ``ssim_change``, ``seconds`` and the settings.
 
     Raises:
-        InputError: not a run of one learned field of spectra alone, or a folder that is not empty.
+        InputError: not a run of a learned field of spectra without a scene, or a folder that is not empty.
     """
     source, folder = Path(run), Path(out)
     check_new(folder)
@@ -96,12 +91,12 @@ def compress_run(
     split = load_rows(source, data)
     start = time.perf_counter()
 
-    def heard(stage: str, steps: int, progress: Progress) -> None:
+    def log(stage: str, steps: int, progress: Progress) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         append_log(folder, progress)
         on_progress(stage, steps, progress)
 
-    settings, params = compress(field.config, field.params, data, split, how, heard)
+    settings, params = compress(field.config, field.params, data, split, how, log)
     seconds = time.perf_counter() - start
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
@@ -127,11 +122,11 @@ def compress_run(
 
 
 def render(found: Mapping[str, Any]) -> str:
-    """The result of `compress_run` as a table."""
+    """Table of the result of `compress_run`."""
     lines = [f"{'':<8}{'Gaussians':>10}{'kB':>9}{'ms':>8}{'SSIM':>8}"]
     for name in ("before", "after"):
-        one = found[name]
-        lines.append(f"{name:<8}{one['gaussians']:>10}{one['bytes'] / 1e3:>9.1f}{one['ms']:>8.2f}{one['ssim']:>8.3f}")
+        row = found[name]
+        lines.append(f"{name:<8}{row['gaussians']:>10}{row['bytes'] / 1e3:>9.1f}{row['ms']:>8.2f}{row['ssim']:>8.3f}")
     value, low, high = found["after"]["times_faster"]
     lines.append(
         f"{found['times_smaller']:.1f} times smaller, {value:.1f} times as fast ({low:.1f} to {high:.1f}), "

@@ -1,67 +1,83 @@
-"""Scores of a method on held-out rows: ``metrics.json`` and ``predictions.npz``."""
+"""Scores of a model on held-out rows: ``metrics.json`` and ``predictions.npz`` of a run and of its folds."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
-from ..core.carriers import FREQUENCY
+from ..core import InputError, Prediction, Record, Split
+from ..core.carriers import FREQUENCY, by_carrier
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
+from ..datasets import make_splits
 from ..datasets.observations import scorable
-from ..tasks import TASKS, Task
-from ..tasks.scores import summary
-from .folder import METRICS, PREDICTIONS
-from .references import reference_predictions
-from .results import reference_key
+from ..models import Fitted, Problem
+from ..models.interpolation.idw import InverseDistance
+from ..models.method import inputs_of
+from ..tasks import TASKS, UPLINK, Task
+from ..tasks.scores import inside_interval, summary
+from ..training.trainer import peak_memory_mb
+from .folder import METRICS, PREDICTIONS, RunConfig
+from .results import Observations, reference_key
 
-Predict = Callable[[IntArray, int], NDArray[Any]]
-"""What the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or channel
-coefficients [m, subcarriers] or [m, antennas, subcarriers]. Rows, and not positions, because a method may use how the
-transmitter was turned, or the uplink."""
+Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
+"""Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
+channel coefficients [m, subcarriers] or [m, antennas, subcarriers]. It takes rows instead of positions because a model
+may use heading or uplink."""
+Scores = tuple[dict[str, Any], dict[str, Any]]
+"""Blocks of ``metrics.json`` and arrays of ``predictions.npz``."""
 
 NOT_SCORED = "n_not_scored"
-"""Key of the number of observations of test rows that are not finite, though the receiver received something."""
+"""Key of the number of observations in test rows that are not finite, though the receiver received something."""
+SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
+"""Arrays of ``predictions.npz`` without an axis of receivers."""
 REPEATS = 20
-"""Single predictions that are timed at most; the median is stated."""
+"""Largest number of single predictions that are timed."""
 TIMED_S = 10.0
-"""After so many seconds no further one is begun: some methods optimise for each sample."""
+"""Time after which no further single prediction is begun: some models optimise for each sample."""
 
 
-def milliseconds_per_sample(predict: Predict, rows: IntArray, repeats: int = REPEATS) -> float:
+class Part(NamedTuple):
+    """Folder, split, fitted model and training time of a run or of a fold."""
+
+    folder: Path
+    split: Split
+    fitted: Fitted
+    seconds: float
+
+
+def _milliseconds_per_sample(predict: Predict, rows: IntArray) -> float:
     """Median time of one prediction at one transmitter position, warm, in ms."""
-    one = rows[:1]
-    predict(one, 0)
+    predict(rows[:1], 0)
     times: list[float] = []
-    while len(times) < repeats and sum(times) < TIMED_S:
+    while len(times) < REPEATS and sum(times) < TIMED_S:
         start = time.perf_counter()
-        predict(one, 0)
+        predict(rows[:1], 0)
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times))
 
 
-def evaluate(
-    record: Record, split: Split, predict: Predict, single: Predict | None = None
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Score a method on the test rows of a split, with the references that the data allow beside it.
+def evaluate(record: Record, split: Split, predict: Predict, single: Predict | None = None) -> Scores:
+    """Score predictions on the test rows of a split, together with the references that the data allow.
 
     Args:
-        record: of any task in `wrf_mi.tasks.TASKS`.
-        split: references (`wrf_mi.runs.references`) know all its training rows, validation rows included.
-        predict: the method; finite wherever something was received.
-        single: the same where it is timed at one row; None: ``predict``.
+        record: data of any task in `wrf_mi.tasks.TASKS`.
+        split: rows; references (`reference_predictions`) use all its training rows, validation rows included.
+        predict: predictions to score; finite wherever something was received.
+        single: prediction that is timed at one row; None: ``predict``.
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
-        receivers ``receivers``, ``n_train``, ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of
-        ``predictions.npz``. An observation that is not finite is not scored: the truth has NaN there.
+        receivers ``receivers``, with standard deviations ``inside_90``, ``n_train``, ``n_test``, ``n_not_scored``,
+        ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite is not scored: its
+        truth is NaN.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
@@ -73,71 +89,125 @@ def evaluate(
     truth, broken = scorable(record.scored[:, rows])
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
+    found = [_prediction(predict(rows, receiver)) for receiver in range(len(truth))]
     arrays = {
         "row": rows,
-        "prediction": np.stack([predict(rows, r) for r in range(len(truth))]).astype(truth.dtype),
+        "prediction": np.stack([prediction.mean for prediction in found]).astype(truth.dtype),
         "truth": truth,
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
         **{reference_key(key): values for key, values in reference_predictions(record, known, rows).items()},
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
+    if found[0].std is not None:
+        arrays["std"] = np.stack([prediction.stated_std for prediction in found]).astype(np.float32)
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
         "n_train": len(known),
-        "ms_per_sample": milliseconds_per_sample(single or predict, rows),
+        "ms_per_sample": _milliseconds_per_sample(single or predict, rows),
     }
     return metrics, arrays
 
 
-def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
-    """The score blocks of ``metrics.json`` from the arrays of ``predictions.npz`` (with a first axis per receiver).
+def _prediction(found: NDArray[Any] | Prediction) -> Prediction:
+    return found if isinstance(found, Prediction) else Prediction(found)
 
-    Rows that a receiver did not receive are left out; with several receivers each has a block of its own, with the
-    number of rows that count, and the block at the top pools all.
+
+def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
+    """Score blocks of ``metrics.json`` from the arrays of ``predictions.npz`` (with a first axis per receiver).
+
+    Rows that a receiver did not receive are left out. With several receivers each has a block with its number of rows,
+    and the block at the top pools all.
     """
     scorer = TASKS[task]
-    own = scorer.of_rows(arrays["prediction"], arrays["truth"])
-    held = {key: scorer.of_rows(arrays[reference_key(key)], arrays["truth"]) for key in _stored(scorer, arrays)}
+    scores = scorer.of_rows(arrays["prediction"], arrays["truth"])
+    keys = [key for key in scorer.references if reference_key(key) in arrays]
+    references = {key: scorer.of_rows(arrays[reference_key(key)], arrays["truth"]) for key in keys}
 
     def blocks(chosen: Any) -> dict[str, Any]:
-        references = {key: summary(scores[chosen]) for key, scores in held.items()}
-        return {scorer.block: summary(own[chosen]), "reference": references}
+        reference = {key: summary(values[chosen]) for key, values in references.items()}
+        return {scorer.block: summary(scores[chosen]), "reference": reference}
 
     metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
-    if len(own) > 1:
-        counts = np.count_nonzero(~np.isnan(own), axis=1)
+    if len(scores) > 1:
+        counts = np.count_nonzero(~np.isnan(scores), axis=1)
         metrics["receivers"] = {
             str(name): {**(blocks(r) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
+    if "std" in arrays:
+        metrics["inside_90"] = inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
     return metrics
 
 
-def _stored(task: Task, arrays: dict[str, Any]) -> list[str]:
-    """References that the arrays hold."""
-    return [key for key in task.references if reference_key(key) in arrays]
-
-
-def pool(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Metrics and predictions of several folds as one: every row's score counts once.
+def pool(parts: Sequence[Scores]) -> Scores:
+    """Metrics and predictions of several folds together: every row's score counts once.
 
     ``n_train`` is the mean over the folds, ``ms_per_sample`` the median.
     """
     blocks, every = zip(*parts, strict=True)
-    task = blocks[0]["task"]
-    shared = [key for key in ("row", "tx_pos", FREQUENCY) if key in every[0]]
-    arrays = {key: np.concatenate([a[key] for a in every]) for key in shared}
-    known = ("prediction", "truth", "std", *(reference_key(key) for key in _stored(TASKS[task], every[0])))
-    for key in (key for key in known if key in every[0]):
-        arrays[key] = np.concatenate([a[key] for a in every], axis=1)
-    arrays["receiver_name"] = every[0]["receiver_name"]
-    metrics = score(arrays, task) | {
+    arrays = {
+        key: values if key == "receiver_name" else np.concatenate([a[key] for a in every], axis=int(key not in SHARED))
+        for key, values in every[0].items()
+    }
+    metrics = score(arrays, blocks[0]["task"]) | {
         NOT_SCORED: sum(m[NOT_SCORED] for m in blocks),
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
     return metrics, arrays
+
+
+def score_part(run: Path, config: RunConfig, problem: Problem, part: Part) -> Scores:
+    """Scores of a run's part; those of a fold are written to its folder."""
+    metrics, arrays = _evaluate_part(problem, part)
+    if part.folder != run:
+        header = _header(part.folder, replace(config, split=part.split.name), [part])
+        write_results(part.folder, header | metrics, arrays)
+    return metrics, arrays
+
+
+def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Sequence[Scores]) -> dict[str, Any]:
+    """Write ``metrics.json`` and ``predictions.npz`` of a run from its parts' scores; return the metrics."""
+    metrics, arrays = scores[0] if len(scores) == 1 else pool(scores)
+    merged = _header(run, config, parts) | metrics
+    write_results(run, merged, arrays)
+    return merged
+
+
+def score_other(config: RunConfig, problem: Problem, part: Part, split: str) -> dict[str, Any]:
+    """Metrics on the test rows of another split that were not used in training; `InputError` if there are none."""
+    asked = np.unique(np.concatenate([s.test for s in make_splits(problem.record, split, config.seed)]))
+    unseen = np.setdiff1d(asked, problem.rows(part.split))
+    if not len(unseen):
+        raise InputError(f"{part.folder}: trained on all test rows of split {split}; nothing is left to score")
+    metrics, _ = _evaluate_part(problem, part._replace(split=replace(part.split, test=unseen)))
+    named = replace(config, split=f"{split} (rows unseen by {config.split})")
+    return _header(part.folder, named, [part]) | metrics
+
+
+def _evaluate_part(problem: Problem, part: Part) -> Scores:
+    record, fitted = problem.record, part.fitted
+
+    def single(rows: IntArray, receiver: int) -> Prediction:
+        return fitted.predict(inputs_of(record, rows), receiver)
+
+    def predict(rows: IntArray, receiver: int) -> Prediction:
+        return fitted.predict_rows(rows, receiver) or single(rows, receiver)
+
+    metrics, arrays = evaluate(record, part.split, predict, single)
+    if not problem.use_rows:
+        metrics["n_train"] = 0  # those of the references
+    return metrics, arrays
+
+
+def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str, Any]:
+    known = {"model": config.model, "dataset": config.dataset, "split": config.split, "seed": config.seed}
+    known |= {} if config.scene is None else {"scene": config.scene}
+    # The peak of the fit, if it is stored already.
+    memory_mb = stored_metrics(folder).get("peak_memory_mb", peak_memory_mb())
+    seconds = sum(part.seconds for part in parts)
+    return {**known, "train_seconds": seconds, "peak_memory_mb": memory_mb, **parts[0].fitted.facts()}
 
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
@@ -150,26 +220,80 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     """Write predictions as ``.npz``, observations without their first axis where there is one receiver.
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
-    ``receiver_name`` [n_rx]. ``prediction`` and, where they are
-    known, ``truth`` and ``reference_<name>``: grey in 0..1 [m, H, W] or [n_rx, m, H, W] float32, power in dBm [m] or
-    [n_rx, m] float32 (NaN: not received), channel coefficients [m, k], or of several antennas [m, antennas, k],
-    complex64, in either case with a first axis where there are several receivers. ``std``, where a method states it,
-    is the predicted standard deviation, of the same shape, real.
+    ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
+    [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
+    [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
+    deviation of the same shape, real.
 
     Returns:
         The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
-    shared = ("row", "tx_pos", FREQUENCY, "receiver_name")
-    written = {k: v[0] if single and k not in shared else v for k, v in arrays.items()}
+    written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}
     write_arrays(path, written, compressed=True)
     return written
 
 
 def stored_metrics(folder: Path) -> dict[str, Any]:
-    """The last ``metrics.json``; nothing where it is missing or damaged, since scoring writes it anew."""
+    """Content of ``metrics.json``; empty where it is missing or damaged, since scoring writes it anew."""
     try:
         stored = json.loads((folder / METRICS).read_text())
     except (OSError, ValueError):
         return {}
     return stored if isinstance(stored, dict) else {}
+
+
+def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> dict[str, Observations]:
+    """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] by key.
+
+    Inverse-distance weighting (IDW) needs positions of training rows ``known`` and scored ``rows``; the copy of the
+    uplink needs an uplink.
+
+    Raises:
+        InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
+            received no training row.
+    """
+    task, kind = TASKS[record.task], record.observation.dtype
+    found: dict[str, Any] = {}
+    if record.uplink is not None and task.from_uplink:
+        found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
+    if np.isfinite(record.tx_pos_m[np.concatenate([known, rows])]).all():
+        found[task.reference] = _interpolate(task, record, known, rows).astype(kind)
+    if not found:
+        lacking = "positions" + (" and uplink" if task.from_uplink else "")
+        raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
+    return found
+
+
+def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:
+    """Uplink [m, antennas, subcarriers] in the shape of a downlink, [m, subcarriers] or [m, antennas, subcarriers].
+
+    Where the numbers of subcarriers differ, each takes the uplink's at the nearest relative position in the band.
+    """
+    shape = record.observation.shape[2:]
+    antennas = shape[0] if len(shape) == 2 else 1
+    if uplink.shape[1] != antennas:
+        raise InputError(
+            f"{record.name}: uplink of {uplink.shape[1]} antennas, downlink of {antennas}; give both for the same ones"
+        )
+    nearest = np.round(np.linspace(0, uplink.shape[2] - 1, shape[-1])).astype(int)
+    return uplink[:, :, nearest].reshape(len(uplink), *shape)
+
+
+def _interpolate(task: Task, record: Record, known: IntArray, rows: IntArray) -> Observations:
+    carriers = record.carriers_hz
+    if carriers is not None:  # neighbours are rows of the same carrier
+
+        def of_carrier(carrier_hz: float, which: IntArray) -> Observations:
+            same = record.at_carrier(carrier_hz)
+            return _interpolate(task, same, known[carriers[known] == carrier_hz], rows[which])
+
+        return by_carrier(carriers[rows], of_carrier, axis=1)
+    found = []
+    for receiver, observed in zip(record.receivers, record.observation, strict=True):
+        idw = InverseDistance(task.neighbours, softening_m=task.softening_m)
+        try:
+            found.append(idw.fit(record.tx_pos_m[known], observed[known]).predict(record.tx_pos_m[rows]))
+        except InputError as error:
+            raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
+    return np.stack(found)

@@ -1,7 +1,4 @@
-"""Pictures: spectra on the polar sky, score distributions, training curves.
-
-Figures are made without pyplot: no global state, no window system.
-"""
+"""Figures: spectra on the polar sky, score distributions, training curves (Matplotlib without pyplot)."""
 
 from __future__ import annotations
 
@@ -18,28 +15,28 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import ArrayLike
 
-from wrf_mi.core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
-from wrf_mi.core.files import write_atomically
-from wrf_mi.gaussians.oracle import Projection
+from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
+from ..core.files import write_atomically
+from ..gaussians.oracle import Projection
 
 PANEL_IN = 2.3
-"""Side of one polar picture in inches."""
-
+"""Side of a polar plot in inches."""
 OUTLINE_POINTS = 64
-"""Corners of the polygon that stands for a footprint's outline."""
+"""Corners of the polygon of a footprint's outline."""
+COLOURS = 10
+"""Number of colours in Matplotlib's cycle."""
+TAIL = 0.01
+"""Fraction of each curve that may lie beyond either end of the axis, so that outliers do not compress the rest."""
+
+Rows = Sequence[tuple[str, Sequence[ArrayLike | None]]]
+"""Rows of a table of plots: a name and an array per column; None leaves the plot out."""
 
 
 def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
-    """Draw a spectrum on polar axes: azimuth as angle, 90 degrees - elevation as radius.
-
-    Args:
-        axes: made with ``projection="polar"``.
-        spectrum: grey values [H, W]; colours span 0..1.
-        title: above the picture.
-    """
+    """Draw grey values [H, W] in 0..1 on polar axes: azimuth as angle, 90 degrees - elevation as radius."""
     values = np.asarray(spectrum)
     height, width = values.shape
-    # The zenith is no sample; the mean of the ring around it closes the picture there.
+    # The zenith is no sample: it gets the mean of the ring around it.
     values = np.vstack([values, np.full(width, values[-1].mean())])
     radius_deg = np.append(90 - np.degrees(elevation_rad(height)), 0.0)
     axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap="viridis", vmin=0, vmax=1)
@@ -56,15 +53,12 @@ def _sky(axes: Axes, title: str, ring_labels: str) -> None:
     axes.set_title(title, fontsize=8)
 
 
-def spectrum_table(rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str]) -> Figure:
-    """Polar pictures side by side, for example truth beside prediction.
+def spectrum_table(rows: Rows, columns: Sequence[str]) -> Figure:
+    """Table of polar plots, for example truth beside prediction.
 
     Args:
-        rows: a name and one spectrum [H, W] per column; None leaves the place empty.
-        columns: a title for each column.
-
-    Returns:
-        The figure.
+        rows: a name and a spectrum [H, W] per column; None leaves the plot out.
+        columns: title of each column.
     """
     figure = Figure(figsize=(PANEL_IN * len(columns), PANEL_IN * len(rows) + 0.2), layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, subplot_kw={"projection": "polar"})
@@ -80,20 +74,14 @@ def spectrum_table(rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], colum
     return figure
 
 
-def position_table(
-    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], tx_pos_m: ArrayLike, label: str
-) -> Figure:
-    """Maps of one value for each transmitter position side by side, for example truth beside prediction.
+def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, label: str) -> Figure:
+    """Table of maps of a value at transmitter positions, seen from above.
 
     Args:
-        rows: a name and one array [m] per column; None leaves the place empty, NaN leaves a position out. The maps of
-            a row share their colours.
-        columns: a title for each column.
-        tx_pos_m: positions [m, 3], metres; drawn from above.
-        label: of the value, with its unit.
-
-    Returns:
-        The figure.
+        rows: a name and an array [m] per column; NaN leaves a position out. The maps of a row share their colours.
+        columns: title of each column.
+        tx_pos_m: positions [m, 3], metres.
+        label: name of the value, with its unit.
     """
     x, y, _ = np.asarray(tx_pos_m, float).T
     aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
@@ -123,19 +111,14 @@ def position_table(
     return figure
 
 
-def row_table(
-    rows: Sequence[tuple[str, Sequence[ArrayLike | None]]], columns: Sequence[str], row: ArrayLike, label: str
-) -> Figure:
-    """One value over row numbers, for data without positions: a panel for each name, a line for each column.
+def row_table(rows: Rows, columns: Sequence[str], row: ArrayLike, label: str) -> Figure:
+    """Values over row numbers, for data without positions: a plot for each name, a line for each column.
 
     Args:
-        rows: a name and one array [m] per column; None leaves the line out, NaN a point.
-        columns: what each line is.
+        rows: a name and an array [m] per column; NaN leaves a point out.
+        columns: name of each line.
         row: numbers of the rows [m].
-        label: of the value, with its unit.
-
-    Returns:
-        The figure.
+        label: name of the value, with its unit.
     """
     order = np.argsort(np.asarray(row))
     figure = Figure(figsize=(8, 2.2 * len(rows) + 0.6), layout="constrained")
@@ -152,18 +135,13 @@ def row_table(
 
 
 def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
-    """A spectrum beside the Gaussians that make it, each as the receiver sees it.
-
-    An outline is where a footprint has fallen to exp(-1/2), one standard deviation from its centre.
+    """Spectrum beside the outlines of the Gaussians' footprints, at exp(-1/2) of their maximum.
 
     Args:
         spectrum: grey values [H, W].
-        gaussians: n of them, projected by `wrf_mi.gaussians.oracle.project`; those without a footprint are left out.
-        weight: colours the outlines, the largest on top, shape [n]; for example the magnitude of opacity times signal.
-        label: of the weight.
-
-    Returns:
-        The figure.
+        gaussians: n Gaussians projected by `wrf_mi.gaussians.oracle.project`; those without a footprint are left out.
+        weight: colour of the outlines, the largest on top, shape [n]; for example |opacity x signal|.
+        label: name of the weight.
     """
     drawn = gaussians.order[np.argsort(np.asarray(weight, float)[gaussians.order], kind="stable")]
     figure = Figure(figsize=(2 * 1.6 * PANEL_IN, 1.5 * PANEL_IN), layout="constrained")
@@ -190,30 +168,23 @@ def _outlines(gaussians: Projection) -> FloatArray:
     return np.stack([azimuth, 90 - np.degrees(elevation)], axis=-1)
 
 
-COLOURS = 10
-"""In Matplotlib's cycle."""
-TAIL = 0.01
-"""Share of each curve that may lie beyond either end of the axis: a few rows would squeeze all others together."""
-
-
 def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLike], label: str = "SSIM") -> Figure:
-    """Cumulative distributions of a score over test rows, one step curve each; references dashed.
+    """Cumulative distributions of a score over test rows; references are dashed.
 
     Args:
-        scores: values of each run by its name; NaN are left out.
-        references: the same for what runs are held against.
-        label: of the score's axis.
+        scores: scores of each run by its name; NaN are left out.
+        references: scores of each reference by its name.
+        label: name of the score.
     """
     figure = Figure(figsize=(7.5, 4), layout="constrained")
     axes = figure.subplots()
-    shown = [
-        np.ravel(values)[~np.isnan(np.ravel(values))] for group in (scores, references) for values in group.values()
-    ]
-    for number, (name, scored) in enumerate(zip([*scores, *references], shown, strict=True)):
-        # Beyond the colours there are, the same again in another style.
+    curves = {name: np.ravel(values) for group in (scores, references) for name, values in group.items()}
+    shown = [values[~np.isnan(values)] for values in curves.values()]
+    for number, (name, values) in enumerate(zip(curves, shown, strict=True)):
+        # Colours repeat in another line style.
         style = "--" if number >= len(scores) else ("-", "-.", ":")[number // COLOURS % 3]
-        axes.ecdf(scored, label=name, linestyle=style, color=f"C{number % COLOURS}")
-    axes.set_xlim(min(np.quantile(one, TAIL) for one in shown), max(np.quantile(one, 1 - TAIL) for one in shown))
+        axes.ecdf(values, label=name, linestyle=style, color=f"C{number % COLOURS}")
+    axes.set_xlim(min(np.quantile(v, TAIL) for v in shown), max(np.quantile(v, 1 - TAIL) for v in shown))
     axes.set_xlabel(label)
     axes.set_ylabel("share of test rows below")
     axes.grid(alpha=0.3)
@@ -222,11 +193,11 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
 
 
 def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "SSIM") -> Figure:
-    """Score on validation rows, while they are held out, over training time.
+    """Score on held-out validation rows over training time.
 
     Args:
         curves: pairs (seconds, score) of each run by its name.
-        label: of the score.
+        label: name of the score.
     """
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
@@ -241,14 +212,14 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
 
 
 def without_formulas(figure: Figure) -> Figure:
-    """The figure with every text as it stands: names may hold dollar signs, between which Matplotlib sees a formula."""
+    """Switch off formulas in all texts of a figure: names may contain dollar signs."""
     for text in figure.findobj(Text):
         text.set_parse_math(False)
     return figure
 
 
 def save(figure: Figure, path: Path, dpi: int = 110) -> Path:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG atomically."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return write_atomically(path, buffer.getvalue())

@@ -1,7 +1,7 @@
-"""Keys of fits that are kept and used again: digests of everything that determines a fit.
+"""Keys of stored fits: digests of everything that determines a fit.
 
-A folder whose name holds the key of a fit can be used again without another look: another setting, row or seed, other
-content of the data or another version of a package makes another key, and so another folder.
+A run folder whose name holds the key of a fit is used again. Other settings, rows, seed, data or versions give another
+key, and so another folder.
 """
 
 from __future__ import annotations
@@ -28,28 +28,24 @@ logger = logging.getLogger(__name__)
 
 PACKAGES, COMPILED = ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"), "__pycache__"
 DIGITS = 16
-"""Of a key, hexadecimal: two of a million fits have the same one with a probability of 3e-8."""
+"""Hexadecimal digits of a key: two of a million fits share a key with a probability of 3e-8."""
 
 
 def fit_key(*determining: Any) -> str:
-    """Key of a fit: a digest of the versions of what computes (`versions`) and of what is given.
+    """Key of a fit: a digest of `versions` and of the given values.
 
     Args:
         determining: arrays, data classes (fields that count in comparisons), mappings, tuples and lists of these, and
             plain values. A path stands for the names and contents of the files there.
 
     Raises:
-        InputError: a path where nothing is.
+        InputError: a path that does not exist.
     """
     return content_digest(versions(), *determining)[:DIGITS]
 
 
 def content_digest(*values: Any) -> str:
-    """SHA-256 (hex) of values as `fit_key` takes them, without versions.
-
-    Raises:
-        InputError: a path where nothing is.
-    """
+    """SHA-256 (hex) of values as for `fit_key`, without versions."""
     digest = hashlib.sha256()
     for value in values:
         _add(digest, value)
@@ -57,7 +53,7 @@ def content_digest(*values: Any) -> str:
 
 
 def _add(digest: Any, value: Any) -> None:
-    """Kind and size come before content, so that no two values have the same bytes."""
+    """Kind and size precede content, so that different values give different bytes."""
     if isinstance(value, Path):
         if not value.exists():
             raise InputError(f"{value}: no such file or folder; restore it")
@@ -80,8 +76,8 @@ def _add(digest: Any, value: Any) -> None:
             _add(digest, value[key])
     elif isinstance(value, (tuple, list)):
         digest.update(f"sequence {len(value)}\n".encode())
-        for one in value:
-            _add(digest, one)
+        for item in value:
+            _add(digest, item)
     elif value is None or isinstance(value, (str, int, float, np.generic)):
         digest.update(f"{value!r}\n".encode())
     else:
@@ -89,13 +85,13 @@ def _add(digest: Any, value: Any) -> None:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """All files of a folder, those of folders that are links too."""
-    below = (Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+    """All files below a folder; links are followed."""
+    below = (Path(parent) / name for parent, _, names in os.walk(folder, followlinks=True) for name in names)
     return sorted(path for path in below if path.is_file())
 
 
 def source_files() -> dict[str, Path]:
-    """Every file of this package, its plugins and its scenes by name, compiled ones left out."""
+    """Files of this package, its plugins and its scenes by name, except compiled files."""
     found: dict[str, Path] = {}
     for name in PACKAGES:
         spec = find_spec(name)
@@ -106,18 +102,18 @@ def source_files() -> dict[str, Path]:
 
 
 def dataset_files(name_or_folder: str) -> list[Path]:
-    """Folder or file of a data set, whose content is part of a key; none where it is not on this machine yet.
+    """Folder or file of a data set; empty where it is not on this machine.
 
     Raises:
         InputError: no such data set.
     """
     path = Path(name_or_folder)
-    place = path if path.exists() else locate(name_or_folder)
-    return [] if place is None else [place]
+    found = path if path.exists() else locate(name_or_folder)
+    return [] if found is None else [found]
 
 
 def scene_files(scene: str | Path) -> list[Path]:
-    """Folder or file of a scene, with the files that a Mitsuba XML names; none for a scene of this package by its name.
+    """Folder or file of a scene, with the files that a Mitsuba XML names; empty for the name of an embedded scene.
 
     Raises:
         InputError: an XML that cannot be read.
@@ -131,18 +127,13 @@ def scene_files(scene: str | Path) -> list[Path]:
         stated = [node.get("value", "") for node in ElementTree.parse(path).iter("string")]
     except (ElementTree.ParseError, OSError) as error:
         raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
-    return [path, *(place for value in stated if value and (place := path.parent / value).is_file())]
+    return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]
 
 
 def fit_once(folder: Path, fit: Callable[[], object]) -> Path:
-    """Fit into a folder whose name holds the fit's key, unless a finished fit lies there; the log says which.
+    """Write a run by ``fit`` into a folder whose name holds the fit's key, unless it holds a finished run (logged).
 
-    Args:
-        folder: of the run; a run in it that was stopped is removed.
-        fit: writes the run.
-
-    Returns:
-        The folder.
+    A stopped run in the folder is removed. Returns the folder.
     """
     if (folder / METRICS).exists():
         logger.info("%s: the same fit was finished before; used again", folder)

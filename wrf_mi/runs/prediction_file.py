@@ -1,9 +1,8 @@
-"""Predictions at new transmitter positions as a file: all of them as ``.npz``, signal strengths also as ``.csv``."""
+"""Files of predictions: inputs as ``.csv`` or ``.npz``, predictions as ``.npz`` or, of signal strengths, ``.csv``."""
 
 from __future__ import annotations
 
 import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +11,103 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
-from ..core.files import write_atomically
+from ..core.files import one_line, stored_arrays, text_lines
+from ..models.method import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
-from .tx_file import HEADING
+from .results import write_csv
 
 NPZ, CSV = ".npz", ".csv"
+HEADING = "heading_rad"
+"""Column or array of headings."""
+POSITIONS, UPLINK = "tx_pos", "uplink"
+"""Arrays of positions and of uplink channels."""
+
+
+def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
+    """Read what a model predicts from; positions are NaN where only an uplink is given.
+
+    Args:
+        csv_file: file with columns x, y, z in metres and optionally heading_rad and frequency_hz; or
+        npz_file: file with arrays ``tx_pos`` [m, 3] and optionally ``heading_rad`` [m] and ``frequency_hz`` [m], or
+            with ``uplink`` [m, antennas, subcarriers] and optionally all of these.
+
+    Raises:
+        InputError: the file is missing, or a row is not made of finite numbers.
+    """
+    path = Path(csv_file if csv_file is not None else npz_file or "")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give positions x, y, z in metres")
+    inputs = _from_csv(path) if csv_file is not None else _from_npz(path)
+    positions, uplink = inputs.tx_pos_m, inputs.uplink
+    if uplink is not None:
+        if uplink.ndim != 3 or uplink.dtype.kind != "c":
+            text = f"uplink has shape {list(uplink.shape)} of {uplink.dtype}"
+            raise InputError(f"{path}: {text}; store complex numbers [m, antennas, subcarriers]")
+        if len(uplink) != len(positions):
+            raise InputError(f"{path}: {len(uplink)} rows of uplink and {len(positions)} positions; give one each")
+        bad = np.flatnonzero(~np.isfinite(uplink).all(axis=(1, 2)))
+        if len(bad):
+            raise InputError(f"{path}, row {bad[0] + 1}: uplink is not finite; correct or remove the row")
+        if np.isnan(positions).all() and len(positions):
+            return inputs
+    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if len(bad):
+        raise InputError(f"{path}, row {bad[0] + 1}: not a finite number; give x, y, z in metres")
+    if len(positions) == 0:
+        raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
+    for name, values, least, kind in (
+        (HEADING, inputs.tx_heading_rad, -np.inf, "finite number (rad)"),
+        (FREQUENCY, inputs.carriers_hz, 0.0, "positive number (Hz)"),
+    ):
+        if values is not None and not (
+            values.shape == positions.shape[:1] and (np.isfinite(values) & (values > least)).all()
+        ):
+            raise InputError(f"{path}: {name} must be one {kind} for each position; correct it")
+    return inputs
+
+
+def _from_csv(path: Path) -> Inputs:
+    try:
+        rows = [row for row in csv.reader(text_lines(path)) if row]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({one_line(error)}); give x, y, z in metres") from None
+    header = [name.strip().lower() for name in rows[0]] if rows else []
+    if not {"x", "y", "z"} <= set(header):
+        raise InputError(f"{path}: header {','.join(header)[:40]!r} lacks x, y, z; make it the first line")
+    optional = [name for name in (HEADING, FREQUENCY) if name in header]
+    columns, values = [header.index(name) for name in ("x", "y", "z", *optional)], []
+    for number, row in enumerate(rows[1:], start=1):
+        try:
+            values.append([float(row[c]) for c in columns])
+        except (ValueError, IndexError):
+            wanted = f"{len(columns)} numbers" if optional else "three numbers"
+            raise InputError(f"{path}, row {number}: {','.join(row)[:60]!r} is not {wanted}; correct it") from None
+    table = np.asarray(values, float).reshape(-1, len(columns))
+    found = dict(zip(optional, table[:, 3:].T, strict=True))
+    return Inputs(table[:, :3], found.get(HEADING), carriers_hz=found.get(FREQUENCY))
+
+
+def _from_npz(path: Path) -> Inputs:
+    try:
+        arrays = stored_arrays(path)
+        uplink = arrays.get(UPLINK)
+        if uplink is not None:
+            arrays.setdefault(POSITIONS, np.full((len(uplink), 3), np.nan))
+        numbers = {name: np.asarray(arrays[name], float) for name in (POSITIONS, HEADING, FREQUENCY) if name in arrays}
+    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
+        raise InputError(f"{path}: not readable as .npz ({one_line(error)}); write it with numpy.savez") from None
+    if POSITIONS not in numbers:
+        raise InputError(f"{path}: no array tx_pos; store positions [m, 3] under that name")
+    positions = numbers[POSITIONS]
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise InputError(f"{path}: tx_pos has shape {list(positions.shape)}, expected [m, 3]; store x, y, z in metres")
+    return Inputs(positions, numbers.get(HEADING), uplink, carriers_hz=numbers.get(FREQUENCY))
 
 
 def check_prediction_file(out: Path, run: Path) -> None:
-    """Refuse a file that cannot hold what a run predicts, before anything is predicted.
-
-    Args:
-        out: file to write.
-        run: folder of the run.
+    """Refuse a file name whose format cannot hold the predictions of a run.
 
     Raises:
         InputError: a suffix other than ``.npz`` and ``.csv``, or ``.csv`` for a run that does not predict signal
@@ -45,14 +126,13 @@ def check_prediction_file(out: Path, run: Path) -> None:
 
 
 def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: FloatArray | None) -> dict[str, Any]:
-    """Write predictions in the form that the suffix names.
+    """Write predictions in the format of the suffix.
 
     Args:
         out: ``.npz``: as `wrf_mi.runs.evaluate.write_predictions`. ``.csv``: one row for each position with columns
-            ``x``, ``y``, ``z`` in metres, ``heading_rad`` where headings were given, ``frequency_hz`` where carriers
-            were, ``<receiver>_dbm`` for each receiver and, where they are stated, standard deviations
-            ``<receiver>_std_db``; a field is empty where nothing is received.
-        arrays: ``row``, ``tx_pos``, ``receiver_name`` and perhaps ``frequency_hz``; ``prediction`` and perhaps
+            ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each
+            receiver and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
+        arrays: ``row``, ``tx_pos``, ``receiver_name`` and optionally ``frequency_hz``; ``prediction`` and optionally
             ``std``, with a first axis of the receivers.
         tx_heading_rad: yaw of each transmitter, [m], or None.
 
@@ -61,20 +141,15 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
     """
     if out.suffix.lower() == NPZ:
         return write_predictions(out, arrays)
-    names = [str(name) for name in arrays["receiver_name"]]
-    header, columns = ["x", "y", "z"], list(np.asarray(arrays["tx_pos"], float).T)
-    if tx_heading_rad is not None:
-        header, columns = [*header, HEADING], [*columns, np.asarray(tx_heading_rad, float)]
-    if FREQUENCY in arrays:
-        header, columns = [*header, FREQUENCY], [*columns, arrays[FREQUENCY]]
+    columns, rows = dict(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True)), range(len(arrays["tx_pos"]))
+    for name, values in ((HEADING, tx_heading_rad), (FREQUENCY, arrays.get(FREQUENCY))):
+        if values is not None:
+            columns[name] = np.asarray(values, float)
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in arrays:
-            header, columns = [*header, *(f"{name}_{suffix}" for name in names)], [*columns, *arrays[key]]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    # str gives the shortest number that reads back as the same one.
-    writer.writerows(["" if np.isnan(value) else str(value) for value in row] for row in zip(*columns, strict=True))
-    write_atomically(out, text.getvalue())
-    single = len(names) == 1
+            columns |= {f"{name}_{suffix}": v for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)}
+    # str gives the shortest number that reads back as the same number.
+    text = ({name: "" if np.isnan(values[k]) else str(values[k]) for name, values in columns.items()} for k in rows)
+    write_csv(out, text, list(columns))
+    single = len(arrays["receiver_name"]) == 1
     return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}

@@ -1,10 +1,11 @@
-"""Reading what a run left behind."""
+"""Scores and predictions of a finished run, read from its folder."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,39 +16,43 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import readable, stored_arrays, write_atomically
 from ..core.types import IntArray
 from ..tasks import TASKS, Task
 from ..training.checkpoint import LOG
 from .folder import METRICS, PREDICTIONS, check_format
 
 Observations = NDArray[np.float32] | NDArray[np.complex64]
-"""Greys, powers in dBm or channel coefficients, see `wrf_mi.core.Record`."""
+"""Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
+
+REMEDY = "run evaluate to write it anew"
 
 
 def reference_key(name: str) -> str:
-    """Key in ``predictions.npz`` of what the reference of that name predicts."""
+    """Key in ``predictions.npz`` of a reference."""
     return f"reference_{name}"
 
 
 @dataclass(frozen=True)
 class Results:
-    """Scores and predictions of a finished run, with one first axis per receiver.
+    """Scores and predictions of a finished run, with a first axis of the receivers.
 
     Attributes:
-        path: the run folder.
-        name: for tables and legends.
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``; `wrf_mi.tasks.TASKS` says how it is scored.
-        dataset: name or folder of the data set, "" where the run does not tell.
+        path: run folder.
+        name: name for tables and legends.
+        task: ``"spectrum"``, ``"rssi"`` or ``"csi"`` (`wrf_mi.tasks.TASKS`).
+        dataset: name or folder of the data set; "": unknown.
         metrics: content of ``metrics.json``.
-        seed: of split and fit, or None where the run does not tell.
-        receivers: their names.
+        seed: seed of split and fit; None: unknown.
+        receivers: names of the receivers.
         row: test rows, shape [m].
         tx_pos_m: transmitter positions [m, 3], metres.
-        prediction: shape [n_rx, m, H, W] grey values, [n_rx, m] dBm or [n_rx, m, subcarriers] coefficients, or
+        prediction: grey values [n_rx, m, H, W], dBm [n_rx, m], or coefficients [n_rx, m, subcarriers] or
             [n_rx, m, antennas, subcarriers].
-        truth: the same shape; NaN where nothing was received.
-        references: by name (`wrf_mi.tasks.Task.references`) what needs no model, the same shape.
-        validation: by fold name ("" without folds), pairs (seconds, SSIM on validation rows while they were held out).
+        truth: observations of the same shape; NaN where nothing was received.
+        references: reference predictions of the same shape by name (`wrf_mi.tasks.Task.references`).
+        validation: pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without
+            folds.
     """
 
     path: Path
@@ -66,36 +71,32 @@ class Results:
 
     @cached_property
     def score(self) -> FloatArray:
-        """The task's metric of each prediction, shape [n_rx, m]; NaN where nothing was received."""
+        """Score of each prediction, shape [n_rx, m]; NaN where nothing was received."""
         return TASKS[self.task].of_rows(self.prediction, self.truth)
 
     @cached_property
     def reference_scores(self) -> dict[str, FloatArray]:
-        """The same of each reference."""
+        """Scores of each reference by name."""
         return {key: TASKS[self.task].of_rows(values, self.truth) for key, values in self.references.items()}
 
     @property
     def reference(self) -> Observations:
-        """The reference that stands for all, the first one."""
+        """Predictions of the first reference."""
         return next(iter(self.references.values()))
 
     @property
     def reference_name(self) -> str:
-        """That one in words."""
+        """Description of the first reference."""
         return TASKS[self.task].references[next(iter(self.references))]
 
     @property
     def reference_score(self) -> FloatArray:
-        """Score of that one."""
+        """Score of the first reference."""
         return next(iter(self.reference_scores.values()))
 
 
 def read_run(path: str | Path, name: str | None = None) -> Results:
-    """Read a run folder.
-
-    Args:
-        path: the folder; a run over all blocks has subfolders ``fold0``, ... and pooled files at its top.
-        name: for tables and legends; the folder's own name without one.
+    """Read a run folder (with folds, the pooled scores); ``name`` is for tables, by default that of the folder.
 
     Raises:
         InputError: not a run folder, or a file in it that is missing or damaged.
@@ -128,10 +129,10 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
 
 
 def read_runs(paths: Sequence[str | Path]) -> list[Results]:
-    """Read several run folders under names that differ: folders of the same name get as many parents as needed.
+    """Read several run folders; where names coincide, parent folders are added to tell them apart.
 
     Raises:
-        InputError: no folder, one of them twice, or one that is no run.
+        InputError: no folder, a folder given twice, or a folder that is not a run.
     """
     resolved = [Path(p).resolve() for p in paths]
     if not resolved:
@@ -146,40 +147,33 @@ def read_runs(paths: Sequence[str | Path]) -> list[Results]:
 
 
 def _read_metrics(path: Path) -> dict[str, Any]:
-    try:
+    missing = f"{path.parent}: no {METRICS}, so no finished run; finish it with train --resume"
+    with readable(path, missing, REMEDY):
         metrics = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path.parent}: no {METRICS}, so no finished run; finish it with train --resume") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error}); run evaluate to write it anew") from None
     needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
-    missing = [key for key in needed if key not in metrics]
-    if missing:
-        raise InputError(f"{path}: no {', '.join(missing)}; run evaluate to write it anew")
+    absent = [key for key in needed if key not in metrics]
+    if absent:
+        raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     if metrics["task"] not in TASKS:
         raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
-    task = TASKS[metrics["task"]]
-    references = metrics.get("reference")
-    held = references if isinstance(references, dict) else {}
-    blocks = [metrics.get(task.block), *(held[key] for key in task.references if key in held)]
+    task, stored = TASKS[metrics["task"]], metrics.get("reference")
+    references = stored if isinstance(stored, dict) else {}
+    blocks = [metrics.get(task.block), *(references[key] for key in task.references if key in references)]
     if len(blocks) == 1 or any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        what = f"no {task.block} or no reference {' or '.join(sorted(task.references))} with a median"
-        raise InputError(f"{path}: {what}; run evaluate to write it anew")
-    return metrics
+        text = f"no {task.block} or no reference {' or '.join(sorted(task.references))} with a median"
+        raise InputError(f"{path}: {text}; {REMEDY}")
+    return dict(metrics)
 
 
 def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict[str, Any]:
     observed = ("prediction", "truth", *map(reference_key, references))
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in ("row", "tx_pos", *observed)}
-            names = stored.get("receiver_name")
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; run evaluate to write it") from None
-    except KeyError as error:
-        raise InputError(f"{path}: {error.args[0]}; run evaluate to write it anew") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not readable ({error}); run evaluate to write it anew") from None
+    with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
+        stored = stored_arrays(path)
+    absent = [key for key in ("row", "tx_pos", *observed) if key not in stored]
+    if absent:
+        raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
+    arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
+    names = stored.get("receiver_name")
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
     single = arrays["truth"].ndim == 1 + task.axes if names is None else len(names) == 1
     if single:
@@ -189,21 +183,30 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     fits = 0 <= len(shape) - 2 - task.axes <= task.more_axes
     fits = fits and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
     if not fits or any(arrays[key].shape != shape for key in observed):
-        raise InputError(f"{path}: shapes do not fit together ({shapes}); run evaluate to write it anew")
+        raise InputError(f"{path}: shapes do not fit together ({shapes}); {REMEDY}")
     return arrays | {"receiver_name": names}
 
 
 def _read_log(path: Path) -> list[tuple[float, float]]:
-    """Pairs (seconds, score on held-out validation rows); methods without training leave no log."""
+    """Pairs (seconds, score on held-out validation rows); empty without a log."""
     if not path.is_file():
         return []
     points = []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         try:
             entry = json.loads(line)
-            # Once the fit trains on the validation rows, their score says nothing about rows it has not seen.
+            # Once the fit trains on the validation rows, their score is no longer that of unseen rows.
             if entry["validation_score"] is not None and entry["held_out"]:
                 points.append((float(entry["seconds"]), float(entry["validation_score"])))
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
     return points
+
+
+def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> None:
+    """Write columns of a table as CSV with a header, atomically; None is an empty field."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())

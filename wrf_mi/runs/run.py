@@ -1,10 +1,9 @@
-"""A run folder as a model that predicts."""
+"""Run folder as a model that predicts."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -27,25 +26,25 @@ from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, write_prediction_file
 
 PREDICTED_PER_CHUNK = 256
-"""Positions of one part at most, for a scheduler: 33 MB of spectra of 90 x 360 for each receiver."""
+"""Largest chunk of positions for a scheduler: 33 MB of spectra of 90 x 360 for each receiver."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder and the model in it.
+    """Run folder and the model in it.
 
     Attributes:
-        folder: where everything lies.
-        record: that it was fitted to, where that is no data set by name or folder; None: the data set it names.
+        folder: run folder.
+        record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
     """
 
     folder: Path
-    record: Record | None = dataclasses.field(default=None, repr=False, compare=False)
+    record: Record | None = field(default=None, repr=False, compare=False)
     operator: bool = True
 
     def __post_init__(self) -> None:
-        """Take the folder's name as text, too."""
+        """Accept the folder's name as text."""
         object.__setattr__(self, "folder", Path(self.folder))
 
     @cached_property
@@ -65,47 +64,47 @@ class Run:
 
     @property
     def model(self) -> Model:
-        """The entry of its model."""
+        """Registry entry of the model."""
         return self.config.entry
 
     @cached_property
     def problem(self) -> Problem:
-        """What it was fitted to."""
-        config, own = self.config, self.record
-        place = config.scene, config.material, config.antennas
+        """Data, scene and settings that the model was fitted to."""
+        config = self.config
+        scene = config.scene, config.material, config.antennas
         rows = config.n_train != 0
-        return Problem(own or config.dataset, config.settings, config.seed, *place, rows, self.operator)
+        return Problem(self.record or config.dataset, config.settings, config.seed, *scene, rows, self.operator)
 
     @cached_property
     def fitted(self) -> Fitted:
-        """The fitted model.
+        """Fitted model.
 
         Raises:
-            InputError: not a finished run, or one with several splits.
+            InputError: not a finished run, or a run with several splits.
         """
-        _ = self.config  # a folder that is no run is refused as such
+        problem = self.problem
         if not (self.folder / SPLIT).exists():
             raise InputError(f"{self.folder}: one model for each block; choose one, e.g. {self.folder / 'fold0'}")
-        return load_part(self.config, self.problem, self.folder)[0]
+        return load_fitted(self.config, problem, self.folder)[0]
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:
-        """Whose observations it predicts."""
+        """Receivers whose observations are predicted."""
         return self.fitted.receivers or self.problem.record.receivers
 
     @property
     def field(self) -> FittedField:
-        """The trained field of spectra: settings, parameters and predictor.
+        """Trained field of spectra: settings, parameters and predictor.
 
         Raises:
-            InputError: not a finished run of one such field.
+            InputError: not a finished run of a learned field.
         """
         if not isinstance(self.fitted, FittedField):
             raise InputError(f"{self.folder}: a run of {self.config.model}, not of a learned field of spectra")
         return self.fitted
 
     def predictor(self) -> Predictor:
-        """The predictor of the trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
+        """Predictor of the trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
 
         Raises:
             InputError: as `field`.
@@ -120,17 +119,17 @@ class Run:
         uplink: ArrayLike | None = None,
         carriers_hz: ArrayLike | None = None,
     ) -> Prediction:
-        """What a receiver observes.
+        """Predict the observations of a receiver.
 
         Args:
-            tx_pos_m: positions [m, 3], metres; None: unknown.
-            receiver: name, or number from 0.
-            tx_heading_rad: how the transmitter is turned, [m]; None: unknown.
+            tx_pos_m: transmitter positions [m, 3], metres; None: unknown.
+            receiver: name, or index from 0.
+            tx_heading_rad: yaw of the transmitter [m], radians; None: unknown.
             uplink: uplink channels [m, antennas, subcarriers]; None: unknown.
             carriers_hz: carrier of each position [m], Hz, where the data have several; else None.
 
         Returns:
-            Observations [m, ...] as in `wrf_mi.core.Record` and, where the model states them, standard deviations.
+            Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations.
 
         Raises:
             InputError: not a finished run with one split, inputs that the model does not predict from, or no such
@@ -145,7 +144,7 @@ class Run:
         return self.predict_inputs(Inputs(positions, heading, up, carriers_hz=carriers), index)
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
-        """What the receiver of that index observes, see `predict`."""
+        """Predict the observations of the receiver of an index; inputs and errors as those of `predict`."""
         self.check_inputs(inputs)
         return self.fitted.predict(inputs, receiver)
 
@@ -153,55 +152,53 @@ class Run:
         """Refuse inputs that the model does not predict from.
 
         Raises:
-            InputError: saying which.
+            InputError: heading, carrier or uplink that is not used, missing, or of another shape.
         """
-        model, heading = self.model, inputs.tx_heading_rad
-        if heading is not None:
+        model = self.model
+        if inputs.tx_heading_rad is not None:
             if not (model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading):
                 raise InputError(f"{self.folder}: {UNUSED_HEADING}")
-            if heading.shape != (len(inputs),) or not np.isfinite(heading).all():
-                text = f"{len(inputs)} positions and headings {heading.shape}; give one finite heading for each"
+            self._check_numbers(inputs, inputs.tx_heading_rad, "headings", "finite heading")
+        if inputs.carriers_hz is not None or model.several_carriers:
+            known = self.problem.record.carriers_hz
+            if known is None and inputs.carriers_hz is not None:
+                raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
+            if known is not None and inputs.carriers_hz is None:
+                text = f"its data have {carriers_text(known)}; give {FREQUENCY} for each position"
                 raise InputError(f"{self.folder}: {text}")
-        if model.several_carriers or inputs.carriers_hz is not None:
-            self._check_carriers(inputs)
+            if inputs.carriers_hz is not None:
+                self._check_numbers(inputs, inputs.carriers_hz, "carriers", f"positive {FREQUENCY}", 0.0)
         if model.uplink == "none":
             if inputs.uplink is not None:
                 raise InputError(f"{self.folder}: {UNUSED_UPLINK}")
         elif inputs.uplink is not None or model.needs_uplink:
             check_inputs(inputs, self.problem.record, model)
 
-    def _check_carriers(self, inputs: Inputs) -> None:
-        known, asked = self.problem.record.carriers_hz, inputs.carriers_hz
-        if known is None and asked is not None:
-            raise InputError(f"{self.folder}: its data have one carrier; leave {FREQUENCY} away")
-        if known is not None and asked is None:
-            raise InputError(f"{self.folder}: its data have {carriers_text(known)}; give {FREQUENCY} for each position")
-        if asked is not None and not (asked.shape == (len(inputs),) and (np.isfinite(asked) & (asked > 0)).all()):
-            text = f"{len(inputs)} positions and carriers {asked.shape}; give one positive {FREQUENCY} for each"
+    def _check_numbers(
+        self, inputs: Inputs, values: FloatArray, name: str, wanted: str, above: float = -np.inf
+    ) -> None:
+        if values.shape != (len(inputs),) or not (np.isfinite(values) & (values > above)).all():
+            text = f"{len(inputs)} positions and {name} {values.shape}; give one {wanted} for each"
             raise InputError(f"{self.folder}: {text}")
 
 
-def load_part(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
-    """The fitted model of a part, and the seconds that its fit took.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
+    """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part)
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
         return config.entry.load(arrays, problem, part), seconds
 
 
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:
-    """The run in a folder: ``open_run(folder).predict(tx_pos_m, receiver)`` gives what a receiver observes.
+    """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
     Args:
-        folder: of the run.
-        record: that it was fitted to, where that is no data set by name or folder; None: the data set it names.
+        folder: run folder.
+        record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
 
     Raises:
-        InputError: not a run folder, or one of version 0.1.
+        InputError: not a run folder, or a run folder of version 0.1.
     """
     run = Run(Path(folder), record, operator)
     _ = run.config
@@ -218,29 +215,27 @@ def predict_to_file(
     uplink: NDArray[Any] | None = None,
     carriers_hz: FloatArray | None = None,
 ) -> dict[str, tuple[int, ...]]:
-    """What a run's model predicts at new transmitter positions, as an ``.npz`` or ``.csv`` file.
+    """Predict at new transmitter positions and write an ``.npz`` or ``.csv`` file.
 
     Args:
         folder: run folder with one fitted model.
-        tx_pos_m: positions [m, 3], metres; NaN where they are not known.
+        tx_pos_m: positions [m, 3], metres; NaN where unknown.
         out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and ``std`` of models
-            that state it. ``.csv``, signal strengths alone: see
-            `wrf_mi.runs.prediction_file.write_prediction_file`.
+            that state it. ``.csv``: signal strengths (`wrf_mi.runs.prediction_file.write_prediction_file`).
         tx_heading_rad: yaw of the transmitter's body [m], radians, for models that use it.
-        scheduler: what computes parts of the positions; None: this process. Its workers must see the run folder, data
-            set and scene under the same names.
+        scheduler: computes chunks of the positions; None: this process. Its workers must see the run folder, data set
+            and scene under the same names.
         operator: learned fields predict by operator where they can.
         uplink: uplink channels [m, antennas, subcarriers], for models that predict from them.
-        carriers_hz: carrier of each position [m], Hz, where the data have several; also in the file, ``frequency_hz``.
+        carriers_hz: carrier of each position [m], Hz, where the data have several; stored as ``frequency_hz``.
 
     Returns:
         Shape of each array that ``.npz`` has.
 
     Raises:
-        InputError: a run over several blocks, positions that are not known, headings or an uplink for a model
-            without, no headings for a model that needs them, or a file name with another suffix or of a form that
-            does not hold what the run predicts.
+        InputError: a run over several blocks, inputs that the model does not predict from, or a file name with another
+            suffix or of a format that cannot hold the predictions.
     """
     path = Path(folder)
     asked = Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink, carriers_hz=carriers_hz)
@@ -252,7 +247,7 @@ def predict_to_file(
     else:
         given = [asked.rows(rows) for rows in row_parts(len(asked), scheduler.workers, most=PREDICTED_PER_CHUNK)]
         opener = partial(open_run, path, operator=operator)
-        parts = scheduler.map(_predict_part, given, opener, what="predicting", sizes=[len(one) for one in given])
+        parts = scheduler.map(_predict_part, given, opener, what="predicting", sizes=[len(chunk) for chunk in given])
     means, stds, names = zip(*parts, strict=True)
     arrays: dict[str, Any] = {
         "row": np.arange(len(asked)),
@@ -269,7 +264,7 @@ def predict_to_file(
 
 
 def _predict_part(run: Run, inputs: Inputs) -> tuple[NDArray[Any], NDArray[Any] | None, list[str]]:
-    """Observations [n_rx, m, ...], their standard deviations where the model states them, and the receivers' names."""
+    """Observations [n_rx, m, ...], their standard deviations if the model states them, and the receivers' names."""
     found = [run.predict_inputs(inputs, index) for index in range(len(run.receivers))]
-    stated = None if found[0].std is None else np.stack([one.stated_std for one in found])
-    return np.stack([one.mean for one in found]), stated, [receiver.name for receiver in run.receivers]
+    stated = None if found[0].std is None else np.stack([prediction.stated_std for prediction in found])
+    return np.stack([prediction.mean for prediction in found]), stated, [receiver.name for receiver in run.receivers]

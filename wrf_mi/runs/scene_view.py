@@ -1,4 +1,4 @@
-"""One picture of a place: its mesh, the paths that were traced in it and the Gaussians that were learned."""
+"""Figure of a scene: mesh, traced paths and learned Gaussians."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from ..tracing.surfaces import scene_surfaces
 from .api import open_run
 
 SHOWN_GAUSSIANS = 40
-"""The strongest ones; all of them would hide the rest."""
+"""Number of Gaussians shown, the strongest."""
 WEAKEST = 1e-6
-"""Signals below it are drawn as this: -120 dB."""
+"""Lower limit of drawn signals: -120 dB."""
 
 
 def scene_view(traced: str | Path, row: int, field: str | Path | None = None) -> Figure:
-    """Mesh, traced paths and, of a field that was trained on the same data, Gaussians for one transmitter position.
+    """Mesh, traced paths and optionally the Gaussians of a learned field for a transmitter position.
 
     Args:
         traced: run folder of the ray tracer.
-        row: of the data set; its transmitter's paths are drawn, and the Gaussians for it.
-        field: run folder of a learned field, or None.
+        row: row of the data set; the paths and Gaussians of its transmitter are drawn.
+        field: run folder of a field that was trained on the same data, or None.
 
     Raises:
-        InputError: not such run folders, or a scene that is no longer there.
+        InputError: not such run folders, or a scene that no longer exists.
     """
     run, found = open_run(traced), load_trace(Path(traced) / PATHS)
     scene = run.problem.open_scene(found.frequency_hz)
     transmitter = found.tx_pos_m[row]
-    own = found.paths.select(found.paths.tx == row)
+    paths = found.paths.select(found.paths.tx == row)
     cloud = None
     if field is not None:
-        cloud = cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
+        cloud = _cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
     return draw_scene(
-        surfaces_of(scene),
-        paths=replace(own, tx=np.zeros_like(own.tx), n_tx=1),
+        _surfaces_of(scene),
+        paths=replace(paths, tx=np.zeros_like(paths.tx), n_tx=1),
         transmitters_m=transmitter,
         receivers_m=[receiver.position_m for receiver in found.receivers],
         gaussians=cloud,
@@ -52,8 +52,8 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     )
 
 
-def surfaces_of(scene: Any) -> list[Surface]:
-    """The objects of a ``sionna.rt.Scene`` as surfaces; a name that begins with a kind's tells it, else ``other``."""
+def _surfaces_of(scene: Any) -> list[Surface]:
+    """Objects of a ``sionna.rt.Scene`` as surfaces; the kind is the prefix of the name, else ``other``."""
     faces = scene_surfaces(scene)
     surfaces = []
     for index, name in enumerate(faces.names):
@@ -64,8 +64,8 @@ def surfaces_of(scene: Any) -> list[Surface]:
     return surfaces
 
 
-def cloud_of(gaussians: Gaussians) -> GaussianCloud:
-    """Gaussians for one transmitter, coloured by the strength with which they are seen, opacity times signal."""
+def _cloud_of(gaussians: Gaussians) -> GaussianCloud:
+    """Gaussians for a transmitter, coloured by opacity times signal, in dB."""
     position, scale, rotation = (
         np.array(a, float).T for a in (gaussians.position, gaussians.scale, gaussians.rotation)
     )

@@ -1,18 +1,15 @@
-"""A sweep: one run for each combination of settings, and a table of their scores.
+"""Sweep: one run for each combination of settings, and a table of their scores.
 
-    OUT/sweep.json                              what all runs share: options, settings, versions, digests of the data
-    OUT/seed=0,initial.gaussians=150/           a run folder for each combination, named after what varies
+    OUT/sweep.json                              common options, settings, versions, and digests of the data
+    OUT/seed=0,initial.gaussians=150/           run folder of a combination
     OUT/scores.csv, scores.md, scores.json      the table
 
-Each run is ``wrf-mi train`` in a process of its own, one after the other or several on the workers of a scheduler. A
-finished one is not run again, one that was stopped goes on from its checkpoint; with other content of the data or
-scenes, or with other versions of packages, the folder is refused, so that all runs of a table are comparable.
+Each run is ``wrf-mi train`` in a subprocess, here or on the workers of a scheduler. A finished run is kept, a stopped
+run goes on from its checkpoint. A folder made with other data, scenes or versions of packages is refused.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import json
 import re
@@ -33,27 +30,16 @@ from .api import plan_run
 from .evaluate import stored_metrics
 from .fit_key import content_digest, dataset_files, scene_files
 from .folder import CONFIG, METRICS, package_versions
+from .results import write_csv
 
 OPTIONS = (
-    "dataset",
-    "model",
-    "scene",
-    "material",
-    "evaluation",
-    "split",
-    "n-train",
-    "seed",
-    "preset",
-    "paths",
-    "depth",
-    "reflections",
-    "rays",
-    "calibrate",
-    *(one.name.replace("_", "-") for one in fields(AntennaOptions)),
+    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset"),
+    *("paths", "depth", "reflections", "rays", "calibrate"),
+    *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
-"""What may vary beside settings: DATASET and the options of ``wrf-mi train``."""
+"""Options of ``wrf-mi train`` that may vary, besides settings."""
 FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
-"""Options and settings that may name a file or folder, beside the data set."""
+"""Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"
 SCORES = ("median", "mean", "p10", "p90")
 HEADINGS = {
@@ -67,18 +53,12 @@ HEADINGS = {
     "peak_memory_mb": "peak memory, MB",
     "status": "status",
 }
-"""Columns of the table behind those that vary."""
+"""Headings of the table's columns after the varied settings."""
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One combination.
-
-    Attributes:
-        folder: of its run.
-        varied: what was chosen for it, by setting or option.
-        arguments: of ``wrf-mi``, without ``--out``.
-    """
+    """A combination: its run folder, the varied settings and options, and the arguments of ``wrf-mi`` but ``--out``."""
 
     folder: Path
     varied: Mapping[str, str]
@@ -87,13 +67,7 @@ class SweepRun:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What `run_sweep` runs.
-
-    Attributes:
-        folder: of the sweep.
-        shared: options and settings that all runs have in common, as kept in ``sweep.json``.
-        runs: one for each combination.
-    """
+    """Folder of a sweep, options and settings that all runs share (kept in ``sweep.json``), and the runs."""
 
     folder: Path
     shared: Mapping[str, Any]
@@ -101,12 +75,12 @@ class Sweep:
 
     @property
     def varied(self) -> list[str]:
-        """Settings and options that vary."""
+        """Varied settings and options."""
         return list(self.runs[0].varied)
 
 
 class SweepFailed(RuntimeError):
-    """Runs of a sweep did not finish; the others are in the table."""
+    """Some runs of a sweep did not finish."""
 
     exit_status = 1
 
@@ -118,18 +92,18 @@ def plan_sweep(
     settings: Sequence[str] = (),
     flags: Sequence[str] = (),
 ) -> Sweep:
-    """All combinations, the last of ``vary`` changing fastest. Nothing is written.
+    """Plan all combinations, the last of ``vary`` changing fastest. Nothing is written.
 
     Args:
         out: folder of the sweep.
-        vary: ``KEY=VALUE,VALUE,...`` each, where a key is one of `OPTIONS` or a setting as ``--set`` takes it. Where a
-            value has commas, semicolons separate the values.
-        options: of all runs, keys from `OPTIONS`.
+        vary: ``KEY=VALUE,VALUE,...`` each; a key is one of `OPTIONS` or a setting as for ``--set``. Where a value has
+            commas, semicolons separate the values.
+        options: options of all runs, keys from `OPTIONS`.
         settings: ``KEY=VALUE`` of all runs.
         flags: further arguments of all runs, such as ``--deterministic``.
 
     Raises:
-        InputError: nothing varies, something does twice, or two runs would have one name.
+        InputError: nothing varies, a key or value is given twice, or two runs would have the same name.
     """
     choices: dict[str, list[str]] = {}
     fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
@@ -145,26 +119,20 @@ def plan_sweep(
         choices[key] = values
     if not choices:
         raise InputError("sweep: nothing varies; give --vary KEY=VALUE,VALUE,... once or more")
-    runs, named = [], set()
+    runs: dict[str, SweepRun] = {}
     for chosen in itertools.product(*choices.values()):
         varied = dict(zip(choices, chosen, strict=True))
         name = ",".join(f"{key}={_in_name(value)}" for key, value in varied.items())
-        if name in named:
+        if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        named.add(name)
-        runs.append(SweepRun(Path(out) / name, varied, _arguments(options, settings, flags, varied)))
+        given = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
+        dataset = [given.pop("dataset")] if "dataset" in given else []
+        arguments = [part for key, value in given.items() for part in (f"--{key}", value)]
+        stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in OPTIONS)]
+        set_all = [part for setting in stated for part in ("--set", setting)]
+        runs[name] = SweepRun(Path(out) / name, varied, ("train", *dataset, *arguments, *flags, *set_all))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
-    return Sweep(Path(out), shared, tuple(runs))
-
-
-def _arguments(
-    options: Mapping[str, str], settings: Sequence[str], flags: Sequence[str], varied: Mapping[str, str]
-) -> tuple[str, ...]:
-    chosen = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
-    own = [f"{key}={value}" for key, value in varied.items() if key not in OPTIONS]
-    dataset = [chosen.pop("dataset")] if "dataset" in chosen else []
-    given = [part for key, value in chosen.items() for part in (f"--{key}", value)]
-    return "train", *dataset, *given, *flags, *(part for one in (*settings, *own) for part in ("--set", one))
+    return Sweep(Path(out), shared, tuple(runs.values()))
 
 
 def _in_name(value: str) -> str:
@@ -172,19 +140,10 @@ def _in_name(value: str) -> str:
 
 
 def check_run(dataset: str, arguments: Mapping[str, Any]) -> None:
-    """Refuse a run that ``wrf-mi train`` would refuse, before anything is written.
-
-    Args:
-        dataset: name or folder.
-        arguments: of `wrf_mi.runs.api.plan_run`.
-
-    Raises:
-        InputError: data, scene, split or settings that cannot be used.
-    """
+    """Refuse a run that ``wrf-mi train`` would refuse; ``arguments`` are those of `wrf_mi.runs.api.plan_run`."""
     plan_run(_record(dataset), **arguments)
 
 
-# Runs of a sweep share most of these.
 _record = lru_cache(maxsize=4)(load_record)
 
 
@@ -192,35 +151,35 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
     """Run what is not finished yet, and write the table.
 
     Args:
-        sweep: from `plan_sweep`; its folder is made if need be.
-        scheduler: what computes the runs; None: this process, one after the other. Its workers must see its
-            folder, data sets and scenes under the same names.
+        sweep: planned runs; the folder is made if need be.
+        scheduler: computes the runs; None: this process, one after the other. Its workers must see folder, data sets
+            and scenes under the same names.
 
     Returns:
-        A dictionary for each run: what varies, the keys of `HEADINGS`, ``metrics`` (content of ``metrics.json``) and
-        ``run``, its folder. ``status`` is ``done``, ``kept`` where the run was finished before, else what went wrong.
+        A dictionary for each run: the varied settings, the keys of `HEADINGS`, ``metrics`` (content of
+        ``metrics.json``) and ``run``, its folder. ``status`` is ``done``, ``kept``, or an error message.
 
     Raises:
-        InputError: the folder is that of another sweep, or of something else.
+        InputError: the folder of another sweep, or with other content.
     """
     _claim(sweep)
-    heard: dict[int, dict[str, Any]] = {}
+    finished: dict[int, dict[str, Any]] = {}
 
     def each(index: int, row: dict[str, Any]) -> None:
-        heard[index] = row
-        # Written after each run: the table of a sweep that takes a day can be looked at any time.
-        _write_table(sweep, [heard[k] for k in sorted(heard)])
-        name, count = sweep.runs[index].folder.name, f"{len(heard)} of {len(sweep.runs)}"
-        print(f"{name}: {_headline(row)} ({count})", file=sys.stderr, flush=True)
+        finished[index] = row
+        _write_table(sweep, [finished[k] for k in sorted(finished)])  # after each run: a sweep may take days
+        headline = row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
+        count = f"{len(finished)} of {len(sweep.runs)}"
+        print(f"{sweep.runs[index].folder.name}: {headline} ({count})", file=sys.stderr, flush=True)
 
     return (scheduler or Scheduler()).map(_run, sweep.runs, what="sweeping", each=each)
 
 
 def _claim(sweep: Sweep) -> None:
-    """Make the folder, or see that it belongs to the same sweep, perhaps with other values."""
+    """Make the folder, or check that it belongs to the same sweep, perhaps with other values."""
     folder, path = sweep.folder, sweep.folder / SHARED
-    content = {name: content_digest(places) for name, places in _files(sweep).items()}
-    made_of: dict[str, dict[str, str]] = {"versions": package_versions(), "content": content}
+    content = {name: content_digest(paths) for name, paths in _files(sweep).items()}
+    current: dict[str, dict[str, str]] = {"versions": package_versions(), "content": content}
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; choose another --out")
     if path.exists():
@@ -230,20 +189,20 @@ def _claim(sweep: Sweep) -> None:
             raise InputError(f"{path}: not readable ({one_line(error)}); choose another --out") from None
         if not isinstance(before, dict) or {key: before.get(key) for key in sweep.shared} != sweep.shared:
             raise InputError(f"{folder}: holds a sweep with other settings than this one; choose another --out")
-        for key, what in (("versions", "by other versions of"), ("content", "with other content of")):
+        for key, text in (("versions", "by other versions of"), ("content", "with other content of")):
             known = before.get(key, {})
-            changed = [name for name, now in made_of[key].items() if known.get(name, now) != now]
+            changed = [name for name, now in current[key].items() if known.get(name, now) != now]
             if changed or key not in before:
                 named = ", ".join(changed or ["what it does not state"])
-                raise InputError(f"{folder}: holds a sweep {what} {named}; choose another --out")
-            made_of[key] = known | made_of[key]
+                raise InputError(f"{folder}: holds a sweep {text} {named}; choose another --out")
+            current[key] = known | current[key]
     elif folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: exists, is not empty and holds no sweep; choose another --out")
-    write_atomically(path, json.dumps({**sweep.shared, **made_of}, indent=1) + "\n")
+    write_atomically(path, json.dumps({**sweep.shared, **current}, indent=1) + "\n")
 
 
 def _files(sweep: Sweep) -> dict[str, list[Path]]:
-    """Files of data sets, scenes and settings that name some, by what the command calls them."""
+    """Files of data sets, scenes and settings by the name that the command gives."""
     found: dict[str, list[Path]] = {}
     for run in sweep.runs:
         words = run.arguments[1:]
@@ -253,11 +212,11 @@ def _files(sweep: Sweep) -> dict[str, list[Path]]:
                 found[value] = dataset_files(value)
             elif key in FILES:
                 found[value] = scene_files(value)
-    return {name: places for name, places in found.items() if places}
+    return {name: paths for name, paths in found.items() if paths}
 
 
 def _run(run: SweepRun) -> dict[str, Any]:
-    """One run, in this process's children; its row of the table."""
+    """Run a combination in a subprocess; return its row of the table."""
     folder = run.folder
     if (folder / METRICS).exists():
         return _row(run, "kept")
@@ -265,10 +224,10 @@ def _run(run: SweepRun) -> dict[str, Any]:
     if folder.exists() and not resumable:
         shutil.rmtree(folder)  # stopped before its configuration was there: nothing to go on from
     arguments = ("train", "--resume", str(folder)) if resumable else (*run.arguments, "--out", str(folder))
-    status, said = run_module("wrf_mi.cli", arguments)
+    status, message = run_module("wrf_mi.cli", arguments)
     if status == 0 and (folder / METRICS).exists():
         return _row(run, "done")
-    return _row(run, said.removeprefix("wrf-mi: ") or f"ended with status {status}")
+    return _row(run, message.removeprefix("wrf-mi: ") or f"ended with status {status}")
 
 
 def _row(run: SweepRun, status: str) -> dict[str, Any]:
@@ -276,31 +235,22 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
     row: dict[str, Any] = {"run": str(run.folder), **run.varied, **dict.fromkeys(HEADINGS), "status": status}
     if not metrics:
         return row | {"metrics": {}}
-    task = TASKS[metrics["task"]]
-    held = task.headline(metrics["reference"])
-    row |= {"score": task.label, "reference_median": metrics["reference"][held]["median"]}
+    task, references = TASKS[metrics["task"]], metrics["reference"]
+    row |= {"score": task.label, "reference_median": references[task.headline(references)]["median"]}
     row |= {key: metrics[task.block][key] for key in SCORES}
     row |= {key: metrics[key] for key in HEADINGS if key in metrics}
     return row | {"metrics": metrics}
 
 
-def _headline(row: Mapping[str, Any]) -> str:
-    return row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
-
-
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Say which runs have no scores.
-
-    Raises:
-        SweepFailed: there are such.
-    """
+    """Raise `SweepFailed` with the names of runs without scores."""
     failed = [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]
     if failed:
         raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {'; '.join(failed)}")
 
 
 def sweep_table(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:
-    """Markdown table of the rows of `sweep`."""
+    """Markdown table of the rows of `run_sweep`."""
     columns = [*varied, *HEADINGS.values()]
     lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
     for row in rows:
@@ -318,10 +268,6 @@ def _cell(key: str, value: Any) -> str:
 
 
 def _write_table(sweep: Sweep, rows: Sequence[Mapping[str, Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, ["run", *sweep.varied, *HEADINGS], extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(sweep.folder / "scores.csv", text.getvalue())
+    write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
     write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
     write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")

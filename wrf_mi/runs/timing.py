@@ -1,11 +1,10 @@
-"""How long a call takes, what of that is tracing, code generation and execution, and how much memory it needs.
+"""Time of a call, its shares of tracing, code generation and execution, and its memory.
 
-Two calls are compared by *interleaved pairs*: one after the other, again and again, in one process. What slows the
-machine for a while slows both, so that the ratio of a pair is far steadier than either time.
+Calls are compared by *interleaved pairs* in one process: a changing load affects both alike, so that the ratio of a
+pair varies far less than either time.
 
-Memory is the largest resident memory during a call beyond what the process held before it, with the stores of freed
-memory that Dr.Jit and the C library keep emptied first. Linux counts it anew when asked to; elsewhere the process is
-looked at every millisecond.
+Memory is the largest resident memory during a call less that before it, after the caches of Dr.Jit and the C library
+are emptied. Linux resets its peak on request; elsewhere the process is sampled every millisecond.
 """
 
 from __future__ import annotations
@@ -24,9 +23,11 @@ from typing import Any
 import numpy as np
 import psutil
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import bootstrap as resampled
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
+from ..core.angles import FloatArray
 
 init()
 
@@ -37,7 +38,7 @@ Call = Callable[[], Any]
 REPEATS, WARM_UP = 15, 2
 """Timed calls, and calls before them: the first compiles, the second still fills caches."""
 RESAMPLES = 2000
-"""Bootstrap resamples: limits of a 95 % interval are then good to a few hundredths of its width."""
+"""Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
 CONFIDENCE = 0.95
 RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 LOOK_EVERY_S = 1e-3
@@ -57,16 +58,14 @@ class Interval:
 
 @dataclass(frozen=True)
 class Split:
-    """Where the time of one call goes, in ms.
+    """Shares of the time of a call, in ms.
 
     Attributes:
-        tracing: Python, NumPy, the recording of Dr.Jit's operations, and what Mitsuba builds on the host (BVHs): all
-            that is not in the other two.
-        code_generation: of kernels that were not in the cache, with LLVM's or CUDA's compiler.
-        execution: of kernels. Those that run beside each other count once each, so this is an upper bound, limited
-            to the time of the call.
-        kernels: launched, reductions and sorts included.
-        compiled: of these, compiled anew.
+        tracing: Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder.
+        code_generation: generation of kernels that were not in the cache, with LLVM's or CUDA's compiler.
+        execution: execution of kernels; concurrent ones count in full, up to the time of the call.
+        kernels: number of launched kernels, reductions and sorts included.
+        compiled: number of compiled kernels among them.
     """
 
     tracing: float
@@ -78,14 +77,14 @@ class Split:
 
 @dataclass(frozen=True)
 class Measured:
-    """One call, measured.
+    """Times and memory of a call.
 
     Attributes:
-        ms: time of a call, warm.
-        times_ms: all of them.
-        first: where the first call's time went, which compiles what it needs (if not on disk already).
-        warm: the same of a later one.
-        memory_mb: largest resident memory of a call beyond what was there before.
+        ms: time of a warm call.
+        times_ms: times of all warm calls.
+        first: shares of the first call, which compiles kernels that are not on disk.
+        warm: shares of a later call.
+        memory_mb: largest resident memory during a call less that before it.
     """
 
     ms: Interval
@@ -95,59 +94,62 @@ class Measured:
     memory_mb: float
 
     def plain(self) -> dict[str, Any]:
-        """As numbers for JSON."""
+        """Dictionary for JSON."""
         return asdict(self)
 
 
-def bootstrap(
-    samples: ArrayLike, statistic: Callable[..., Any] = np.median, seed: int = 0, resamples: int = RESAMPLES
-) -> Interval:
-    """A statistic of samples [n] with its 95 % percentile interval.
+def bootstrap(samples: ArrayLike, statistic: Callable[..., Any] = np.median, seed: int = 0) -> Interval:
+    """Statistic of independent samples [n] with its 95 % percentile interval.
 
     Args:
-        samples: independent.
-        statistic: takes an array and ``axis``.
-        seed: of the resamples.
-        resamples: their number.
+        samples: samples, one at least.
+        statistic: function of an array and ``axis``.
+        seed: seed of the resamples.
 
-    Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), section 13.3.
+    Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), section 13.3; `scipy.stats.bootstrap`.
     """
     values = np.asarray(samples, float)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"bootstrap: samples of shape {values.shape}; give [n], one at least")
-    drawn = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    low, high = np.quantile(statistic(values[drawn], axis=1), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Interval(float(statistic(values, axis=0)), float(low), float(high))
+    return _interval([values], statistic, seed)
+
+
+def _interval(samples: Sequence[FloatArray], statistic: Callable[..., Any], seed: int) -> Interval:
+    # SciPy asks for two samples; a single one twice has the same quantiles.
+    data = [np.resize(values, max(2, len(values))) for values in samples]
+    draws: dict[str, Any] = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "rng": seed}
+    low, high = resampled(data, statistic, method="percentile", vectorized=True, **draws).confidence_interval
+    return Interval(float(statistic(*data, axis=-1)), float(low), float(high))
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """BLAS on one thread, as a benchmark needs it: its threads wait for each other by spinning.
+    """Context with BLAS on one thread, as its threads spin while they wait for each other.
 
-    Where another process has one of the cores, the spectrum of an array then takes twenty times as long.
+    Where another process has a core, the spectrum of an array would take twenty times as long.
     """
     return threadpool_limits(1, "blas")
 
 
 def settle(result: Any) -> None:
-    """Evaluate Dr.Jit arrays in a result, and wait for all kernels."""
+    """Evaluate Dr.Jit arrays of a result and wait for all kernels."""
     dr.eval(result)
     dr.sync_thread()
 
 
 @dataclass(frozen=True)
 class Within:
-    """A call inside a context whose entering and leaving is not timed, for example another variant of Mitsuba.
+    """A call in a context whose entering and leaving is not timed, for example another variant of Mitsuba.
 
     Attributes:
-        call: what is timed.
-        context: makes the context.
+        call: timed call.
+        context: function that returns the context.
     """
 
     call: Call
     context: Callable[[], AbstractContextManager[Any]]
 
     def __call__(self) -> Any:
-        """Call it in its context."""
+        """Result of the call in its context."""
         with self.context():
             return self.call()
 
@@ -156,8 +158,8 @@ def seconds(call: Call, processor: bool = False) -> float:
     """Time of one call, until all its kernels have run.
 
     Args:
-        call: what is timed.
-        processor: the time of all processors of this process instead, which others on the machine do not lengthen.
+        call: timed call.
+        processor: whether to measure the processor time of this process, which other processes do not lengthen.
     """
     if isinstance(call, Within):
         with call.context():
@@ -176,13 +178,13 @@ def interleaved(
     most_s: float = np.inf,
     processor: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
-    """Times in ms [rounds] of several calls that take turns in this process; every round calls each once.
+    """Times in ms [rounds] of several interleaved calls in this process; every round calls each once.
 
     Args:
-        calls: by name.
-        repeats: rounds that are timed.
-        warm_up: rounds before them that are not.
-        most_s: no further round begins after so many seconds; three are timed in any case.
+        calls: calls by name.
+        repeats: number of timed rounds.
+        warm_up: number of rounds before them.
+        most_s: seconds after which no further round begins; three are timed in any case.
         processor: see `seconds`.
     """
     start = time.perf_counter()
@@ -190,15 +192,15 @@ def interleaved(
         for call in calls.values():
             seconds(call)
     times: dict[str, list[float]] = {name: [] for name in calls}
-    # Python's collector stops the world when it likes; here it does so between rounds.
+    # Garbage is collected between rounds only.
     collecting = gc.isenabled()
     gc.disable()
     try:
         for done in range(repeats):
             if done >= 3 and time.perf_counter() - start > most_s:
                 break
-            gc.collect(1)  # all of them take longer than many a call
-            # Every other round the other way round: what the one leaves in caches helps or harms the other.
+            gc.collect(1)  # older generations take longer than many calls
+            # The order alternates, as a call may profit from the caches of the one before.
             for name in list(calls)[:: 1 if done % 2 == 0 else -1]:
                 times[name].append(1e3 * seconds(calls[name], processor))
     finally:
@@ -216,10 +218,9 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
 
 
 def split(call: Call) -> Split:
-    """Where the time of a single call goes, from Dr.Jit's kernel history.
+    """Shares of the time of a call, from Dr.Jit's kernel history.
 
-    A frozen function that was recorded without the history is recorded anew for it, so this is called with
-    ``call`` again by whoever wants its warm state (`typical_split`).
+    A frozen function that was recorded without the history is recorded again; `typical_split` has its warm state.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.sync_thread()
@@ -227,24 +228,24 @@ def split(call: Call) -> Split:
         whole = 1e3 * seconds(call)
         history = dr.kernel_history()
     generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
-    # Kernels may run beside each other and beside the recording of the next.
+    # Kernels may run concurrently with each other and with the recording of the next.
     executed = min(sum(entry["execution_time"] for entry in history), max(whole - generated, 0.0))
     compiled = sum(not entry.get("cache_hit", 1) for entry in history)
     return Split(max(whole - generated - executed, 0.0), generated, executed, len(history), compiled)
 
 
 def typical_split(call: Call, calls: int = 5) -> Split:
-    """That of several calls whose time is the median: one alone may have been disturbed."""
+    """Shares of the call with the median time among several."""
     found = sorted((split(call) for _ in range(calls)), key=lambda s: s.tracing + s.code_generation + s.execution)
     return found[calls // 2]
 
 
 def memory_mb(call: Call) -> float:
-    """Largest resident memory during a call beyond what the process held before it, MB."""
+    """Largest resident memory during a call less that before it, MB."""
     gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()
-    # The C library keeps what NumPy freed, and a call that takes it again would seem to need nothing.
+    # The C library keeps memory that NumPy freed and would reuse it unseen.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
@@ -260,7 +261,7 @@ def memory_mb(call: Call) -> float:
 
 
 def _watched(call: Call) -> int:
-    """Largest resident memory during a call that was seen from a thread beside it, bytes."""
+    """Largest resident memory during a call sampled by a thread, bytes."""
     process, done, peak = psutil.Process(), threading.Event(), [0]
 
     def watch() -> None:
@@ -279,12 +280,12 @@ def _watched(call: Call) -> int:
 
 
 def measure(call: Call, repeats: int = REPEATS, most_s: float = np.inf) -> Measured:
-    """Time, split and memory of a call.
+    """Time, shares and memory of a call.
 
     Args:
-        call: what is measured; what it returns is evaluated.
-        repeats: timed calls.
-        most_s: no further one begins after so many seconds; three are timed in any case.
+        call: measured call, whose result is evaluated.
+        repeats: number of timed calls.
+        most_s: seconds after which no further call begins; three are timed in any case.
     """
     first, warm = split(call), typical_split(call)
     memory = memory_mb(call)
@@ -293,37 +294,32 @@ def measure(call: Call, repeats: int = REPEATS, most_s: float = np.inf) -> Measu
 
 
 def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) -> Interval:
-    """Exponent of cost against work: the least-squares slope of log time over log size, over the larger half of sizes.
+    """Exponent of the growth of time with size: the least-squares slope of their logarithms over the larger sizes.
 
-    At small sizes overheads hide the growth. The interval is from resampling the repetitions at each size: it says how
-    sure the slope of *these* sizes is, not that it goes on like that.
+    Overheads hide the growth at small sizes. The interval is from resampled repetitions at each size.
 
     Args:
-        sizes: ascending, two or more.
-        times: repetitions at each size.
-        seed: of the resamples.
+        sizes: ascending sizes, two or more.
+        times: times of the repetitions at each size.
+        seed: seed of the resamples.
     """
     if len(sizes) != len(times) or len(sizes) < 2:
         raise ValueError(f"exponent: {len(sizes)} sizes and {len(times)} sets of times; give two or more of both")
     kept = larger_half(len(sizes))
     x = np.log(np.asarray(sizes, float)[kept])
     x -= x.mean()
-    rng = np.random.default_rng(seed)
-    own, drawn = [], []
-    for one in list(times)[kept]:
-        values = np.asarray(one, float)
-        own.append(np.log(np.median(values)))
-        picked = rng.integers(0, len(values), (RESAMPLES, len(values)))
-        drawn.append(np.log(np.median(values[picked], axis=1)))
-    low, high = np.quantile(x @ np.array(drawn) / (x @ x), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Interval(float(x @ np.array(own) / (x @ x)), float(low), float(high))
+
+    def slope(*samples: FloatArray, axis: int) -> Any:
+        return np.tensordot(x, np.log([np.median(values, axis=axis) for values in samples]), 1) / (x @ x)
+
+    return _interval([np.asarray(values, float) for values in list(times)[kept]], slope, seed)
 
 
 def larger_half(count: int) -> slice:
-    """The larger half of ascending sizes; of four or five the largest three, two at least."""
+    """Slice of the larger half of ascending sizes; of four or five the largest three, two at least."""
     return slice(count - max(count - count // 2, min(3, count - 1), 2), count)
 
 
 def n_log_n(sizes: Sequence[float]) -> float:
-    """What `exponent` gives for a cost of n log n at these sizes; a little above 1."""
+    """Result of `exponent` for a cost of n log n at these sizes, slightly above 1."""
     return exponent(sizes, [[n * np.log(max(n, 2))] for n in sizes]).value

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core import Receiver
 from ..core.angles import FloatArray
-from ..gaussians.footprint import Pose, own_axes
+from ..gaussians.footprint import Pose, principal_axes
 
 
 def position_name(receiver: Receiver) -> str:
@@ -51,7 +51,7 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
 
     moved, turned = correction(position_name(receiver)), correction(turn_name(receiver))
     position = [float(x) + t for x, t in zip(receiver.position_m, moved, strict=True)]
-    columns = own_axes([*(0.5 * r for r in turned), float_type(1)])
+    columns = principal_axes([*(0.5 * r for r in turned), float_type(1)])
     stated = receiver.to_world
     to_world = [[sum(float(stated[i, k]) * columns[j][k] for k in range(3)) for j in range(3)] for i in range(3)]
     return Pose(position, to_world)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
-from ..gaussians.encoding import telling_scale
+from ..gaussians.encoding import unambiguous_scale
 from ..gaussians.skip import Skip
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
@@ -214,7 +214,7 @@ class TrainConfig(LoopConfig):
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
         """The settings with number of steps and scale for the training transmitters [n, 3] in metres."""
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
-        scale = self.encoding.tx_scale_m or telling_scale(tx_pos_m, LEAST_TX_SCALE_M)
+        scale = self.encoding.tx_scale_m or unambiguous_scale(tx_pos_m, LEAST_TX_SCALE_M)
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:

@@ -1,20 +1,20 @@
 """Gaussians as an absorbing medium: extinction at a point, and its integral along a ray in closed form.
 
-A field says how much of a wave passes a Gaussian through its centre, and says the same for every direction:
-1 - alpha under alpha blending, |delta| under product blending. An extinction that depends on position alone cannot do
-that for a Gaussian that is not round, because the way through it differs. So here the extinction depends on the ray's
-direction d too, as in media of microflakes (Jakob et al. 2010), and is the same forwards and backwards:
+A field gives the transmission through the centre of a Gaussian, 1 - alpha or |delta|, for every direction alike. An
+extinction that depends on position alone cannot do that for a Gaussian that is not round, because the length of the way
+through it differs. The extinction therefore depends on the ray's direction d too, as in media of microflakes (Jakob et
+al. 2010), and is equal forwards and backwards:
 
     sigma(x, d) = sum_i w_i(d) exp(-m_i(x)^2 / 2) where m_i(x) < CUTOFF, else 0
     w_i(d)      = tau_i |W_i d| / (sqrt(2 pi) erf(CUTOFF / sqrt(2))),   m_i(x) = |W_i (x - mu_i)|
     tau_i       = -log(1 - alpha_i) or -log |delta_i|,                  W_i = diag(1 / s_i) R_i^T
 
-so the optical depth along any line through the centre is tau_i, whatever the Gaussian's shape, and along a line that
-passes at Mahalanobis distance m it is tau_i G with G = exp(-m^2 / 2), but for what the cut-off takes. Blending lets
-1 - alpha G pass there, the medium (1 - alpha)^G: the same at the centre, far from it, and to first order in alpha.
+The optical depth along any line through the centre is tau_i, whatever the Gaussian's shape, and tau_i G with
+G = exp(-m^2 / 2) along a line at Mahalanobis distance m, up to the cut-off. The medium passes (1 - alpha)^G there and
+blending 1 - alpha G: equal at the centre, far from it, and to first order in alpha.
 
 The depth between two points of a ray is a difference of error functions. Depths are logarithms: their sum does not
-underflow. A phase is no attenuation: of delta only the magnitude enters.
+underflow. The phase of delta has no effect.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from wrf_mi.gaussians.footprint import dot, principal_axes
+from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.parameters import Gaussians, each
+
 from .extinction_cells import CellLists, HostGaussians
-from .footprint import dot, own_axes
-from .footprint_constants import CUTOFF
-from .parameters import Gaussians
 
 LEAST_PASSED = 2.0**-24
-"""What passes the most opaque Gaussian, an optical depth of 16.6: float32 tells no smaller 1 - alpha from zero."""
+"""Transmission of the most opaque Gaussian, an optical depth of 16.6: a smaller 1 - alpha is zero in float32."""
 
 CENTRE_LINE = math.erf(CUTOFF / math.sqrt(2))
 """Share of a Gaussian's line integral that lies within the cut-off, 0.9973; divided out."""
@@ -42,7 +43,8 @@ PEAK = 1 / (math.sqrt(2 * math.pi) * CENTRE_LINE)
 """Largest extinction of a Gaussian in units of optical depth per standard deviation along the ray."""
 
 _SHORTEST_HALF_CHORD = 1e-3
-"""In standard deviations: bounds the derivative of the chord, which is infinite where a ray grazes the cut-off."""
+"""Shortest half chord in standard deviations: it bounds the derivative of the chord, which is infinite where a ray
+grazes the cut-off."""
 
 Vector = list[Any]
 
@@ -61,36 +63,40 @@ class Attenuators:
     whitening: list[Vector]
     depth: Any
 
+    def at(self, index: Any) -> Attenuators:
+        """The Gaussians at ``index``, gathered. Differentiable."""
 
-def depth_of_opacity(opacity: Any) -> Any:
-    """Optical depth -log(1 - alpha) of an alpha in [0, 1]; at most 16.6. Differentiable."""
-    return -dr.log(dr.maximum(1 - opacity, LEAST_PASSED))
+        def take(a: Any) -> Any:
+            return dr.gather(type(a), a, index)
 
+        return Attenuators(each(take, self.centre), [each(take, row) for row in self.whitening], take(self.depth))
 
-def depth_of_attenuation(delta: Vector) -> Any:
-    """Optical depth -log |delta| of a complex factor (re, im) with |delta| <= 1; at most 16.6. Differentiable."""
-    re, im = delta
-    return dr.maximum(-0.5 * dr.log(dr.maximum(re * re + im * im, LEAST_PASSED**2)), 0)
+    def whiten(self, v: Vector) -> Vector:
+        """Vectors W v."""
+        return [dot(row, v) for row in self.whitening]
 
 
 def attenuators(gaussians: Gaussians) -> Attenuators:
     """The attenuation of a field's Gaussians for one transmitter. Differentiable.
 
+    The optical depth is -log(1 - alpha) or -log |delta|, at most 16.6.
+
     Args:
-        gaussians: with batch 1.
+        gaussians: Gaussians with batch 1.
 
     Raises:
         ValueError: Gaussians for several transmitters.
     """
     if gaussians.batch != 1:
         raise ValueError(f"attenuators: Gaussians for {gaussians.batch} transmitters; give those of one")
-    if gaussians.opacity is not None:
-        depth = depth_of_opacity(gaussians.opacity)
+    blending: list[Any] = gaussians.blending
+    if len(blending) == 1:
+        depth = -dr.log(dr.maximum(1 - blending[0], LEAST_PASSED))
     else:
-        assert gaussians.attenuation is not None
-        depth = depth_of_attenuation(gaussians.attenuation)
-    turned = own_axes(gaussians.rotation)
-    rows = [[a / s for a in axis] for s, axis in zip(gaussians.scale, turned, strict=True)]
+        re, im = blending
+        depth = dr.maximum(-0.5 * dr.log(dr.maximum(re * re + im * im, LEAST_PASSED**2)), 0)
+    axes = principal_axes(gaussians.rotation)
+    rows = [[a / s for a in axis] for s, axis in zip(gaussians.scale, axes, strict=True)]
     return Attenuators(list(gaussians.position), rows, depth)
 
 
@@ -98,71 +104,57 @@ def on_host(of: Attenuators) -> HostGaussians:
     """Gaussians in float64 on the host, each with its largest extinction in any direction."""
     dr.eval(of.centre, of.whitening, of.depth)  # one kernel, not one for each
 
-    def plain(a: Any) -> Any:
-        return dr.detach(a).numpy().astype(float)
+    def plain(arrays: Vector) -> Any:
+        return np.stack([dr.detach(a).numpy().astype(float) for a in arrays], axis=-1)
 
-    whitening = np.stack([np.stack([plain(a) for a in row], axis=-1) for row in of.whitening], axis=1)
+    whitening = np.stack([plain(row) for row in of.whitening], axis=1)
     # The rows of W are orthogonal: the longest is its norm.
     densest = np.linalg.norm(whitening, axis=2).max(axis=1)
-    return HostGaussians(np.stack([plain(a) for a in of.centre], axis=-1), whitening, plain(of.depth) * densest * PEAK)
+    return HostGaussians(plain(of.centre), whitening, plain([of.depth])[:, 0] * densest * PEAK)
 
 
-def _whiten(own: Attenuators, v: Vector) -> Vector:
-    return [dot(row, v) for row in own.whitening]
+def closest_approach(of: Attenuators, origin: Vector, direction: Vector) -> tuple[Any, Any, Any]:
+    """Passage of each line by one Gaussian: (m^2, t, c). Differentiable.
 
-
-def one(of: Attenuators, index: Any) -> Attenuators:
-    """The Gaussians at ``index``, gathered. Differentiable."""
-
-    def take(a: Any) -> Any:
-        return dr.gather(type(a), a, index)
-
-    return Attenuators([take(a) for a in of.centre], [[take(a) for a in row] for row in of.whitening], take(of.depth))
-
-
-def passing(own: Attenuators, origin: Vector, direction: Vector) -> tuple[Any, Any, Any]:
-    """How a line passes a Gaussian: (m^2, t, c).
-
-    m is the Mahalanobis distance at which it passes the centre, t the distance in metres along it to the point where it
-    does, and c the number of standard deviations per metre along it. Differentiable.
+    m is the smallest Mahalanobis distance of the line from the centre, t the distance in metres along it to that point,
+    and c the number of standard deviations per metre along it.
     """
     # From the point nearest to the centre, in metres: whitening a far origin would cost a needle its digits.
-    offset = [o - c for o, c in zip(origin, own.centre, strict=True)]
+    offset = [o - c for o, c in zip(origin, of.centre, strict=True)]
     near = -dot(offset, direction)
-    p = _whiten(own, [dr.fma(near, d, o) for o, d in zip(offset, direction, strict=True)])
-    q = _whiten(own, direction)
+    p = of.whiten([dr.fma(near, d, o) for o, d in zip(offset, direction, strict=True)])
+    q = of.whiten(direction)
     square = dot(q, q)
     further = -dot(p, q) / square
     p = [dr.fma(further, b, a) for a, b in zip(p, q, strict=True)]
     return dot(p, p), near + further, dr.sqrt(square)
 
 
-def depth_between(own: Attenuators, origin: Vector, direction: Vector, near_m: Any, far_m: Any) -> Any:
+def depth_between(of: Attenuators, origin: Vector, direction: Vector, near_m: Any, far_m: Any) -> Any:
     """Optical depth of each ray through one Gaussian each, see `optical_depth`."""
-    square, t, per_metre = passing(own, origin, direction)
+    square, t, per_metre = closest_approach(of, origin, direction)
     left = CUTOFF * CUTOFF - square
     half = dr.select(left > _SHORTEST_HALF_CHORD**2, dr.sqrt(dr.maximum(left, _SHORTEST_HALF_CHORD**2)), 0)
     reach = half / per_metre
     # Cut off in metres: scaled, an infinite distance would have no derivative.
     start, end = ((dr.clip(x, t - reach, t + reach) - t) * per_metre for x in (near_m, far_m))
     passed = dr.erf(end * math.sqrt(0.5)) - dr.erf(start * math.sqrt(0.5))
-    return own.depth * dr.exp(-0.5 * square) * passed * (0.5 / CENTRE_LINE)
+    return of.depth * dr.exp(-0.5 * square) * passed * (0.5 / CENTRE_LINE)
 
 
-def extinction_of(own: Attenuators, position: Vector, direction: Vector) -> Any:
+def extinction_of(of: Attenuators, position: Vector, direction: Vector) -> Any:
     """Extinction at each point by one Gaussian each, see `extinction`."""
-    p = _whiten(own, [x - c for x, c in zip(position, own.centre, strict=True)])
-    q = _whiten(own, direction)
+    p = of.whiten([x - c for x, c in zip(position, of.centre, strict=True)])
+    q = of.whiten(direction)
     square = dot(p, p)
-    return dr.select(square < CUTOFF * CUTOFF, own.depth * dr.sqrt(dot(q, q)) * dr.exp(-0.5 * square) * PEAK, 0)
+    return dr.select(square < CUTOFF * CUTOFF, of.depth * dr.sqrt(dot(q, q)) * dr.exp(-0.5 * square) * PEAK, 0)
 
 
 @dr.syntax
 def _sum(term: Callable[..., Any], i: Any, last: Any, at: list[Any], total: Any) -> Any:
     """Sum of ``term(i, at)`` from ``i`` up to ``last``.
 
-    What a term gathers from must not be a variable of the loop, in which all have one width; what differs from lane to
-    lane must be one.
+    Variables of the loop have one width: ``at`` holds arrays that differ between lanes; tables are not among them.
     """
     while dr.hint(i < last, max_iterations=-1):
         total += term(i, at)
@@ -177,11 +169,11 @@ def optical_depth(of: Attenuators, origin: Vector, direction: Vector, near_m: An
     Differentiable in both modes with respect to Gaussians and rays.
 
     Args:
-        of: n Gaussians.
+        of: attenuation of n Gaussians.
         origin: three arrays [r], metres.
         direction: three arrays [r], unit vectors.
-        near_m: array [r], where the piece of the ray begins, metres from its origin.
-        far_m: array [r], where it ends; may be infinite.
+        near_m: array [r], begin of the segment, metres from the origin.
+        far_m: array [r], end of the segment; may be infinite.
 
     Returns:
         Array [r], at least 0.
@@ -191,7 +183,7 @@ def optical_depth(of: Attenuators, origin: Vector, direction: Vector, near_m: An
     first = dr.zeros(dr.uint32_array_t(Float), rays)
 
     def term(i: Any, at: list[Any]) -> Any:
-        return depth_between(one(of, i), *at)
+        return depth_between(of.at(i), *at)
 
     at = [origin, direction, near_m, far_m]
     return _sum(term, first, type(first)(dr.width(of.depth)), at, dr.zeros(Float, rays))
@@ -201,8 +193,8 @@ def extinction(of: Attenuators, cells: CellLists, position: Vector, direction: V
     """Extinction sigma at points for rays through them, from the Gaussians listed in each point's cell. Differentiable.
 
     Args:
-        of: the Gaussians that ``cells`` were made from.
-        cells: from `wrf_mi.gaussians.extinction_cells.cell_lists`.
+        of: attenuation of the Gaussians that ``cells`` were made from.
+        cells: grid from `wrf_mi_plugins.extinction_cells.to_device`.
         position: three arrays [p], metres.
         direction: three arrays [p], unit vectors; its sign does not matter.
         active: mask [p].
@@ -212,7 +204,7 @@ def extinction(of: Attenuators, cells: CellLists, position: Vector, direction: V
     """
 
     def term(i: Any, at: list[Any]) -> Any:
-        return extinction_of(one(of, dr.gather(type(i), cells.index, i)), *at)
+        return extinction_of(of.at(dr.gather(type(i), cells.index, i)), *at)
 
     first, last = cells.range_at(position, active)
     return _sum(term, first, last, [position, direction], dr.zeros(type(of.depth), dr.width(first)))

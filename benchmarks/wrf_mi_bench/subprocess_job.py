@@ -1,6 +1,6 @@
-"""One computation in a process of its own, to be held against the same in another process.
+"""A computation in a subprocess, to be compared with that of another one.
 
-``python -m wrf_mi_bench.alone JOB FILE``: ``JOB`` is a `Job` as JSON; arrays go to ``FILE`` (npz).
+``python -m wrf_mi_bench.subprocess_job JOB FILE``: ``JOB`` is a `Job` as JSON; arrays go to ``FILE`` (npz).
 """
 
 from __future__ import annotations
@@ -20,32 +20,31 @@ from numpy.typing import NDArray
 
 from wrf_mi.backend import init
 from wrf_mi.backend.libraries import LLVM_VARIABLE
-from wrf_mi.core.files import write_arrays
+from wrf_mi.core.files import stored_arrays, write_arrays
 from wrf_mi.parallel import run_module
 
 Arrays = dict[str, NDArray[Any]]
 
 
-class AloneFailed(RuntimeError):
-    """The process failed; says how."""
+class SubprocessJobFailed(RuntimeError):
+    """The subprocess failed."""
 
     exit_status = 1
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to compute.
+    """A computation.
 
     Attributes:
         kind: a key of `KINDS`.
-        dataset: name or folder.
-        settings: of the fit, ``key=value``.
-        scene: of a physics model or traced run; "": none.
-        material: of a bare mesh; "": it is none.
-        n_train: training rows; 0: all.
-        stop: step after which a fit is stopped, to be gone on with in another process; 0: none.
-        deterministic: as the command's flag.
-        threads: of Dr.Jit; 0: its own choice.
+        dataset: name or folder of a data set.
+        settings: settings of the fit, ``key=value``.
+        scene: scene of a physics model or of ray tracing; "": none.
+        n_train: number of training rows; 0: all.
+        stop: step after which a fit is stopped, to be resumed in another subprocess; 0: none.
+        deterministic: whether to fit with ``--deterministic``.
+        threads: number of Dr.Jit's threads; 0: its default.
         backend: ``"llvm"`` or ``"cuda"``.
     """
 
@@ -53,7 +52,6 @@ class Job:
     dataset: str
     settings: tuple[str, ...] = ()
     scene: str = ""
-    material: str = ""
     n_train: int = 0
     stop: int = 0
     deterministic: bool = False
@@ -61,32 +59,20 @@ class Job:
     backend: str = "llvm"
 
 
-def alone(job: Job, llvm: Path | str | None = None) -> Arrays:
-    """Do a job in a process of its own.
-
-    Args:
-        job: what to do.
-        llvm: library to compute with; None: as this process.
-
-    Returns:
-        What it computed, see `KINDS`.
-
-    Raises:
-        AloneFailed: the process did not end well.
-    """
+def subprocess_job(job: Job, llvm: Path | str | None = None) -> Arrays:
+    """Arrays that a job computes in a subprocess, with another LLVM library where one is given (see `KINDS`)."""
     with TemporaryDirectory() as work:
         out = Path(work) / "out.npz"
-        with _computing_with(llvm):
-            status, said = run_module(__name__, [json.dumps(asdict(job)), str(out)], quiet=True)
+        with _llvm_library(llvm):
+            status, message = run_module(__name__, [json.dumps(asdict(job)), str(out)], quiet=True)
         if status != 0:
-            raise AloneFailed(f"{job.kind} of {job.dataset} ended with status {status}: {said}")
-        with np.load(out, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files}
+            raise SubprocessJobFailed(f"{job.kind} of {job.dataset} ended with status {status}: {message}")
+        return stored_arrays(out)
 
 
 @contextmanager
-def _computing_with(llvm: Path | str | None) -> Iterator[None]:
-    """Processes that are started in the block load this LLVM; None: the same as this process."""
+def _llvm_library(llvm: Path | str | None) -> Iterator[None]:
+    """Context in which subprocesses load an LLVM library; None: that of this process."""
     before = os.environ.get(LLVM_VARIABLE)
     if llvm is not None:
         os.environ[LLVM_VARIABLE] = str(llvm)
@@ -98,23 +84,18 @@ def _computing_with(llvm: Path | str | None) -> Iterator[None]:
             os.environ[LLVM_VARIABLE] = before
 
 
-def _of_run(folder: Path, files: tuple[str, ...]) -> Arrays:
-    """Arrays of a run's files, but how long it took."""
-    found: Arrays = {}
-    for name in files:
-        with np.load(folder / name, allow_pickle=False) as stored:
-            found |= {f"{name}: {key}": stored[key] for key in stored.files if not key.endswith("seconds")}
-    return found
-
-
-def _predicted(folder: Path) -> Arrays:
-    """What ``predict`` writes at positions between those of the test rows."""
+def _results(folder: Path, *files: str) -> Arrays:
+    """Arrays of a run's files and its predictions at positions near those of test rows, without times."""
     from wrf_mi.runs.api import predict_to_file
 
-    with np.load(folder / "predictions.npz") as stored:
-        tx = stored["tx_pos"][:8]
-    predict_to_file(folder, tx + 0.01, folder / "new.npz")
-    return _of_run(folder, ("new.npz",))
+    tx_pos_m = stored_arrays(folder / "predictions.npz")["tx_pos"][:8]
+    predict_to_file(folder, tx_pos_m + 0.01, folder / "new.npz")
+    return {
+        f"{name}: {key}": values
+        for name in (*files, "predictions.npz", "new.npz")
+        for key, values in stored_arrays(folder / name).items()
+        if not key.endswith("seconds")
+    }
 
 
 def _field(job: Job, work: Path) -> Arrays:
@@ -123,23 +104,20 @@ def _field(job: Job, work: Path) -> Arrays:
     from wrf_mi.training.config import TrainConfig
 
     config: Any = with_settings(TrainConfig(deterministic=job.deterministic), job.settings)
-    taken = iter(range(1, config.steps))
-    asked: dict[str, Any] = {"settings": config, "n_train": job.n_train or None}
+    steps = iter(range(1, config.steps))
     with suppress(Interrupted):
-        train(job.dataset, work, config.model, **asked, stop=lambda: next(taken) == job.stop)
-    if job.stop:  # gone on with in a process that has compiled and drawn nothing yet
+        train(job.dataset, work, config.model, settings=config, stop=lambda: next(steps) == job.stop)
+    if job.stop:
         run_module("wrf_mi.cli", ["train", "--resume", str(work)], quiet=True)
     score = json.loads((work / "metrics.json").read_text())["ssim"]["median"]
-    files = _of_run(work, ("model.npz", "predictions.npz"))
-    return files | _predicted(work) | {"score": np.asarray(score)}
+    return _results(work, "model.npz") | {"score": np.asarray(score)}
 
 
 def _physics(job: Job, work: Path) -> Arrays:
     from wrf_mi.runs.api import train
 
-    asked: dict[str, Any] = {"material": job.material or None, "n_train": job.n_train or None}
-    train(job.dataset, work, "physics", scene=job.scene or None, **asked, settings=job.settings)
-    return _of_run(work, ("model.npz", "predictions.npz")) | _predicted(work)
+    train(job.dataset, work, "physics", scene=job.scene or None, n_train=job.n_train or None, settings=job.settings)
+    return _results(work, "model.npz")
 
 
 def _channels(job: Job, work: Path) -> Arrays:
@@ -147,8 +125,8 @@ def _channels(job: Job, work: Path) -> Arrays:
     from wrf_mi.models.physics.csi import CsiSettings, fit_csi
     from wrf_mi.synthetic import load_record
 
+    from .comparison import room_file
     from .physics_csi import scanned_scene
-    from .trace import room_file
 
     record = load_record(job.dataset)
     assert record.official is not None
@@ -162,12 +140,12 @@ def _channels(job: Job, work: Path) -> Arrays:
 def _traced(job: Job, work: Path) -> Arrays:
     from wrf_mi.runs.api import train
 
-    train(job.dataset, work, "ray-tracing", scene=job.scene, material=job.material or None)
-    return _of_run(work, ("paths.npz", "predictions.npz")) | _predicted(work)
+    train(job.dataset, work, "ray-tracing", scene=job.scene)
+    return _results(work, "paths.npz")
 
 
 def _step(job: Job, work: Path) -> Arrays:
-    """The images of a batch and the gradient of one step, of starting values."""
+    """Images of a batch and gradient of one step, at the initial parameters."""
     import drjit as dr
     import mitsuba as mi
 
@@ -205,12 +183,12 @@ KINDS: Mapping[str, Callable[[Job, Path], Arrays]] = {
     "traced": _traced,
     "step": _step,
 }
-"""By name. ``field``, ``physics`` and ``traced`` make a run and give what its files hold and what it predicts at new
-positions, ``channels`` a model and what it predicts, ``step`` images and a gradient."""
+"""Computations by name. ``field``, ``physics`` and ``traced`` return a run's arrays and predictions at new positions,
+``channels`` a model and its predictions, ``step`` images and a gradient."""
 
 
 def main(job: str, out: str) -> None:
-    """Do a job in this process."""
+    """Compute a job in this process."""
     given = json.loads(job)
     asked = Job(**{**given, "settings": tuple(given["settings"])})
     # As the command: with --deterministic on one thread.

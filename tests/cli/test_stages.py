@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from wrf_mi.runs.watch import Watch
+from wrf_mi.cli.output import Watch
 
 
 def test_stages_are_named_once(capsys: pytest.CaptureFixture[str]) -> None:

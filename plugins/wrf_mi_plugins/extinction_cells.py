@@ -1,8 +1,8 @@
-"""Which Gaussians reach which cell of a grid, and a bound on their extinction: what free-flight sampling needs.
+"""Grid of the Gaussians that reach each cell, and a bound on their extinction, for free-flight sampling.
 
 Made on the host, in float64, whenever the Gaussians change. A cell lists every Gaussian whose cut-off reaches into it,
-by a lower bound of the Mahalanobis distance between the two: in the Gaussian's own axes, scaled to unit deviation, the
-cell is enclosed in an upright box; and along each axis of the world the cell is a slab.
+by a lower bound of the Mahalanobis distance between the two: along the Gaussian's axes, scaled to unit deviation, the
+cell is enclosed in a box; and along each axis of the world the cell is a slab.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .footprint_constants import CUTOFF
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.types import IntArray
+from wrf_mi.gaussians.footprint_constants import CUTOFF
 
 CELLS_PER_GAUSSIAN = 8
-"""Cells are cubes, about this many for each Gaussian."""
+"""Approximate number of (cubic) cells per Gaussian."""
 MOST_PAIRS = 1_000_000
-"""Pairs of a cell and a Gaussian that are looked at; if there are more, the grid gets coarser."""
+"""Largest number of pairs of a cell and a Gaussian; if there are more, the grid gets coarser."""
 TIGHT = 1.2
 """The bound is refined until it is within this factor of an extinction that occurs ..."""
 MOST_SPLIT_PAIRS = 300_000
-"""... or until this many pairs of a part of a cell and a Gaussian have been looked at."""
+"""... or until this many pairs of a part of a cell and a Gaussian have been visited."""
 SPLIT_PER_CHUNK = 32
 """Cells that are split together, those with the largest sums."""
 EIGHT = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-"""Where the eight parts of a cell are, in half widths of a part."""
+"""Centres of the eight parts of a cell, in half widths of a part."""
 MARGIN = 1e-4
 """Relative room for rounding in float32: of a cell's width and of the bound."""
 
@@ -70,12 +70,12 @@ class HostGaussians:
             half_m: half their width, shape [p, 1] or one number.
         """
         w, offset = self.whitening[which], middle_m - self.centre_m[which]
-        own = np.abs(np.einsum("pij,pj->pi", w, offset)) - half_m * np.abs(w).sum(axis=2)
+        box = np.abs(np.einsum("pij,pj->pi", w, offset)) - half_m * np.abs(w).sum(axis=2)
         slab = (np.abs(offset) - half_m) / self.deviation_m[which]
-        return np.maximum((np.maximum(own, 0) ** 2).sum(axis=1), np.maximum(slab, 0).max(axis=1) ** 2)
+        return np.maximum((np.maximum(box, 0) ** 2).sum(axis=1), np.maximum(slab, 0).max(axis=1) ** 2)
 
     def extinction(self, which: IntArray, points_m: FloatArray) -> FloatArray:
-        """What Gaussians [p] add at points [p, 3] for the direction in which each is densest, 1/m."""
+        """Extinction of Gaussians [p] at points [p, 3] in the direction in which each is densest, 1/m."""
         squared = self.squared_distance(which, points_m, 0.0)
         return np.where(squared < CUTOFF**2, self.peak[which] * np.exp(-0.5 * squared), 0.0)
 
@@ -86,9 +86,9 @@ class Cells:
 
     Attributes:
         low_m: corner of the grid, shape [3].
-        width_m: of a cell.
+        width_m: width of a cell.
         size: cells along each axis, shape [3].
-        first: where each cell's list begins in ``index``, shape [cells + 1]; z runs fastest.
+        first: begin of each cell's list in ``index``, shape [cells + 1]; z runs fastest.
         index: Gaussians, cell by cell.
     """
 
@@ -102,21 +102,15 @@ class Cells:
         """Centres [p, 3] of cells [p]."""
         return self.low_m + (np.stack(np.unravel_index(cell, self.size), axis=-1) + 0.5) * self.width_m
 
-    def listed(self, points_m: FloatArray) -> tuple[IntArray, IntArray]:
-        """Pairs of a point and a Gaussian in the list of the point's cell, for points [p, 3] inside the grid."""
-        place = np.clip((points_m - self.low_m) // self.width_m, 0, self.size - 1).astype(int)
-        cell = np.ravel_multi_index(tuple(place.T), self.size)
-        return _expand(self.first[cell], np.diff(self.first)[cell], self.index)
 
-
-def _expand(start: IntArray, count: IntArray, values: IntArray) -> tuple[IntArray, IntArray]:
-    """For each row, itself repeated, beside ``values[start : start + count]``."""
+def _ranges(start: IntArray, count: IntArray) -> tuple[IntArray, IntArray]:
+    """For each row, its number repeated, and the integers from ``start`` to ``start + count``, concatenated."""
     row = np.repeat(np.arange(len(count)), count)
-    return row, values[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(start, count)]
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(start, count)
 
 
 def make_cells(gaussians: HostGaussians) -> Cells:
-    """The grid over everything within the cut-off."""
+    """The grid over all cut-off ellipsoids."""
     low, high = gaussians.bounds_m()
     reach = CUTOFF * gaussians.deviation_m
     width = float(np.cbrt(np.prod(high - low) / (CELLS_PER_GAUSSIAN * len(reach))))
@@ -128,10 +122,9 @@ def make_cells(gaussians: HostGaussians) -> Cells:
         if size.prod() + count.sum() <= MOST_PAIRS or size.prod() == 1:
             break
         width *= 1.5
-    which = np.repeat(np.arange(len(count)), count)
-    inside = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-    place = np.stack([inside // (span[which, 1] * span[which, 2]), inside // span[which, 2] % span[which, 1]], axis=-1)
-    place = np.concatenate([place, (inside % span[which, 2])[:, None]], axis=-1) + begin[which]
+    which, inside = _ranges(np.zeros_like(count), count)
+    y, z = span[which, 1], span[which, 2]
+    place = np.stack([inside // (y * z), inside // z % y, inside % z], axis=-1) + begin[which]
     middle, half = low + (place + 0.5) * width, 0.5 * width * (1 + MARGIN)
     near = gaussians.squared_distance(which, middle, half) < CUTOFF**2
     cell = np.ravel_multi_index(tuple(place[near].T), size)
@@ -141,27 +134,31 @@ def make_cells(gaussians: HostGaussians) -> Cells:
 
 
 def largest_extinction(gaussians: HostGaussians, cells: Cells) -> float:
-    """An extinction in 1/m that is passed nowhere: at most `TIGHT` times too large, or what `MOST_SPLIT_PAIRS` give.
+    """Upper bound of the extinction, 1/m: at most `TIGHT` times too large, unless `MOST_SPLIT_PAIRS` are visited first.
 
-    Branch and bound: a cell cannot hold more than what each listed Gaussian has where it is nearest to the cell; the
-    one with the largest such sum is split in eight until sums at points come close to it. Every Gaussian is taken in
-    its densest direction, so where thin ones of several orientations meet the bound is loose by up to their number.
+    Branch and bound: the extinction in a cell is at most the sum of each listed Gaussian's at its nearest point of the
+    cell; cells with the largest such sums are split in eight until sums at points come close to it. Every Gaussian is
+    taken in its densest direction: where thin ones of several orientations meet the bound is loose by up to their
+    number.
     """
-    row, which = cells.listed(gaussians.centre_m)
+    at = np.clip((gaussians.centre_m - cells.low_m) // cells.width_m, 0, cells.size - 1).astype(int)
+    home = np.ravel_multi_index(tuple(at.T), cells.size)
+    row, entry = _ranges(cells.first[home], np.diff(cells.first)[home])
+    which = cells.index[entry]
     reached = float(np.bincount(row, gaussians.extinction(which, gaussians.centre_m[row])).max(initial=0.0))
     cell = np.repeat(np.arange(len(cells.first) - 1), np.diff(cells.first))
     start_half = 0.5 * cells.width_m * (1 + MARGIN)
     squared = gaussians.squared_distance(cells.index, cells.middle_m(cell), start_half)
     most = np.bincount(cell, gaussians.peak[cells.index] * np.exp(-0.5 * squared), minlength=len(cells.first) - 1)
     middle = cells.middle_m(np.arange(len(most)))
-    number = itertools.count()  # of the entry, so that equal bounds compare
+    number = itertools.count()  # ties of the heap
     heap = [
         (-most[c], next(number), middle[c], start_half, cells.index[cells.first[c] : cells.first[c + 1]])
         for c in np.flatnonzero(most > TIGHT * reached)
     ]
     heapq.heapify(heap)
-    looked_at = 0
-    while heap and -heap[0][0] > TIGHT * reached and looked_at < MOST_SPLIT_PAIRS:
+    visited = 0
+    while heap and -heap[0][0] > TIGHT * reached and visited < MOST_SPLIT_PAIRS:
         boxes = [heapq.heappop(heap) for _ in range(min(len(heap), SPLIT_PER_CHUNK))]
         # Pairs of a part, eight to a box, and a Gaussian, part by part.
         which = np.concatenate([np.tile(listed, 8) for *_, listed in boxes])
@@ -172,18 +169,18 @@ def largest_extinction(gaussians: HostGaussians, cells: Cells) -> float:
         near = squared < CUTOFF**2
         most = np.bincount(part, np.where(near, gaussians.peak[which] * np.exp(-0.5 * squared), 0), minlength=len(half))
         reached = max(reached, np.bincount(part, gaussians.extinction(which, middle[part])).max(initial=0.0))
-        looked_at += len(which)
-        ends = np.searchsorted(part, np.arange(len(half) + 1))
+        visited += len(which)
+        edges = np.searchsorted(part, np.arange(len(half) + 1))
         for p in np.flatnonzero(most > TIGHT * reached):
-            own = slice(ends[p], ends[p + 1])
-            heapq.heappush(heap, (-most[p], next(number), middle[p], half[p], which[own][near[own]]))
+            pairs = slice(edges[p], edges[p + 1])
+            heapq.heappush(heap, (-most[p], next(number), middle[p], half[p], which[pairs][near[pairs]]))
     bound = max(-heap[0][0] if heap else 0.0, TIGHT * reached)
     return float(bound * (1 + MARGIN))
 
 
 @dataclass
 class CellLists:
-    """A grid of cells on the device, see `Cells`.
+    """A grid of cells on the device (`Cells`).
 
     Attributes:
         low: corner, three arrays [1], metres.
@@ -200,7 +197,7 @@ class CellLists:
     index: Any
 
     def range_at(self, position: list[Any], active: Any) -> tuple[Any, Any]:
-        """Where the lists of the cells at points [p] begin and end in ``index``; an empty range outside the grid."""
+        """Begin and end in ``index`` of the lists of the cells at points [p]; an empty range outside the grid."""
         inside, cell = active, type(self.index)(0)
         for x, low, size in zip(position, self.low, self.size, strict=True):
             place = (x - low) * self.per_m

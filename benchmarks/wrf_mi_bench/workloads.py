@@ -1,0 +1,82 @@
+"""Calls of parts of the package at a given size, for the benchmarks of time and memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from wrf_mi.backend.device import to_float
+from wrf_mi.core import Record
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.models.physics.selection import kind_of
+from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.runs.timing import Call
+from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.step import device_pose
+
+from .traced import random_field, scene_of
+
+HEIGHT, WIDTH = 90, 360
+COVER_DEG2 = 7.0**2 * 270
+"""Squared angular size times number of the default field, so that the overlap is the same at every number."""
+
+
+def size_deg(count: int) -> float:
+    """Angular size of each of ``count`` Gaussians with the overlap of the default field."""
+    return float(np.sqrt(COVER_DEG2 / count))
+
+
+def splatting(gaussians: Any, receiver: Any, height: int = HEIGHT, width: int = WIDTH) -> Call:
+    """Splatting of Gaussians."""
+    pose, plane = device_pose(receiver), perception_plane(height, width, mi.Float)
+    return lambda: splat(gaussians, pose, plane)
+
+
+def integrator(gaussians: Any, receiver: Any) -> Call:
+    """`mi.render` after the geometry changed, Mitsuba's BVH included."""
+    scene = scene_of(gaussians, receiver)
+    params = mi.traverse(scene)
+    data = params["gaussians.data"].numpy().copy()
+
+    def call() -> Any:
+        params["gaussians.data"] = to_float(data)
+        params.update()
+        return mi.render(scene)
+
+    return call
+
+
+def field(count: int, size: float | None = None, opacity: float = 0.4) -> Any:
+    """Random Gaussians and their receiver."""
+    return random_field(0, "alpha", count, size_deg(count) if size is None else size, opacity=opacity)
+
+
+def tracer(options: TraceOptions) -> RayTracer:
+    """Ray tracer of the laboratory for spectra of a 4 x 4 array."""
+    receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
+    instrument = SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
+    return RayTracer("laboratory", instrument, options)
+
+
+def record(rows: int, **more: Any) -> Record:
+    """Random spectra."""
+    observation = np.random.default_rng(0).random((1, rows, HEIGHT, WIDTH)).astype(np.float32)
+    given = {"receivers": (RECEIVER,)} | more
+    return Record("random", "spectrum", transmitter_path(rows), observation=observation, **given)
+
+
+def physics(transmitters: int) -> Call:
+    """Prediction by a physics model without training rows, which evaluates traced paths in NumPy."""
+    receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
+    known = record(1, receivers=receivers, frequencies_hz=np.array([FREQUENCY_HZ]))
+    kind, scene = kind_of(known, True), open_scene("laboratory", FREQUENCY_HZ)
+    model = kind.fit(known, np.zeros(0, np.int64), scene, kind.settings(), 0, lambda what, share: None)
+    tx_pos_m = transmitter_path(transmitters)
+    return lambda: model.predict(tx_pos_m, 0).mean

@@ -1,0 +1,151 @@
+"""``wrf-mi data``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Record
+from ..core.carriers import carriers_text
+from .options import DATASET, Arguments, add_command
+from .output import print_json
+
+SHOWN_CARRIERS = 8
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``data`` and its subcommands to the commands."""
+    data = commands.add_parser("data", help="data sets: list, fetch, info").add_subparsers(
+        required=True, metavar="COMMAND"
+    )
+    add_command(data, "list", list_command, "list known data sets and their folders")
+    parser = add_command(data, "fetch", fetch_command, "download a data set, checked by SHA-256", json_output=False)
+    parser.add_argument("name", metavar="NAME", help="name of a data set")
+    parser = add_command(data, "info", info_command, "read and check a data set, and summarise its content")
+    parser.add_argument("dataset", metavar="DATASET", help=DATASET)
+
+
+def list_command(a: Arguments) -> int:
+    """List known data sets."""
+    from ..datasets import datasets
+
+    rows = [
+        {name: getattr(entry.dataset, name) for name in ("name", "task", "licence", "origin")}
+        | {"location": str(entry.location) if entry.location else None}
+        for entry in datasets()
+    ]
+    if a.json:
+        print_json(rows)
+        return 0
+    for row in rows:
+        print(f"{row['name']:<19}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
+        print(f"{'':<19}{row['origin']}")
+    return 0
+
+
+def fetch_command(a: Arguments) -> int:
+    """Download or generate a data set."""
+    from ..datasets import fetch
+    from ..datasets.registry import known
+    from ..synthetic import load_record
+
+    dataset = known(a.name)
+    synthetic = dataset.base_url is None
+    print(f"{a.name}: {load_record(a.name, progress=True).source if synthetic else fetch(a.name)}")
+    if synthetic and dataset.note:
+        print(f"{a.name}: {dataset.note}", file=sys.stderr)
+    return 0
+
+
+def info_command(a: Arguments) -> int:
+    """Summarise a data set."""
+    from ..synthetic import load_record
+
+    found = summary(load_record(a.dataset, progress=True))
+    if a.json:
+        print_json(found)
+    else:
+        print(render(found))
+    return 0
+
+
+def summary(record: Record) -> dict[str, Any]:
+    """Summary of a record in plain values; None: not stated.
+
+    ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
+    training and test rows, ``frequencies_hz`` the carrier or the subcarriers, ``carriers_hz`` rows by carrier,
+    ``n_readings`` and ``std_db`` minimum, median and maximum.
+
+    Raises:
+        InputError: parts of the record that do not fit together.
+    """
+    from ..models.checks import check_parts
+
+    check_parts(record)
+    seen = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
+    carriers = None
+    if record.carriers_hz is not None:
+        hz, rows = np.unique(record.carriers_hz, return_counts=True)
+        carriers = dict(zip(hz.tolist(), rows.tolist(), strict=True))
+    return {
+        "name": record.name,
+        "task": record.task,
+        "source": record.source,
+        "rows": len(record),
+        "receivers": {r.name: int(count) for r, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
+        "observation": list(record.observation.shape[2:]),
+        "official": None if record.official is None else [len(part) for part in record.official],
+        "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
+        "carriers_hz": carriers,
+        "n_readings": _range(record.n_readings, seen),
+        "std_db": _range(record.std, seen),
+        "positions": record.has_positions,
+        "headings": record.tx_heading_rad is not None,
+        "uplink": record.uplink is not None,
+        "truth": record.truth is not None,
+    }
+
+
+def render(found: dict[str, Any]) -> str:
+    """`summary` as text."""
+    shape = " x ".join(map(str, found["observation"])) or "one number"
+    received = ", ".join(f"{name} {count}" for name, count in found["receivers"].items())
+    official = (
+        "not stated" if found["official"] is None else "{} training rows, {} test rows".format(*found["official"])
+    )
+    carriers, frequencies = found["carriers_hz"], found["frequencies_hz"]
+    if carriers is not None:
+        carrier = carriers_text(np.array(list(carriers)))
+        if len(carriers) <= SHOWN_CARRIERS:
+            carrier = ", ".join(f"{hz:.10g} Hz in {rows} rows" for hz, rows in carriers.items())
+    elif frequencies is None:
+        carrier = "not stated"
+    else:
+        band = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
+        carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else band
+    known = [name for name in ("positions", "headings", "uplink", "truth") if found[name]]
+    lines = {
+        "data set": f"{found['name']}, {found['task']}, {found['source']}",
+        "rows": f"{found['rows']}, each {shape}",
+        "received": received,
+        "official split": official,
+        "carrier": carrier,
+        "readings per row": _shown(found["n_readings"], ""),
+        "noise": _shown(found["std_db"], " dB"),
+        "known": ", ".join(known) or "observations alone",
+    }
+    return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
+
+
+def _range(values: NDArray[Any] | None, seen: NDArray[np.bool_]) -> list[float] | None:
+    """Minimum, median and maximum where something was received."""
+    if values is None or not seen.any():
+        return None
+    return [float(value) for value in np.percentile(values[seen], [0, 50, 100])]
+
+
+def _shown(values: list[float] | None, unit: str) -> str:
+    return "not stated" if values is None else f"{values[0]:g} to {values[2]:g}{unit}, median {values[1]:g}{unit}"

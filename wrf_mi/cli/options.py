@@ -1,0 +1,103 @@
+"""Parser of the command line, and the options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any, NoReturn, get_args
+
+from ..core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
+from ..graph.settings import EvaluationName
+from ..models import MODELS
+
+Arguments = argparse.Namespace
+
+DATASET = "name of a data set (`wrf-mi data list`) or a folder"
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser that reports an error in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """End the process with status 2."""
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def add_command(
+    commands: Any, name: str, call: Callable[[Arguments], int], text: str, json_output: bool = True
+) -> argparse.ArgumentParser:
+    """Add a command; ``call`` takes its parsed arguments and returns the exit status."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(call=call)
+    if json_output:
+        parser.add_argument("--json", action="store_true", help="print figures as JSON")
+    return parser
+
+
+def add_training(parser: argparse.ArgumentParser) -> None:
+    """Add data set, model, split and settings."""
+    add = parser.add_argument
+    add("dataset", nargs="?", metavar="DATASET", help=DATASET)
+    add("--model", choices=list(MODELS), help="model to fit (default: wrf-gs+); baselines: docs/baselines.md")
+    text = "scene to trace: jointly with wrf-gs, wrf-gs+ or factorised, for physics, or alone for ray-tracing"
+    add("--scene", metavar="SCENE", help=text)
+    text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
+    add("--receiver", metavar="NAME", help=text)
+    text = "of Gaussians: splatted (default) or traced by the Mitsuba plugins, through the walls of a scene (slower)"
+    add("--evaluation", choices=get_args(EvaluationName), help=f"evaluation {text}")
+    add_tracing(parser)
+    add("--split", help="official (default), random, blocked (every fold in turn), blocked:K, or trajectory")
+    add_n_train(parser)
+    add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
+    add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
+    add("--preset", choices=("default", "paper", "quick"), help="named set of settings")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
+
+
+def add_tracing(parser: argparse.ArgumentParser) -> None:
+    """Add options of ray tracing and antennas."""
+    add = parser.add_argument
+    add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
+    kinds = "line-of-sight,reflection,transmission,diffraction,scattering"
+    add("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
+    add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
+    add("--reflections", type=int, metavar="N", help="largest number of reflections among these (default: all)")
+    fit = "parameters to train on the training rows, separated by commas: gain, materials, planes, patterns, pose"
+    add("--calibrate", metavar="LIST", help=fit)
+    add("--rays", metavar="N", help="number of rays from each source, or auto: until no more paths are found")
+    default = "overrides the data set, whose default is"
+    add("--rx-pattern", choices=PATTERNS, help=f"pattern of the receivers' antennas; {default} iso")
+    text = f"polarisation of the receivers' antennas; {default} V, vertical in --rx-frame"
+    add("--rx-polarization", choices=POLARIZATIONS, help=text)
+    text = f"frame of pattern and polarisation, the world's or the array's; {default} world"
+    add("--rx-frame", choices=FRAMES, help=text)
+    add("--tx-pattern", choices=OMNIDIRECTIONAL, help="pattern of the transmitter's antenna")
+    add("--tx-polarization", choices=POLARIZATIONS, help="polarisation of the transmitter's antenna")
+
+
+def add_n_train(parser: argparse.ArgumentParser) -> None:
+    """Add ``--n-train``."""
+    parser.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
+
+
+def add_scheduler(parser: argparse.ArgumentParser) -> None:
+    """Add ``--scheduler``."""
+    text = "workers: local, local:N (on this machine) or the address of a Dask scheduler, tcp://HOST:PORT"
+    parser.add_argument("--scheduler", metavar="WHERE", help=text)
+
+
+def add_operator(parser: argparse.ArgumentParser) -> None:
+    """Add ``--no-operator``."""
+    text = "splat each spectrum, also where geometry is static and one linear operator would do (docs/speed.md)"
+    parser.add_argument("--no-operator", action="store_true", help=text)
+
+
+def _number(text: str) -> int | float:
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None

@@ -1,0 +1,113 @@
+"""Output of the command: figures on standard output, progress on standard error, and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+if TYPE_CHECKING:
+    from ..training.loop import Progress as FitProgress
+
+
+def print_json(value: Any) -> None:
+    """Print figures for programs."""
+    print(json.dumps(value, indent=1, default=str))
+
+
+def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -> int:
+    """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
+    if as_json:
+        print_json(metrics)
+        return 0
+    from ..tasks import TASKS
+
+    task = TASKS[metrics["task"]]
+    title = f"{task.label} on {metrics['n_test']} test rows"
+    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
+    references = metrics["reference"]
+    named = [(metrics["model"], metrics[task.block])]
+    named += [(f"{words} ({key})", references[key]) for key, words in task.references.items() if key in references]
+    for name, block in named:
+        print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    if metrics.get("n_not_scored"):
+        print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
+    if "inside_90" in metrics:
+        print(f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals")
+    print(
+        f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
+        f"{metrics['ms_per_sample']:.2g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
+    )
+    if folder is not None:
+        print(f"results: {folder}")
+    return 0
+
+
+class Watch:
+    """Progress of a fit on standard error (plain lines where it is no terminal), and a stop on Ctrl-C.
+
+    The first Ctrl-C lets the current step finish and writes a checkpoint; a second one ends at once.
+    """
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console
+        )
+        self._task: Any = None
+        self._stage: str | None = None
+        self._score = ""
+        self._stop = False
+
+    def __enter__(self) -> Watch:
+        """Handle Ctrl-C."""
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Restore the handler of Ctrl-C and stop the bar."""
+        if self._console.is_terminal:
+            self._bar.stop()
+        signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._stop:
+            raise KeyboardInterrupt
+        self._stop = True
+        print("stopping after this step; Ctrl-C again ends at once", file=sys.stderr)
+
+    def stop(self) -> bool:
+        """Whether Ctrl-C was pressed."""
+        return self._stop
+
+    def on_progress(self, stage: str, fraction: float, progress: FitProgress | None = None) -> None:
+        """Show the fraction (0 to 1) of a stage that is done, and loss and score of a training."""
+        new = stage != self._stage
+        if new:
+            self._stage, self._task, self._score = stage, None, ""
+        text = "" if progress is None else self._text(progress)
+        if self._console.is_terminal:
+            if self._task is None:
+                self._bar.start()  # not before: the tracer has a bar of its own
+                self._task = self._bar.add_task(stage, total=1.0, text=text)
+            self._bar.update(self._task, completed=fraction, text=text)
+        elif progress is not None and progress.validation_score is not None:
+            steps = round(progress.step / fraction)
+            print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
+        elif progress is None and new:
+            print(stage, file=sys.stderr, flush=True)
+
+    def _text(self, p: FitProgress) -> str:
+        if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
+            rows = "validation rows" if p.held_out else "validation rows, now trained on"
+            self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
+        gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
+        minutes, seconds = divmod(int(p.left_s), 60)
+        return f"loss {p.loss:.4f}  {self._score}  {gaussians}{minutes}:{seconds:02d} left"

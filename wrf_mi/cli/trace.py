@@ -1,0 +1,34 @@
+"""``wrf-mi trace``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .options import DATASET, Arguments, add_command, add_n_train, add_scheduler, add_tracing
+from .train import RAY_TRACING, run_training
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``trace`` to the commands."""
+    text = "predict by ray tracing and score it like a learned field"
+    parser = add_command(commands, "trace", trace_command, text)
+    parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[], deterministic=False)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
+    add("dataset", metavar="DATASET", help=DATASET)
+    add("--out", metavar="RUN", required=True, help="run folder to make")
+    add_tracing(parser)
+    target = "choose depth, rays, diffraction and scattering until power and spectra are converged to DB decibels"
+    add("--target-error", type=float, metavar="DB", help=target)
+    add("--split", help="as for train (default: official)")
+    add_n_train(parser)
+    add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
+    add_scheduler(parser)
+
+
+def trace_command(a: Arguments) -> int:
+    """Predict by ray tracing alone."""
+    from ..parallel import open_scheduler
+
+    with open_scheduler(a.scheduler) as scheduler:
+        return run_training(a, scheduler=scheduler if a.scheduler else None)
