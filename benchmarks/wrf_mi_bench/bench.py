@@ -22,7 +22,7 @@ import yaml
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
-from wrf_mi.parallel import Scheduler, SerialScheduler, run_module, worker_threads
+from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.fit_key import dataset_files, fit_key
 from wrf_mi.runs.folder import CONFIG, METRICS, versions
 
@@ -178,7 +178,7 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
 
     if scheduler is not None:
         print(SHARED_NOTE, file=sys.stderr)
-    rows = (scheduler or SerialScheduler()).map(partial(_case, runs), names, what="measuring", each=each)
+    rows = (scheduler or Scheduler()).map(partial(_case, runs), names, what="measuring", each=each)
     trained, checked = read_results(out)
     parts = ["# Figures", f"Written by `wrf-mi bench`. {NOTE}", table(trained), CHECK_NOTE, check_table(checked)]
     write_atomically(out / "README.md", "\n\n".join(parts) + "\n")

@@ -14,8 +14,7 @@ from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.physics.spectrum_loss import Grid
-from wrf_mi.tasks.losses import absolute_error
-from wrf_mi.tasks.spectrum_loss import SSIM_WEIGHT, spectrum_loss
+from wrf_mi.tasks.losses import SSIM_WEIGHT, absolute_error, spectrum_loss
 
 from .stress_fields import SIZE, Rng
 from .stress_rows import DOUBLE, EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst

@@ -155,7 +155,7 @@ def _step(job: Job, work: Path) -> Arrays:
     from wrf_mi.datasets import make_splits
     from wrf_mi.gaussians.tiles import perception_plane
     from wrf_mi.synthetic import load_record
-    from wrf_mi.tasks.spectrum_loss import spectrum_loss
+    from wrf_mi.tasks.losses import spectrum_loss
     from wrf_mi.training.config import TrainConfig
     from wrf_mi.training.step import TrainingData, device_pose, grey
     from wrf_mi.training.trainer import Trainer

@@ -24,7 +24,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import atomic_folder, one_line, write_atomically
-from wrf_mi.parallel import Scheduler, SerialScheduler
+from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.fit_key import content_digest, dataset_files, fit_key, scene_files
 from wrf_mi.runs.folder import CONFIG, METRICS, package_versions, versions
 from wrf_mi.runs.results import read_run
@@ -167,7 +167,7 @@ def tables(
         with suppress(InputError):
             _scene(part, runs / place.name)
     call = partial(_guarded, runs / place.name, None if most_s is None else time.time() + most_s)
-    (scheduler or SerialScheduler()).map(call, left, what="measuring", each=each)
+    (scheduler or Scheduler()).map(call, left, what="measuring", each=each)
     write_tables(place, quick)
     print(f"tables: {place / 'README.md'} after {(time.perf_counter() - begun) / 60:.0f} min", file=sys.stderr)
     if failures:

@@ -95,7 +95,7 @@ def test_version_from_file_name(name: str, version: tuple[int, ...] | None) -> N
 
 
 @given(st.integers(3, 99), st.integers(0, 9), st.integers(0, 99))
-def test_every_version_survives_a_file_name(major: int, minor: int, patch: int) -> None:
+def test_version_round_trips_through_a_file_name(major: int, minor: int, patch: int) -> None:
     assert libraries.version_from_name(f"libLLVM-{major}.{minor}.{patch}.so") == (major, minor, patch)
     assert libraries.version_from_name(f"libLLVM.so.{major}.{minor}") == (major, minor)
 
@@ -140,7 +140,7 @@ def test_newest_good_library_is_chosen(only, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("major", [14, 15, 16])
-def test_old_llvm_is_refused_unseen(only, major: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_llvm_is_refused_without_a_trial(only, major: int, monkeypatch: pytest.MonkeyPatch) -> None:
     only(f"libLLVM-{major}.so.1")
     monkeypatch.setattr(probe, "_run_trial", lambda *arguments: pytest.fail("an old LLVM was loaded"))
     with pytest.raises(BackendError, match=rf"LLVM {major} .* is too old .*: .*install") as caught:
@@ -154,7 +154,7 @@ def test_no_llvm_at_all(only) -> None:
         backend.choose("llvm")
 
 
-def test_a_file_that_is_no_library_is_refused(only) -> None:
+def test_invalid_library_is_refused(only) -> None:
     only("libLLVM.so.19.1")
     with pytest.raises(BackendError, match=r"LLVM 19\.1 .* fails") as caught:
         backend.choose("llvm")
@@ -169,7 +169,7 @@ def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch: p
         backend.choose("llvm")
 
 
-def test_a_trial_in_its_own_process_finds_what_aborts() -> None:
+def test_trial_reports_an_abort() -> None:
     verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
     assert final
     assert not verdict.usable
@@ -178,7 +178,7 @@ def test_a_trial_in_its_own_process_finds_what_aborts() -> None:
     assert "0x" not in verdict.reason
 
 
-def test_verdicts_are_remembered_until_the_file_changes(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.MonkeyPatch) -> None:
     file = only("libLLVM.so.19.1") / "libLLVM.so.19.1"
     trials = []
 
@@ -197,14 +197,14 @@ def test_verdicts_are_remembered_until_the_file_changes(only, monkeypatch: pytes
     assert len(trials) == 3
 
 
-def test_a_failure_is_forgotten_after_its_time() -> None:
+def test_cached_failures_expire() -> None:
     cache.remember("short", {"usable": False}, seconds=-1)
     cache.remember("long", {"usable": True})
     assert cache.recall("short") is None
     assert cache.recall("long") == {"usable": True}
 
 
-def test_a_damaged_cache_is_an_empty_one() -> None:
+def test_damaged_cache_counts_as_empty() -> None:
     cache.remember("key", {"usable": True})
     cache.cache_file().write_text('{"key": {"usa')
     assert cache.recall("key") is None
@@ -212,14 +212,14 @@ def test_a_damaged_cache_is_an_empty_one() -> None:
     assert cache.recall("key") == {"usable": True}
 
 
-def test_a_cache_that_cannot_be_written_only_costs_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_cache_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "file" / "libraries.json")
     cache.remember("key", {"usable": True})
     assert cache.recall("key") is None
 
 
-def test_choice_is_quick_once_remembered() -> None:
+def test_choice_is_fast_once_cached() -> None:
     backend.choose()
     seconds = []
     for _ in range(5):

@@ -50,7 +50,7 @@ def test_values_are_copied(size: int, kind: Any) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_there_is_room_behind_what_is_wrapped(size: int) -> None:
+def test_wrapped_arrays_are_padded_by_a_packet(size: int) -> None:
     room = with_room(np.ones(size), np.float32)
     assert room.base is not None
     assert room.base.size == size + PACKET
@@ -65,7 +65,7 @@ def test_shapes_and_columns() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="protects a page by Linux's C library")
-def test_nothing_beyond_the_end_is_read() -> None:
+def test_device_copies_read_within_bounds() -> None:
     done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, ["0.0", "1.0", "2.0", "3.0", "4.0"]), done.stderr
 
@@ -80,7 +80,7 @@ def wraps(code: str) -> bool:
     return bool(ARRAYS.match(code) and NUMPY.search(code)) and ".tolist()" not in code
 
 
-def test_numpy_comes_in_by_one_way() -> None:
+def test_only_the_device_module_wraps_numpy() -> None:
     assert wraps("mi.Float(x.astype(np.float32))")
     assert not wraps("mi.UInt32(np.asarray(rows).tolist())")
     found = []

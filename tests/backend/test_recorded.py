@@ -33,7 +33,7 @@ def always(call: Callable[[], Any]) -> None:
         np.testing.assert_array_equal(call().numpy(), TERMS / SUMS)
 
 
-def test_more_threads_record_anew() -> None:
+def test_functions_are_recorded_again_for_more_threads() -> None:
     recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
     set_threads(1)
     always(lambda: recorded(one))
@@ -47,7 +47,7 @@ def test_more_threads_record_anew() -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
-def test_waiting_sums_are_computed_first(before: int, after: int) -> None:
+def test_pending_sums_are_evaluated_before_threads_change(before: int, after: int) -> None:
     def waited() -> Any:
         set_threads(before)
         found = sums(mi.Float(1))

@@ -79,7 +79,7 @@ def test_models_of_several_carriers_are_named(flat: Record) -> None:
         plan_run(flat, "wrf-gs+")
 
 
-def test_carriers_that_do_not_fit_are_refused(flat: Record) -> None:
+def test_inconsistent_carriers_are_refused(flat: Record) -> None:
     for change, message in (
         ({"carriers_hz": np.ones(3)}, r"carriers_hz \[3\]; give 30 positive"),
         ({"carriers_hz": np.zeros(len(flat))}, r"carriers_hz \[30\]; give 30 positive"),
@@ -93,7 +93,7 @@ def test_carriers_that_do_not_fit_are_refused(flat: Record) -> None:
 
 
 @pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
-def test_each_carrier_is_interpolated_by_itself(name: str, flat: Record, tmp_path: Path) -> None:
+def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path: Path) -> None:
     settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
     run = train(flat, tmp_path / "run", name, settings=settings)
     read = read_run(run.folder)
@@ -111,7 +111,7 @@ def test_each_carrier_is_interpolated_by_itself(name: str, flat: Record, tmp_pat
     np.testing.assert_array_equal(found.astype(np.float32), read.prediction[1])
 
 
-def test_carriers_are_asked_for_where_there_are_several(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
+def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
     run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
     with pytest.raises(
         InputError, match=r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position"
@@ -162,7 +162,7 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
-def test_rays_alone_bring_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:
+def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:
     run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(reflection=False, max_depth=0))
     rx = np.stack([receiver.position_m for receiver in flat.receivers])
     distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
@@ -185,7 +185,7 @@ def spectra_of(record: Record) -> Record:
 
 
 @pytest.mark.parametrize("make", [lambda record: record, spectra_of])
-def test_reflections_are_those_of_a_trace_at_the_rows_carrier(
+def test_reflections_equal_a_trace_at_the_rows_carrier(
     make: Callable[[Record], Record], flat: Record, room: Path, tmp_path: Path
 ) -> None:
     record = make(flat)
@@ -226,19 +226,19 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("setting", ["calibration=gain", "target_error_db=1"])
-def test_what_serves_one_carrier_alone_is_refused(setting: str, flat: Record, room: Path, tmp_path: Path) -> None:
+def test_calibration_and_target_error_refuse_carriers(setting: str, flat: Record, room: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"rows at 2 carriers, .* calibration and target_error_db serve one carrier"):
         train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=[setting])
 
 
-def test_a_material_that_is_unknown_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:
+def test_unknown_material_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:
     far = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
     with pytest.raises(InputError, match=r"not known at 0\.1 GHz"):
         train(far, tmp_path / "run", "ray-tracing", scene=room)
     assert not (tmp_path / "run").exists()
 
 
-def test_the_reference_blends_rows_of_one_carrier(flat: Record) -> None:
+def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
     assert flat.official is not None
     known, rows = flat.official
     key = TASKS["rssi"].reference
@@ -248,7 +248,7 @@ def test_the_reference_blends_rows_of_one_carrier(flat: Record) -> None:
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 
-def test_the_command_shows_carriers_readings_and_noise(
+def test_data_command_shows_carriers_readings_and_noise(
     flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shape = flat.observation.shape
@@ -270,7 +270,7 @@ def test_the_command_shows_carriers_readings_and_noise(
     assert (status, err.count("\n")) == (2, 1)
 
 
-def test_the_command_shows_what_channels_are_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_command_shows_carriers_of_channels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_nerf2_csi(tmp_path / "stations", channels())
     status, out, _ = call(["data", "info", folder], capsys)
     assert status == 0

@@ -27,9 +27,9 @@ ROUNDING = 1e-9
 """Float64 through some tens of operations; pixels on the edge of a footprint may fall to either side."""
 SIZE = (20, 40)
 FIELDS = st.builds(
-    lambda seed, count: made(count, np.random.default_rng(seed)), st.integers(0, 10**6), st.integers(1, 40)
+    lambda seed, count: made(count, np.random.default_rng(seed)), st.integers(0, 10**6), st.sampled_from([1, 8, 40])
 )
-FEW = settings(max_examples=12, deadline=None)
+FEW = settings(max_examples=8, deadline=None)
 
 
 def render(field: Field, blending: str, receiver: Receiver = RECEIVER) -> np.ndarray:
@@ -62,7 +62,7 @@ def turned(receiver: Receiver, by: Rotation, origin: np.ndarray) -> Receiver:
 
 @FEW
 @given(FIELDS, st.sampled_from(BLENDINGS), st.integers(0, 10**6))
-def test_the_world_may_be_turned_and_moved(field: Field, blending: str, seed: int) -> None:
+def test_splat_is_invariant_to_rigid_motion_of_the_world(field: Field, blending: str, seed: int) -> None:
     by, origin = Rotation.random(rng=np.random.default_rng(seed)), np.random.default_rng(seed).normal(size=3)
     moved = replace(
         field,
@@ -74,7 +74,7 @@ def test_the_world_may_be_turned_and_moved(field: Field, blending: str, seed: in
 
 @FEW
 @given(FIELDS, st.sampled_from(BLENDINGS), st.integers(-40, 40))
-def test_a_turn_of_the_receiver_shifts_azimuths(field: Field, blending: str, columns: int) -> None:
+def test_rotation_of_the_receiver_about_its_normal_shifts_azimuths(field: Field, blending: str, columns: int) -> None:
     spin = Rotation.from_rotvec([0, 0, 2 * np.pi * columns / SIZE[1]])
     own = Rotation.from_quat(RECEIVER.orientation_xyzw) * spin
     shifted = render(field, blending, replace(RECEIVER, orientation_xyzw=own.as_quat()))
@@ -83,7 +83,7 @@ def test_a_turn_of_the_receiver_shifts_azimuths(field: Field, blending: str, col
 
 @FEW
 @given(FIELDS, st.sampled_from(BLENDINGS), st.randoms(use_true_random=False))
-def test_gaussians_may_be_stored_in_any_order(field: Field, blending: str, random: Any) -> None:
+def test_splat_is_invariant_to_the_order_of_gaussians(field: Field, blending: str, random: Any) -> None:
     order = list(range(len(field.signal)))
     random.shuffle(order)
     mixed = Field(**{name: getattr(field, name)[order] for name in Field.__dataclass_fields__})
@@ -100,7 +100,9 @@ def test_images_are_linear_in_signals(field: Field, blending: str, factor: compl
 
 @FEW
 @given(st.integers(0, 10**6), st.randoms(use_true_random=False), st.floats(0.1, 10))
-def test_elements_may_be_stored_in_any_order_and_power_scales(seed: int, random: Any, amplitude: float) -> None:
+def test_bartlett_spectrum_ignores_order_of_elements_and_scales_with_power(
+    seed: int, random: Any, amplitude: float
+) -> None:
     rng = np.random.default_rng(seed)
     elements, direction = planar_array(4, 4, 0.16), rng.normal(size=3)
     h = array_response(elements, direction / np.linalg.norm(direction), 920e6) + 0.1 * rng.normal(size=16)
@@ -114,7 +116,7 @@ def test_elements_may_be_stored_in_any_order_and_power_scales(seed: int, random:
 
 @FEW
 @given(FIELDS, st.floats(0.05, 0.95))
-def test_optical_depth_may_be_split(field: Field, share: float) -> None:
+def test_optical_depth_of_coincident_gaussians_adds(field: Field, share: float) -> None:
     """Two Gaussians in one place, whose transmittances multiply to that of one."""
     opaque = np.clip(field.opacity, 0, 0.999)
     parts = [1 - (1 - opaque) ** share, 1 - (1 - opaque) ** (1 - share)]

@@ -36,8 +36,8 @@ def test_unknown_receivers_are_refused_in_one_line_with_the_names(receiver: Any)
     assert "\n" not in str(error.value)
 
 
-def test_a_name_of_several_is_refused_and_long_lists_are_cut() -> None:
-    with pytest.raises(InputError, match=r"'1': name of several; give one's number, of 1, 4$"):
+def test_ambiguous_names_are_refused_and_long_lists_are_cut() -> None:
+    with pytest.raises(InputError, match=r"'1': name of several; give a number, of 1, 4$"):
         receiver_index([*MADE, MADE[1]], "1")
     with pytest.raises(InputError, match=r"1, kitchen, \.\.\., or its number from 0 to 39$"):
         receiver_index(MADE[::-1] * 10, "sensor10")

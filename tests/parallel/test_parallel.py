@@ -18,8 +18,8 @@ from worker_tasks import Lossy
 from wrf_mi.backend import init
 from wrf_mi.core import InputError
 from wrf_mi.parallel import Scheduler, SchedulerFailed, open_scheduler, row_parts, run_module, scheduler, worker
-from wrf_mi.parallel.progress import Parts
-from wrf_mi.parallel.worker import this_place
+from wrf_mi.parallel.scheduler import PartsProgress
+from wrf_mi.parallel.worker import WorkerEnvironment, worker_environment
 
 SECONDS = 60
 """For a process of ours to start on a busy machine."""
@@ -40,31 +40,31 @@ def test_parts_cover_all_rows_once(count: int, workers: int, least: int, most: i
     assert all(least <= size <= most for size in sizes[:-1])
 
 
-def test_large_parts_are_cut_and_small_ones_shared() -> None:
+def test_row_parts_respect_maximum_size_and_number_of_workers() -> None:
     assert len(row_parts(100_000, 1, 1, 1000)) == 100
     assert len(row_parts(80, 2)) == 16
 
 
-def test_results_come_in_order_and_once(two: Scheduler, capsys: pytest.CaptureFixture[str]) -> None:
-    heard: list[tuple[int, int]] = []
+def test_map_returns_results_in_order_and_calls_each_once(two: Scheduler, capsys: pytest.CaptureFixture[str]) -> None:
+    received: list[tuple[int, int]] = []
     assert two.map(worker_tasks.double, range(20), what="doubling") == list(range(0, 40, 2))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 10
     assert lines[-1] == "doubling: 20 of 20, 2 workers"
-    assert two.map(worker_tasks.double, range(5), each=lambda *one: heard.append(one)) == [0, 2, 4, 6, 8]
-    assert sorted(heard) == [(k, 2 * k) for k in range(5)]
+    assert two.map(worker_tasks.double, range(5), each=lambda *one: received.append(one)) == [0, 2, 4, 6, 8]
+    assert sorted(received) == [(k, 2 * k) for k in range(5)]
     assert two.map(worker_tasks.double, []) == []
 
 
-def test_serial_is_the_same_in_this_process() -> None:
-    heard: list[tuple[int, int]] = []
+def test_scheduler_without_workers_computes_in_this_process() -> None:
+    received: list[tuple[int, int]] = []
     with open_scheduler(None) as serial:
-        assert serial.map(worker_tasks.double, [3, 1], each=lambda *one: heard.append(one)) == [6, 2]
+        assert serial.map(worker_tasks.double, [3, 1], each=lambda *one: received.append(one)) == [6, 2]
         assert serial.map(pow, [2, 3], lambda: 2) == [4, 8]
-    assert heard == [(0, 6), (1, 2)]
+    assert received == [(0, 6), (1, 2)]
 
 
-def test_workers_stand_where_the_client_does_and_open_once(
+def test_workers_adopt_folder_variables_and_backend_and_open_once(
     two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -77,19 +77,19 @@ def test_workers_stand_where_the_client_does_and_open_once(
     assert len(list(tmp_path.glob("opened-*"))) == len(processes)
 
 
-def test_lost_worker_loses_nothing(two: Scheduler, tmp_path: Path) -> None:
+def test_parts_of_a_lost_worker_are_computed_by_another(two: Scheduler, tmp_path: Path) -> None:
     lossy = Lossy(two, tmp_path)
     assert lossy.map(worker_tasks.double, range(9)) == list(range(0, 18, 2))
     lossy.assert_one_was_lost()
 
 
-def test_part_that_kills_every_worker_is_given_up(two: Scheduler) -> None:
+def test_part_that_ends_four_workers_fails(two: Scheduler) -> None:
     with pytest.raises(SchedulerFailed, match="computing: 4 workers in a row ended in one part"):
         two.map(worker_tasks.die, [0])
     assert two.map(worker_tasks.double, [1]) == [2]
 
 
-def test_errors_of_parts_are_raised_as_they_are(two: Scheduler) -> None:
+def test_errors_of_parts_are_raised_unchanged(two: Scheduler) -> None:
     with pytest.raises(InputError, match=r"^part -1: negative; give another$"):
         two.map(worker_tasks.refuse_negative, [1, 2, -1, 3])
     with pytest.raises(ZeroDivisionError, match="no such number"):
@@ -100,17 +100,17 @@ def test_errors_of_parts_are_raised_as_they_are(two: Scheduler) -> None:
 def test_other_versions_and_folders_are_refused(
     two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = this_place()
+    environment = worker_environment()
     monkeypatch.chdir(tmp_path)  # is put back after the worker's own change of folder
-    other = worker.Place(place.folder, (), place.backend, (("drjit", "0.1"),))
+    other = WorkerEnvironment(environment.folder, (), environment.backend, (("drjit", "0.1"),))
     with pytest.raises(InputError, match=r"drjit 1\.5\.0, but 0\.1 where the command runs; install the same"):
         worker.run_part(other, "", None, worker_tasks.double, 1)
-    gone = worker.Place(str(tmp_path / "gone"), (), place.backend, place.versions)
+    gone = WorkerEnvironment(str(tmp_path / "gone"), (), environment.backend, environment.versions)
     with pytest.raises(InputError, match=r"cannot enter .*gone .*run the command in a folder that workers see"):
         worker.run_part(gone, "", None, worker_tasks.double, 1)
 
 
-def test_where_it_cannot_compute_is_said_in_one_line(
+def test_invalid_scheduler_ends_with_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scheduler, "CONNECT_S", 0.2)
@@ -129,11 +129,11 @@ def test_where_it_cannot_compute_is_said_in_one_line(
     assert not (tmp_path / "p.npz").exists()
 
 
-def test_waiting_for_a_worker_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with Parts("tracing", 2, lines=True) as bar:
+def test_waiting_for_a_worker_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with PartsProgress("tracing", 2, lines=True) as bar:
         bar.waiting()
         bar.waiting()
-        bar.advance(1, 1)
+        bar.add(1, 1)
     assert capsys.readouterr().err.splitlines() == [
         "tracing: waiting for a worker to connect to the scheduler",
         "tracing: 1 of 2, 1 worker",

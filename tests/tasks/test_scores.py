@@ -25,7 +25,7 @@ PUBLISHED = 0.0005
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 3, 0], [50, 50, 0]], float)
 
 
-def test_blend_by_hand():
+def test_idw_equals_values_by_hand():
     values = np.array([[1.0, 10], [2, 20], [3, 30], [1e9, 1e9]])
     # Distances from (0.5, 0, 0): 0.5, 0.5, sqrt(9.25); weights 4, 4, 1 / 9.25.
     expected = (4 * 1 + 4 * 2 + 3 / 9.25) / (8 + 1 / 9.25)
@@ -35,7 +35,7 @@ def test_blend_by_hand():
     assert InverseDistance(k=3, power=1).fit(SQUARE, values).predict([[0.5, 0, 0]])[0, 0] == pytest.approx(expected)
 
 
-def test_training_positions_give_their_own_value_and_twins_their_mean():
+def test_idw_interpolates_training_values_and_averages_duplicates():
     positions = np.concatenate([SQUARE, SQUARE[:1]])
     values = np.array([1.0, 2, 3, 4, 5])
     blend = InverseDistance().fit(positions, values).predict(SQUARE)
@@ -56,7 +56,7 @@ def test_tiny_distances_do_not_overflow():
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 6), st.floats(0.5, 4), st.integers(0, 2**32 - 1))
-def test_blend_lies_within_the_values_and_ignores_row_order_and_origin(n, k, power, seed):
+def test_idw_lies_within_the_values_and_ignores_row_order_and_origin(n, k, power, seed):
     rng = np.random.default_rng(seed)
     positions, values, asked = rng.standard_normal((n, 3)), rng.standard_normal(n), rng.standard_normal((5, 3))
     blend = InverseDistance(k, power).fit(positions, values).predict(asked)
@@ -67,14 +67,14 @@ def test_blend_lies_within_the_values_and_ignores_row_order_and_origin(n, k, pow
     assert other == pytest.approx(blend, abs=1e-9)  # adding one rounds the positions
 
 
-def test_softening_evens_out_rows_that_are_near():
+def test_softening_equalises_near_rows():
     # Distances from the first position: 0, 1, 3 and far away; one metre is added to each.
     blend = InverseDistance(k=3, softening_m=1).fit(SQUARE, [1.0, 2, 3, 4]).predict(SQUARE[:1])
     weights = np.array([1, 1 / 2, 1 / 4]) ** 2
     assert blend == pytest.approx([weights @ [1, 2, 3] / weights.sum()], rel=EXACT)
 
 
-def test_rows_that_were_not_received_are_no_neighbours():
+def test_missing_observations_are_no_neighbours():
     values = np.array([np.nan, 2.0, 3, 4])
     blend = InverseDistance(k=2).fit(SQUARE, values).predict(SQUARE[:1])
     assert blend == pytest.approx([(2 + 3 / 9) / (1 + 1 / 9)], rel=EXACT)
@@ -93,7 +93,7 @@ def test_bad_arguments_are_refused():
         InverseDistance().fit(np.zeros((0, 3)), np.zeros(0))
 
 
-def test_ssim_is_taken_image_by_image():
+def test_ssim_is_computed_per_image():
     rng = np.random.default_rng(1)
     prediction, truth = rng.random((2, 3, 8, 9)), rng.random((2, 3, 8, 9))
     scores = ssim(prediction, truth)
@@ -109,7 +109,7 @@ def test_ssim_refuses_other_shapes_and_small_images():
         ssim(np.zeros((2, 6, 8)), np.zeros((2, 6, 8)))
 
 
-def test_abs_error_leaves_out_what_was_not_received():
+def test_abs_error_of_missing_observations_is_nan():
     truth = np.array([[-60.0, np.nan, -70], [np.nan, -50, -90]])
     prediction = np.array([[-61.5, -10, -69], [np.nan, -50, -80]])
     np.testing.assert_array_equal(abs_error_db(prediction, truth), [[1.5, np.nan, 1], [np.nan, 0, 10]])
@@ -127,7 +127,7 @@ def test_cea_of_known_errors():
 
 
 @pytest.mark.parametrize("metric", [abs_error_db, cea_db, ssim])
-def test_metrics_refuse_predictions_that_are_missing(metric):
+def test_metrics_refuse_missing_predictions(metric):
     truth = np.ones((2, 8, 9))
     prediction = truth.copy()
     prediction[1, 2, 3] = np.nan
@@ -185,7 +185,7 @@ PUBLISHED_DB = 0.1
 to be as good, and at most a little better, with a softening that was chosen on training rows."""
 
 
-def test_published_figures_of_the_blend_of_signal_strengths():
+def test_published_figures_of_idw_of_signal_strengths():
     """Median and 90th percentile over all anchors and test rows."""
     if not (Path(os.environ.get("WRF_MI_DATA", "/nowhere")) / "flat-ble").is_dir():
         pytest.skip("WRF_MI_DATA names no folder with flat-ble/")

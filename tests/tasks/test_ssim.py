@@ -16,7 +16,7 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core import InputError
-from wrf_mi.tasks.spectrum_loss import spectrum_loss
+from wrf_mi.tasks.losses import spectrum_loss
 from wrf_mi.tasks.ssim import ssim
 
 Float64 = dr.float64_array_t(mi.Float)
@@ -149,7 +149,7 @@ def test_float32_gradient_stays_close_on_flat_images():
     assert gradients[0] == pytest.approx(gradients[1], abs=1e-3 * np.abs(gradients[1]).max())
 
 
-def test_loss_is_the_stated_mix():
+def test_loss_equals_its_formula():
     shape = (2, 10, 11)
     rng = np.random.default_rng(4)
     prediction, truth = rng.random(shape), rng.random(shape)
@@ -159,7 +159,7 @@ def test_loss_is_the_stated_mix():
     assert np.array(similarity) == pytest.approx(reference(prediction, truth), abs=DOUBLE)
 
 
-def test_frozen_function_gives_the_same_as_the_plain_one():
+def test_frozen_loss_equals_plain_loss():
     shape = (2, 12, 13)
 
     def step(prediction, stack, choice):

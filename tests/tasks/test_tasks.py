@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -77,9 +78,26 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str],
     return {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "error::RuntimeWarning"}, data
 
 
-def command(environment: dict[str, str], *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-m", "wrf_mi.cli", *map(str, arguments)]
-    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+CALLS = """
+import contextlib, io, json, sys
+from wrf_mi.cli.main import main
+
+for words in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(words)
+    print(json.dumps([status, out.getvalue(), err.getvalue()]))
+"""
+
+
+def commands(environment: dict[str, str], *calls: list[str | Path]) -> list[tuple[int, str, str]]:
+    """Status, standard output and standard error of commands, one after the other in a process of their own."""
+    words = json.dumps([list(map(str, call)) for call in calls])
+    done = subprocess.run(
+        [sys.executable, "-c", CALLS, words], env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
 
 
 def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_compared(
@@ -87,39 +105,31 @@ def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_
 ) -> None:
     environment, data = installed
     runs = [tmp_path / name for name in ("idw", "kriging")]
-    for run in runs:
-        done = command(environment, "train", data, "--model", run.name, "--out", run)
-        assert done.returncode == 0, done.stderr
-        assert "absolute error (ns) on 10 test rows" in done.stdout
+    for status, out, err in commands(environment, *(["train", data, "--model", r.name, "--out", r] for r in runs)):
+        assert status == 0, err
+        assert "absolute error (ns) on 10 test rows" in out
     (runs[0] / "metrics.json").unlink()  # as a run that was stopped before its scores
-    for arguments in (["train", "--resume", runs[0]], ["evaluate", runs[0]]):
-        done = command(environment, *arguments)
-        assert done.returncode == 0, done.stderr
     (tmp_path / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
-    done = command(environment, "predict", runs[1], "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz")
-    assert done.returncode == 0, done.stderr
+    done = commands(
+        environment,
+        ["train", "--resume", runs[0]],
+        ["evaluate", runs[0]],
+        ["predict", runs[1], "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz"],
+        ["compare", *runs, "--out", tmp_path / "compare"],
+    )
+    assert [status for status, _, _ in done] == [0] * 4, done
     with np.load(tmp_path / "p.npz") as predicted:
         assert predicted["prediction"] == pytest.approx([30 + 5 + np.sin(2), 30 + 15 + np.sin(1)], abs=3)
-    done = command(environment, "compare", *runs, "--out", tmp_path / "compare")
-    assert done.returncode == 0, done.stderr
     assert "absolute error (ns)" in (tmp_path / "compare" / "index.html").read_text()
 
 
-def test_models_that_do_not_serve_a_task_say_so_in_one_line(
-    installed: tuple[dict[str, str], Path], tmp_path: Path
-) -> None:
+def test_unsupported_tasks_are_refused_in_one_line(installed: tuple[dict[str, str], Path], tmp_path: Path) -> None:
     environment, data = installed
-    for model, message in (
-        ("trees", "holds delay-spread; trees serves rssi, so choose another model: idw, kriging"),
-        ("physics", "holds delay-spread; physics serves spectrum, rssi and csi, so choose another model: idw, kriging"),
-        (
-            "factorised",
-            "holds delay-spread; factorised serves spectrum, rssi and csi, so choose another model: idw, kriging",
-        ),
-    ):
-        done = command(environment, "train", data, "--model", model, "--out", tmp_path / model)
-        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-        assert message in done.stderr
+    served = {"trees": "rssi", "physics": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
+    done = commands(environment, *(["train", data, "--model", model, "--out", tmp_path / model] for model in served))
+    for (model, tasks), (status, _, err) in zip(served.items(), done, strict=True):
+        assert (status, err.count("\n")) == (2, 1), err
+        assert f"holds delay-spread; {model} serves {tasks}, so choose another model: idw, kriging" in err
         assert not (tmp_path / model).exists()
 
 
@@ -153,7 +163,7 @@ def test_instruments_need_positions_carrier_and_arrays() -> None:
     assert instrument_of(known).carrier_hz == 1
 
 
-def test_a_folder_shows_its_layout_by_its_files(tmp_path: Path) -> None:
+def test_layout_is_recognised_by_files(tmp_path: Path) -> None:
     assert layouts.layout_of(tmp_path) is layouts.SPECTRA
     for layout in layouts.BUILT_IN:
         folder = tmp_path / layout.name

@@ -60,7 +60,7 @@ def test_wrong_files_are_refused(traced: TraceResult, tmp_path: Path, scene: Any
     with pytest.raises(InputError, match="missing; trace"):
         load_trace(tmp_path / "none.npz")
     (tmp_path / "bad.npz").write_bytes(b"PK no")
-    with pytest.raises(InputError, match="not a readable file of paths"):
+    with pytest.raises(InputError, match="not readable"):
         load_paths(tmp_path / "bad.npz")
     plain = save_paths(tmp_path / "plain.npz", traced.paths)
     assert len(load_paths(plain)) == len(traced.paths)
@@ -74,7 +74,7 @@ def test_wrong_files_are_refused(traced: TraceResult, tmp_path: Path, scene: Any
     with pytest.raises(InputError, match="gain"):
         load_paths(tmp_path / "short.npz")
     np.savez(tmp_path / "pickle.npz", **(arrays | {"tx": np.array([{}], object)}))
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="not readable"):
         load_paths(tmp_path / "pickle.npz")
     with pytest.raises(ValueError, match="length_m has shape"):
         replace(traced.paths, length_m=traced.paths.length_m[:-1])

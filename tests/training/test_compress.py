@@ -35,7 +35,7 @@ QUOTIENT_TOLERANCE = 1e-6
 
 
 @pytest.mark.parametrize("product", [False, True])
-def test_removal_is_what_an_image_loses(product: bool) -> None:
+def test_removal_equals_change_of_the_image_without_the_gaussian(product: bool) -> None:
     """Against images without one Gaussian."""
     gaussians = fields(4, product)
     found = removal(gaussians, POSE, perception_plane(*SIZE, Float64)).numpy().reshape(BATCH, COUNT)
@@ -64,7 +64,7 @@ HALF_RELATIVE, HALF_ABSOLUTE = 2.0**-11, 2.0**-25
     st.sampled_from(["single", "half", "8bit"]),
     *[hnp.arrays(np.float32, shape, elements=st.floats(-50, 50, width=32)) for shape in ((3, 7), (5, 6), (5, 1))],
 )
-def test_stored_numbers_are_within_their_bound(precision: str, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
+def test_packing_error_is_within_its_bound(precision: str, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
     params = dict(zip(NAMES, (a, b, c), strict=True))
     packed = pack_params(params, precision)
     assert all(values.dtype != object for values in packed.values())
@@ -99,7 +99,7 @@ def run(one_gateway: Record, folder: Path, tmp_path_factory: pytest.TempPathFact
     ).folder
 
 
-def test_the_least_important_goes(run: Path, one_gateway: Record) -> None:
+def test_prune_removes_the_least_important_gaussian(run: Path, one_gateway: Record) -> None:
     """A Gaussian that is made idle has no importance, and is the one that pruning drops."""
     config, params = open_run(run).field.config, dict(open_run(run).field.params)
     params["opacity"] = params["opacity"].copy()
@@ -117,7 +117,7 @@ def test_the_least_important_goes(run: Path, one_gateway: Record) -> None:
     np.testing.assert_allclose(*same, atol=1e-6)
 
 
-def test_a_compressed_run_is_a_run(
+def test_compressed_run_opens_as_a_run(
     run: Path, one_gateway: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "small"
@@ -136,7 +136,7 @@ def test_a_compressed_run_is_a_run(
 
 
 @pytest.mark.parametrize(("precision", "most"), [("single", 0.0), ("half", 5e-3), ("8bit", 5e-2)])
-def test_storage_alone_changes_little(precision: str, most: float, run: Path, one_gateway: Record) -> None:
+def test_packing_changes_spectra_within_tolerance(precision: str, most: float, run: Path, one_gateway: Record) -> None:
     """Greys of the same field from its numbers in few bits, whose errors add up over the layers."""
     field, params = open_run(run).field.field, open_run(run).field.params
     few = unpack_params(pack_params(params, precision))
@@ -148,7 +148,7 @@ def test_storage_alone_changes_little(precision: str, most: float, run: Path, on
     ("sizes", "model", "steps"),
     [({"width": 8, "layers": 2}, "wrf-gs+", 80), ({"terms": 4, "width": 16}, "factorised", 80)],
 )
-def test_a_smaller_network_learns_the_larger_ones_spectra(
+def test_distillation_recovers_the_teachers_spectra(
     sizes: dict[str, int], model: str, steps: int, run: Path, one_gateway: Record
 ) -> None:
     config, params = open_run(run).field.config, dict(open_run(run).field.params)
@@ -173,12 +173,14 @@ def test_a_smaller_network_learns_the_larger_ones_spectra(
     ("how", "message"),
     [({"budget": -1}, "budget -1"), ({"fine_tune": -2}, "fine-tune -2"), ({"precision": "x"}, "unknown; choose from")],
 )
-def test_what_cannot_be_done_is_refused(how: dict[str, object], message: str) -> None:
+def test_invalid_compressions_are_refused(how: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Compression(**how)  # type: ignore[arg-type]
 
 
-def test_more_than_there_are_cannot_be_kept(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_budget_above_number_of_gaussians_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["compress", str(run), "--out", str(tmp_path / "x"), "--budget", "9"]) == 2
     assert "has 8 Gaussians; choose fewer" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
@@ -200,11 +202,11 @@ def test_sizes_of_networks_are_settings() -> None:
         ("model=wrf-gs", "network.phase_hz=1e9"),
         ("network.terms=4",),
     ):
-        with pytest.raises(InputError, match="leave it away"):
+        with pytest.raises(InputError, match="omit it"):
             field(*bad)
 
 
-def test_settings_say_what_predictions_skip(run: Path, one_gateway: Record) -> None:
+def test_skip_settings_reach_predictions(run: Path, one_gateway: Record) -> None:
     """Steps evaluate all, whatever is skipped in predictions."""
     set_threads(1)  # several add in another order from run to run
     split = make_splits(one_gateway, "official")[0]

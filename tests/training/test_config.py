@@ -117,7 +117,7 @@ def test_settings_as_text_make_any_configuration(config: TrainConfig) -> None:
     assert with_settings(TrainConfig(), [f"{name}={as_text(value)}" for name, value in changed]) == config
 
 
-def test_what_is_not_named_keeps_its_default() -> None:
+def test_missing_settings_keep_their_defaults() -> None:
     assert read({}) == TrainConfig()
     config = read({"steps": 5, "density": {"growth_fraction": 0.5}})
     assert (config.steps, config.density.growth_fraction, config.density.every) == (5, 0.5, TrainConfig().density.every)
@@ -140,7 +140,7 @@ def test_what_is_not_named_keeps_its_default() -> None:
         (" model =wrf-gs", "model", "wrf-gs"),
     ],
 )
-def test_a_setting(setting: str, name: str, value: Any) -> None:
+def test_setting_changes_one_value_and_keeps_its_type(setting: str, name: str, value: Any) -> None:
     flat = leaves(asdict(with_settings(TrainConfig(), [setting])))
     assert flat[name] == value
     assert type(flat[name]) is type(value)
@@ -171,11 +171,11 @@ def test_the_last_of_several_settings_counts() -> None:
         ("optimiser.network=fast", "setting optimiser.network: expected float, got 'fast'"),
         ("optimiser.network=true", "setting optimiser.network: expected float, got True"),
         ("optimiser.network=null", "setting optimiser.network: expected float, got None"),
-        pytest.param(f"optimiser.network={10**400}", "expected float, got 1000", id="larger than any float"),
-        ("initial.points=3", "setting initial.points: expected str, got 3"),
+        pytest.param(f"optimiser.network={10**400}", "network: inf is out of range", id="larger than any float"),
+        ("initial.points=3", "setting initial.points: expected string, got 3"),
     ],
 )
-def test_settings_that_are_refused(setting: str, message: str) -> None:
+def test_invalid_settings_are_refused(setting: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         with_settings(TrainConfig(), [setting])
     assert message in str(caught.value)
@@ -245,7 +245,7 @@ def test_ends_of_ranges_are_accepted(setting: str, value: float) -> None:
         ({"steps": "3"}, "config.yaml, setting steps: expected int, got '3'"),
     ],
 )
-def test_files_that_are_refused(values: Any, message: str) -> None:
+def test_invalid_files_are_refused(values: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         read(values, "config.yaml")
     assert message in str(caught.value)
@@ -257,14 +257,14 @@ def test_presets_are_settings(name: str) -> None:
     assert (config == TrainConfig()) == (name == "default")
 
 
-def test_paper_preset_has_what_the_paper_states() -> None:
+def test_paper_preset_equals_the_papers_settings() -> None:
     """Section V-A: L = 9, ten octaves, for Gaussians and transmitter; eta = 0.2."""
     config = with_settings(TrainConfig(), PRESETS["paper"])
     assert (config.encoding.position_octaves, config.encoding.tx_octaves) == (10, 10)
     assert config.loss.ssim_weight == 0.2
 
 
-def test_zero_steps_are_as_many_as_the_model_needs() -> None:
+def test_zero_steps_resolve_to_the_models_default() -> None:
     near = np.zeros((2, 3))
     assert TrainConfig(model="wrf-gs+").resolved(near).steps == 9000
     assert TrainConfig(model="wrf-gs").resolved(near).steps == 15000
@@ -272,7 +272,7 @@ def test_zero_steps_are_as_many_as_the_model_needs() -> None:
 
 
 @pytest.mark.parametrize(("extent_m", "scale_m"), [(0, 1), (1.99, 1), (2, 2), (3.9, 2), (8.8, 8), (63, 32)])
-def test_zero_scale_tells_all_training_transmitters_apart(extent_m: float, scale_m: float) -> None:
+def test_zero_scale_distinguishes_all_training_transmitters(extent_m: float, scale_m: float) -> None:
     """Positions a period, two units, apart are one to the network."""
     tx = np.array([[5.0, 1, -7], [5, 1 + extent_m, -7], [5, 1, -7.5]])
     resolved = TrainConfig().resolved(tx)
@@ -282,7 +282,7 @@ def test_zero_scale_tells_all_training_transmitters_apart(extent_m: float, scale
     assert own.resolved(tx).encoding.tx_scale_m == 0.25
 
 
-def test_field_of_open_scale_is_refused() -> None:
+def test_unresolved_scale_is_refused() -> None:
     with pytest.raises(InputError, match=r"encoding\.tx_scale_m: 0 is resolved by the training transmitters"):
         make_field(TrainConfig())
 

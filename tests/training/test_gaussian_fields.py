@@ -96,7 +96,7 @@ def fitted(record: Record, split: Split, *settings: str) -> Predictor:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_power_is_that_of_the_operator_over_the_full_sphere(model: str) -> None:
+def test_power_equals_operator_over_the_full_sphere(model: str) -> None:
     record = strengths()
     trainer = Trainer(record, halves(record), config(record, f"model={model}"))
     trainer.state.set_param("level", np.array([[-0.3, 0.7]], np.float32))
@@ -113,7 +113,7 @@ def test_power_is_that_of_the_operator_over_the_full_sphere(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_fit_begins_at_the_level_of_what_each_receiver_observed(model: str) -> None:
+def test_starting_level_matches_each_receivers_observations(model: str) -> None:
     record = strengths()
     louder = replace(record, observation=record.observation + np.array([[0], [-35]], np.float32))
     predict = Trainer(louder, halves(louder), config(louder, f"model={model}")).predictor()
@@ -124,7 +124,7 @@ def test_a_fit_begins_at_the_level_of_what_each_receiver_observed(model: str) ->
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_each_component_has_an_image_of_its_own(model: str) -> None:
+def test_components_have_separate_images(model: str) -> None:
     record = channels()
     trainer = Trainer(record, halves(record), config(record, f"model={model}", "initial.gaussians=5"))
     params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
@@ -142,7 +142,7 @@ def test_each_component_has_an_image_of_its_own(model: str) -> None:
                 np.testing.assert_array_equal(one, narrow.numpy().reshape(4, 5), strict=True)
 
 
-def test_components_hold_what_channels_are_made_of() -> None:
+def test_components_span_the_channels() -> None:
     rng = np.random.default_rng(0)
     modes = rng.normal(size=(2, 8)) + 1j * rng.normal(size=(2, 8))
     h = ((rng.normal(size=(60, 2)) + 1j * rng.normal(size=(60, 2))) @ modes)[None].astype(np.complex64)
@@ -230,7 +230,7 @@ def test_a_second_receiver_with_other_components_is_learned(antennas: int) -> No
 
 @pytest.mark.all_threads
 @pytest.mark.parametrize("model", [*MODELS, "nerf2"])
-def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
+def test_fit_is_invariant_to_the_power_of_a_receiver(model: str) -> None:
     """A receiver 40 dB weaker is told in its own units: a power of two changes no digit of what is learned."""
     record, weak = two_stations(), 2.0**-7
     fainter = replace(record, observation=record.observation * np.array([1, weak], np.float32)[:, None, None])
@@ -249,7 +249,7 @@ def test_a_weak_receiver_is_learned_as_well_as_a_strong_one(model: str) -> None:
     np.testing.assert_allclose(faint, weak * plain, rtol=0, atol=THREADED * weak * np.abs(plain).max())
 
 
-def test_any_number_of_rows_is_predicted_alike() -> None:
+def test_predictions_do_not_depend_on_the_number_of_rows() -> None:
     record = strengths(1, 2 * TOGETHER + 53)
     split = Split("all", 0, np.arange(40), np.arange(40, 50), np.arange(50, len(record)))
     predict = fitted(record, split, "steps=10")
@@ -259,7 +259,7 @@ def test_any_number_of_rows_is_predicted_alike() -> None:
 
 
 @pytest.mark.parametrize("holdout_steps_fraction", [0.5, 1.0])
-def test_a_fit_goes_on_from_its_best_moment(holdout_steps_fraction: float) -> None:
+def test_early_stopping_resumes_from_the_best_state(holdout_steps_fraction: float) -> None:
     """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
     record = strengths()
     own = config(
@@ -293,7 +293,7 @@ def test_a_fit_goes_on_from_its_best_moment(holdout_steps_fraction: float) -> No
 
 
 @pytest.mark.parametrize("stop", [25, 45, 150])
-def test_a_stopped_fit_chooses_as_one_that_was_not(stop: int, tmp_path) -> None:
+def test_resumed_fit_chooses_the_same_state(stop: int, tmp_path) -> None:
     record = strengths()
     own = config(record, "steps=160", "validate_every=10", "patience=2", "deterministic=true")
     whole, part = (Trainer(record, halves(record), own) for _ in range(2))
@@ -306,7 +306,7 @@ def test_a_stopped_fit_chooses_as_one_that_was_not(stop: int, tmp_path) -> None:
         np.testing.assert_array_equal(again.state.mean_params()[name], values)
 
 
-def test_rows_that_were_not_received_are_learned_from_at_no_receiver() -> None:
+def test_missing_observations_do_not_train() -> None:
     record = strengths()
     targets = targets_of(record, np.arange(40))
     assert set(range(40)) - set(targets.received(0, np.arange(40))) == {0, 1, 2}
@@ -315,7 +315,7 @@ def test_rows_that_were_not_received_are_learned_from_at_no_receiver() -> None:
     assert not set(trainer.schedule.rows[trainer.schedule.receiver == 0].ravel()) & {0, 1, 2}
 
 
-def test_differences_are_divided_by_the_stated_noise() -> None:
+def test_loss_divides_differences_by_stated_noise() -> None:
     record, rows = strengths(rows=20), np.arange(4, 20)
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 4, record.observation.shape)
@@ -340,7 +340,7 @@ def test_differences_are_divided_by_the_stated_noise() -> None:
         np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
 
 
-def test_rows_of_much_stated_noise_are_learned_from_less() -> None:
+def test_noisy_rows_have_less_weight() -> None:
     record = strengths(1)
     record = replace(record, observation=np.nan_to_num(record.observation, nan=-50))
     split, wrong = halves(record), np.zeros(record.observation.shape, bool)
@@ -356,7 +356,7 @@ def test_rows_of_much_stated_noise_are_learned_from_less() -> None:
     assert error(replace(louder, std=np.where(wrong, 40.0, 1.0))) < 0.5 * error(louder)
 
 
-def test_readings_and_noise_that_do_not_fit_are_refused(tmp_path) -> None:
+def test_inconsistent_readings_and_noise_are_refused(tmp_path) -> None:
     record = strengths()
     std = np.ones(record.observation.shape)
     for change, message in (
@@ -370,7 +370,7 @@ def test_readings_and_noise_that_do_not_fit_are_refused(tmp_path) -> None:
         train(replace(channels(), std=std), tmp_path / "run", "idw", split=halves(record))
 
 
-def test_what_cannot_be_learned_from_is_refused() -> None:
+def test_unsuitable_records_are_refused() -> None:
     record = strengths()
     nowhere = replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="no position in row 0"):
@@ -382,7 +382,7 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
 
 @pytest.mark.parametrize("model", [*MODELS, "nerf2"])
 @pytest.mark.parametrize("lost", ["position_m", "orientation_xyzw"])
-def test_receivers_without_a_pose_are_refused_where_positions_tell(model: str, lost: str) -> None:
+def test_unknown_poses_are_refused_for_fields_over_positions(model: str, lost: str) -> None:
     record = strengths()
     unknown = replace(record.receivers[1], **{lost: np.full(3 if lost == "position_m" else 4, np.nan)})
     record = replace(record, receivers=(record.receivers[0], unknown))

@@ -19,8 +19,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import WrfGsPlus
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.training.config import InitialConfig, TrainConfig
-from wrf_mi.training.initial import initial_gaussians
-from wrf_mi.training.initial_paths import gaussians_from_mesh, gaussians_from_paths
+from wrf_mi.training.initial import gaussians_from_mesh, gaussians_from_paths, initial_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]
     return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(max_depth=1, rays=1 << 12)).paths, tx
 
 
-def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -> None:
+def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
     paths, tx = traced
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 40, np.random.default_rng(0))
     assert start.count == 40
@@ -45,7 +44,7 @@ def test_gaussians_lie_where_waves_come_from(traced: tuple[Paths, np.ndarray]) -
     assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 
-def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndarray]) -> None:
+def test_image_maps_are_orthogonal(traced: tuple[Paths, np.ndarray]) -> None:
     paths, tx = traced
     wall = paths.object_names.index("west")
     own = paths.select(paths.objects[:, 0] == wall)
@@ -55,7 +54,7 @@ def test_maps_from_transmitter_to_image_are_mirrors(traced: tuple[Paths, np.ndar
 
 
 @pytest.mark.parametrize("kind", [mi.Float, mi.Float64])
-def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarray], kind: Any) -> None:
+def test_phase_of_signals_follows_distance_of_images(traced: tuple[Paths, np.ndarray], kind: Any) -> None:
     paths, tx = traced
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
     plain = WrfGsPlus(layers=2, width=8, skip=1)
@@ -77,7 +76,7 @@ def test_signals_turn_with_the_distance_of_images(traced: tuple[Paths, np.ndarra
     assert np.abs(signals[1] - signals[0]).max() > 0.1
 
 
-def test_a_field_starts_with_them(traced: tuple[Paths, np.ndarray]) -> None:
+def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
     paths, tx = traced
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
@@ -87,7 +86,7 @@ def test_a_field_starts_with_them(traced: tuple[Paths, np.ndarray]) -> None:
     assert np.ptp(weights["opacity"]) > 0
 
 
-def test_more_gaussians_than_points_are_spread(traced: tuple[Paths, np.ndarray]) -> None:
+def test_more_gaussians_than_clusters_are_jittered(traced: tuple[Paths, np.ndarray]) -> None:
     paths, tx = traced
     one = paths.select(np.arange(2))
     start = gaussians_from_paths(one, tx, (receiver([3.0, 2.0, 1.0]),), 9, np.random.default_rng(0))
@@ -96,7 +95,7 @@ def test_more_gaussians_than_points_are_spread(traced: tuple[Paths, np.ndarray])
         gaussians_from_paths(paths.select(np.arange(0)), tx, (receiver([3.0, 2.0, 1.0]),), 4, np.random.default_rng(0))
 
 
-def test_a_mesh_is_covered_by_area(tmp_path: Path) -> None:
+def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
     triangles = np.concatenate([mesh.triangles for _, mesh in SHOEBOX.values()])
     start = gaussians_from_mesh(triangles, 2000, np.random.default_rng(0))
     floor = np.abs(start.position_m[:, 2]) < 1e-9
@@ -106,7 +105,7 @@ def test_a_mesh_is_covered_by_area(tmp_path: Path) -> None:
         gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
 
 
-def test_settings_name_surfaces_or_paths(tmp_path: Path) -> None:
+def test_gaussians_start_from_the_source_in_the_settings(tmp_path: Path) -> None:
     scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
     own = receiver([3.0, 2.0, 1.0])
     record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))

@@ -27,7 +27,7 @@ def product(q: np.ndarray, p: np.ndarray) -> np.ndarray:
     return np.append(v, w)
 
 
-def test_only_the_pose_between_field_and_receiver_counts() -> None:
+def test_prediction_is_invariant_to_rigid_motion() -> None:
     """Field and receiver moved and turned together give the same spectrum."""
     field, params = true_field("wrf-gs+")
     params = still(params)
@@ -70,7 +70,7 @@ def test_predictor_of_other_receivers_and_sizes() -> None:
         (np.array([[0, 0, 0], [0, np.nan, 0]]), "row 2: not a finite number"),
     ],
 )
-def test_positions_that_cannot_be_predicted(positions: np.ndarray, message: str) -> None:
+def test_invalid_positions_are_refused(positions: np.ndarray, message: str) -> None:
     field, params = true_field("wrf-gs+")
     with pytest.raises(InputError, match=message):
         Predictor(field, params, RECEIVERS, *SIZE)(positions)

@@ -38,13 +38,13 @@ def test_weight_is_a_gaussian_of_the_distance_from_the_nearest_known_transmitter
     assert (two.weight(at(10.0), 0) == 0).all()  # and where it is negligible, none
 
 
-def test_reach_of_zero_trusts_nowhere_and_an_infinite_one_everywhere() -> None:
+def test_reach_of_zero_and_infinity_give_weights_zero_and_one() -> None:
     places = at(0, 0.1, 1e6)
     assert not Reach(ORIGIN, 0.0).weight(places, 0).any()
     assert (Reach(ORIGIN, np.inf).weight(places, 0) == 1).all()
 
 
-def test_receiver_that_observed_nothing_has_no_trusted_transmitter() -> None:
+def test_receiver_without_observations_has_weight_zero() -> None:
     assert not Reach((np.zeros((0, 3)),), 1.0).weight(at(0, 1), 0).any()
 
 
@@ -55,7 +55,7 @@ def test_weight_rises_with_the_reach(one: float, other: float, distance: float) 
 
 
 @given(st.integers(2, 80), st.integers(0, 20), st.integers(0, 99))
-def test_held_out_groups_leave_rows_that_train(train: int, validation: int, seed: int) -> None:
+def test_held_out_groups_keep_training_rows(train: int, validation: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = rng.permutation(train + validation + 5)
     split = Split("own", seed, np.sort(rows[:train]), np.sort(rows[train : train + validation]), np.sort(rows[-5:]))
@@ -93,7 +93,7 @@ def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better: bool) -
     assert choose_reach(reach, lengths, held, score, higher_is_better) == (lengths[3], 0.0)
 
 
-def test_nothing_held_out_leaves_the_reach_as_it_is() -> None:
+def test_without_held_out_rows_the_reach_is_kept() -> None:
     found, score = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w, True)
     assert found == 2.0
     assert np.isnan(score)
@@ -104,7 +104,7 @@ def channels(channel: np.ndarray, position: np.ndarray) -> Record:
     return Record("own", "csi", position, receiver, channel[None].astype(np.complex64), frequencies_hz=np.array([9e8]))
 
 
-def test_channels_that_nothing_tells_are_predicted_as_zero() -> None:
+def test_channels_of_random_phase_are_predicted_as_zero() -> None:
     """Phases are independent from row to row: whatever is predicted for a new row is worse than nothing."""
     rng = np.random.default_rng(0)
     record = channels(np.exp(2j * np.pi * rng.random((60, 1))), rng.uniform(1, 4, (60, 3)))
@@ -117,39 +117,43 @@ def test_channels_that_nothing_tells_are_predicted_as_zero() -> None:
     assert not trainer.predictor()(record.tx_pos_m[45:]).any()
 
 
-def test_far_from_training_rows_a_joint_fit_predicts_what_its_paths_do(tmp_path: Path) -> None:
-    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """A short fit of Gaussians beside the paths of a room, to channels of random phases."""
+    scene = open_scene(write_xml(tmp_path_factory.mktemp("room"), SHOEBOX), 9e8)
     rng = np.random.default_rng(0)
     record = channels(np.exp(2j * np.pi * rng.random((60, 1))), rng.uniform([1.5, 2, 1], [2, 2.5, 1.5], (60, 3)))
     rows = np.arange(60)
-    config = with_settings(default_config("csi", True), [*SMALL, "traced.depth=1", "traced.rays=4096"])
+    config = with_settings(default_config("csi", True), [*SMALL, "steps=20", "traced.depth=1", "traced.rays=4096"])
     trainer = Trainer(record, Split("own", 0, rows[:45], rows[45:50], rows[50:]), config, scene=scene)
     trainer.run()
-    trainer.state.reach_m = 0.1
-    far, predict = np.array([[4.5, 3.5, 1.2]]), trainer.predictor()
-    known = predict(record.tx_pos_m[:1])
-    both = predict(far)
-    trainer.state.reach_m = 0.0
-    predict = trainer.predictor()
-    np.testing.assert_allclose(both, predict(far), rtol=FLOAT32)
-    assert np.abs(both).max() > 0
-    assert np.abs(known - predict(record.tx_pos_m[:1])).max() > 0
+    return trainer
 
 
-def test_gaussians_that_are_not_trusted_are_not_evaluated(tmp_path: Path) -> None:
+FAR_M = np.array([[4.5, 3.5, 1.2]])
+
+
+def test_far_from_training_rows_a_joint_fit_predicts_its_paths_alone(joint: Trainer) -> None:
+    near_m = joint.record.tx_pos_m[:1]
+    joint.state.reach_m = 0.1
+    predict = joint.predictor()
+    near, far = predict(near_m), predict(FAR_M)
+    joint.state.reach_m = 0.0
+    predict = joint.predictor()
+    np.testing.assert_allclose(far, predict(FAR_M), rtol=FLOAT32)
+    assert np.abs(far).max() > 0
+    assert np.abs(near - predict(near_m)).max() > 0
+
+
+def test_gaussians_beyond_their_reach_are_not_evaluated(joint: Trainer) -> None:
     """Far from the training rows a joint fit launches the kernels of its paths alone."""
-    scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
-    position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (40, 3))
-    record, rows = channels(np.ones((40, 1)), position), np.arange(40)
-    config = with_settings(default_config("csi", True), [*SMALL, "steps=2", "traced.depth=1", "traced.rays=4096"])
-    trainer = Trainer(record, Split("own", 0, rows[:25], rows[25:30], rows[30:]), config, scene=scene)
 
     def kernels(reach_m: float) -> int:
-        trainer.state.reach_m = reach_m
-        predict = trainer.predictor()
+        joint.state.reach_m = reach_m
+        predict = joint.predictor()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            predict(np.array([[4.5, 3.5, 1.2]]))
+            predict(FAR_M)
             return len(dr.kernel_history([dr.KernelType.JIT]))
 
     far, everywhere = kernels(0.1), kernels(np.inf)
@@ -157,22 +161,20 @@ def test_gaussians_that_are_not_trusted_are_not_evaluated(tmp_path: Path) -> Non
     assert far < everywhere
 
 
-def test_rows_too_few_to_judge_gaussians_leave_the_paths_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_too_few_rows_to_choose_a_reach_switch_gaussians_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     scene = open_scene(write_xml(tmp_path, SHOEBOX), 9e8)
     position = np.random.default_rng(0).uniform([1.5, 2, 1], [2, 2.5, 1.5], (12, 3))
     record, rows = channels(np.ones((12, 1)), position), np.arange(12)
-    config = with_settings(default_config("csi", True), [*SMALL, "traced.depth=1", "traced.rays=4096"])
+    config = with_settings(default_config("csi", True), [*SMALL, "steps=20", "traced.depth=1", "traced.rays=4096"])
     trainer = Trainer(record, Split("own", 0, rows[:6], rows[6:7], rows[7:]), config, scene=scene)
     trainer.run()
     assert trainer.state.reach_m == 0
-    assert "6 training rows do not tell how far Gaussians hold" in caplog.text
+    assert "6 training rows do not suffice to choose a reach" in caplog.text
     assert np.abs(trainer.predictor()(position[7:])).max() > 0
 
 
 @pytest.mark.parametrize(("holdout_steps_fraction", "known"), [(0.7, 45), (1.0, None)])
-def test_rows_that_never_train_are_not_known(holdout_steps_fraction: float, known: int | None) -> None:
+def test_held_out_rows_do_not_extend_the_reach(holdout_steps_fraction: float, known: int | None) -> None:
     """Kept out to the end, held-out rows are judged by their distance from those that trained."""
     rng = np.random.default_rng(0)
     record, rows = channels(np.ones((60, 1)), rng.uniform(1, 2, (60, 3))), np.arange(60)

@@ -56,14 +56,14 @@ def test_each_epoch_visits_each_row_at_each_receiver_once(
 
 
 @given(train=st.integers(3, 20), batch=st.integers(2, 3), seed=st.integers(0, 99))
-def test_a_batch_holds_no_row_twice(train: int, batch: int, seed: int) -> None:
+def test_batches_have_distinct_rows(train: int, batch: int, seed: int) -> None:
     """Where the batch does not divide the rows too."""
     schedule = plan_of(split_of(train), 2, batch=batch, steps=40, seed=seed)
     assert schedule.rows.shape == (40, batch)
     assert all(len(set(rows)) == batch for rows in schedule.rows)
 
 
-def test_every_row_comes_although_the_batch_does_not_divide_them() -> None:
+def test_every_row_is_visited_if_the_batch_does_not_divide_them() -> None:
     split = split_of(7)
     schedule = plan_of(split, 1, batch=3, steps=40, holdout_steps_fraction=1.0)
     assert set(schedule.rows.ravel()) == set(split.train)
@@ -75,7 +75,7 @@ def test_every_row_comes_although_the_batch_does_not_divide_them() -> None:
     receivers=st.integers(1, 3),
     seed=st.integers(0, 99),
 )
-def test_validation_rows_wait_and_test_rows_never_come(
+def test_schedule_holds_out_validation_and_excludes_test_rows(
     holdout_steps_fraction: float, steps: int, receivers: int, seed: int
 ) -> None:
     split = split_of(9, 3)
@@ -89,7 +89,7 @@ def test_validation_rows_wait_and_test_rows_never_come(
         assert np.isin(split.validation, after).all()
 
 
-def test_hold_out_of_one_never_joins() -> None:
+def test_holdout_fraction_of_one_never_trains_on_validation_rows() -> None:
     schedule = plan_of(split_of(9), 1, steps=100, holdout_steps_fraction=1.0)
     assert schedule.joined == 100
     assert plan_of(split_of(9), 1, steps=100, holdout_steps_fraction=0.0).joined == 0
@@ -134,7 +134,7 @@ def test_no_warm_up() -> None:
     assert plan_of(split_of(9), 1, "optimiser.warm_up=0", steps=50).factor[0] == 1.0
 
 
-def test_the_mean_forgets_its_start() -> None:
+def test_running_mean_discards_starting_values() -> None:
     """Decay rises from 1/10 to the setting: the starting values' share of the mean is soon nothing."""
     decay = plan_of(split_of(9), 1, "optimiser.ema_decay=0.99", steps=3000).decay
     assert decay[0] == pytest.approx(0.1)
@@ -153,7 +153,7 @@ def test_rounds_of_density_control() -> None:
     assert plan_of(split_of(9), 1, *settings, "density.stop=1", steps=300).density == {100, 200}
 
 
-def test_rates_stay_until_the_cosine_starts() -> None:
+def test_rates_are_constant_before_the_cosine() -> None:
     factor = plan_of(split_of(9), 1, "optimiser.warm_up=0", "optimiser.cosine_start=0.6", steps=50).factor
     np.testing.assert_array_equal(factor[:31], 1)
     final = TrainConfig().optimiser.final
@@ -180,7 +180,7 @@ def test_a_batch_is_no_larger_than_the_rows_of_any_receiver() -> None:
         plan_of(split_of(0, 1), 1, steps=10)
 
 
-def test_rows_that_join_at_once_count() -> None:
+def test_without_hold_out_validation_rows_train_from_step_zero() -> None:
     split = split_of(0, 4)
     schedule = plan_of(split, 1, steps=10, batch=4, holdout_steps_fraction=0.0)
     assert schedule.rows.shape == (10, 4)

@@ -16,8 +16,8 @@ from small_fits import official, settings, stop_after
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Record
 from wrf_mi.gaussians import FIELDS, random_gaussians
+from wrf_mi.tasks.losses import spectrum_loss
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tasks.spectrum_loss import spectrum_loss
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.loop import Progress
 from wrf_mi.training.predictor import Predictor
@@ -32,19 +32,19 @@ FLOAT32_TOLERANCE = 1e-4
 
 @pytest.mark.parametrize("model", FIELDS)
 def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> None:
-    heard: list[Progress] = []
+    received: list[Progress] = []
     split = official(one_gateway)
     trainer = Trainer(
         one_gateway, split, settings("steps=120", "holdout_steps_fraction=0.5", "validate_every=40", model=model)
     )
-    assert trainer.run(heard.append)
-    assert [p.step for p in heard] == list(range(5, 121, 5))
-    assert heard[-1].loss < 0.8 * heard[0].loss
-    scores = [p.validation_score for p in heard if p.validation_score is not None]
+    assert trainer.run(received.append)
+    assert [p.step for p in received] == list(range(5, 121, 5))
+    assert received[-1].loss < 0.8 * received[0].loss
+    scores = [p.validation_score for p in received if p.validation_score is not None]
     assert len(scores) == 3
     assert scores[-1] > scores[0] + 0.05
-    assert [p.held_out for p in heard] == [p.step <= 60 for p in heard]
-    assert all(a.seconds < b.seconds and a.left_s > b.left_s for a, b in zip(heard[:2], heard[-2:], strict=True))
+    assert [p.held_out for p in received] == [p.step <= 60 for p in received]
+    assert all(a.seconds < b.seconds and a.left_s > b.left_s for a, b in zip(received[:2], received[-2:], strict=True))
     # What training calls its score is what scikit-image says of the same predictions.
     rows = split.validation
     expected = np.median(ssim(trainer.predictor()(one_gateway.tx_pos_m[rows]), one_gateway.observation[0, rows]))
@@ -52,21 +52,21 @@ def test_loss_falls_and_similarity_rises(model: str, one_gateway: Record) -> Non
 
 
 def test_density_rounds_within_a_run(one_gateway: Record) -> None:
-    heard: list[Progress] = []
+    received: list[Progress] = []
     own = (
         "steps=100", "density.every=10", "density.start=0", "density.stop=0.4", "density.growth_fraction=0.5",
         "density.max_gaussians=20",
     )  # fmt: skip
     trainer = Trainer(one_gateway, official(one_gateway), settings(*own))
-    trainer.run(heard.append)
+    trainer.run(received.append)
     # 8, 12, 18, then no more than 20; unseen Gaussians may have been removed meanwhile.
-    counts = {p.step: p.gaussians for p in heard}
+    counts = {p.step: p.gaussians for p in received}
     assert counts[5] == 8
     assert counts[10] > 8
     assert 12 < counts[100] <= 20
     assert counts[40] == counts[100]
     # Growth disturbs what was learned; after the last round it is learned again.
-    losses = {p.step: p.loss for p in heard}
+    losses = {p.step: p.loss for p in received}
     assert losses[100] < 0.9 * losses[45]
     # The recordings are those for this number of Gaussians: a new predictor of the same parameters agrees.
     tx = one_gateway.tx_pos_m[:2]
@@ -74,7 +74,7 @@ def test_density_rounds_within_a_run(one_gateway: Record) -> None:
     np.testing.assert_allclose(trainer.predictor()(tx), again(tx), atol=FLOAT32_TOLERANCE)
 
 
-def test_a_round_that_changes_nothing_changes_nothing(one_gateway: Record) -> None:
+def test_density_round_without_change_keeps_the_state(one_gateway: Record) -> None:
     """Parameters, momentum and mean go through a round and a new recording as they are."""
     states = []
     for own in ("density.every=0", "density.every=10"):
@@ -105,7 +105,7 @@ def test_opacity_reset_within_a_run(one_gateway: Record) -> None:
     np.testing.assert_allclose(opacity, 0.05, rtol=1e-5)
 
 
-def test_a_loss_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
+def test_loss_that_is_nan_raises(one_gateway: Record) -> None:
     def loss(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
         return dr.select(dr.max(truth) > 1.5, np.nan, spectrum_loss(prediction, truth, batch, height, width)[0])
 
@@ -128,7 +128,7 @@ def test_a_loss_that_is_not_a_number_is_reported(one_gateway: Record) -> None:
     assert str(caught.value).startswith(f"step {reached}: not finite: loss")
 
 
-def test_a_gradient_that_is_not_a_number_changes_nothing(one_gateway: Record) -> None:
+def test_gradient_that_is_nan_leaves_parameters_unchanged(one_gateway: Record) -> None:
     def broken(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
         return dr.sum(prediction) * float("nan")
 
@@ -142,7 +142,7 @@ def test_a_gradient_that_is_not_a_number_changes_nothing(one_gateway: Record) ->
     assert not trainer.state.view_gradient_norm.numpy().any()
 
 
-def test_what_broke_is_reported_before_a_stop_is_asked_for(one_gateway: Record) -> None:
+def test_non_finite_values_raise_before_the_stop_condition(one_gateway: Record) -> None:
     def broken(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
         return dr.sum(prediction) * float("nan")
 
@@ -155,7 +155,7 @@ def test_what_broke_is_reported_before_a_stop_is_asked_for(one_gateway: Record) 
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_parameters_that_are_not_numbers_are_named(model: str, one_gateway: Record) -> None:
+def test_parameters_that_are_nan_are_named(model: str, one_gateway: Record) -> None:
     """In each group, at the first step; a Gaussian without a place or shape is not seen, and the loss stays finite."""
     trainer = Trainer(one_gateway, official(one_gateway), settings("steps=5", model=model))
     good = trainer.state.params()
@@ -186,7 +186,7 @@ def test_nothing_is_compiled_after_the_first_steps(model: str, two_gateways: Rec
     assert sum(step.n_recordings for step in trainer._steps.values()) == recordings
 
 
-def test_garbage_waits_while_a_function_is_recorded(one_gateway: Record) -> None:
+def test_garbage_collector_is_off_during_recording(one_gateway: Record) -> None:
     """A user's array that wraps NumPy's memory, freed then by Python's collector, would end the process."""
     seen: list[bool] = []
 
@@ -207,7 +207,7 @@ def test_garbage_waits_while_a_function_is_recorded(one_gateway: Record) -> None
     assert not any(seen)
 
 
-def test_device_memory_is_not_numpys() -> None:
+def test_device_arrays_do_not_share_memory_with_numpy() -> None:
     """What is wrapped instead of copied changes with its source."""
     values = np.arange(6, dtype=np.float32)
     own = to_float(values)
@@ -215,7 +215,7 @@ def test_device_memory_is_not_numpys() -> None:
     np.testing.assert_array_equal(own.numpy(), np.arange(6))
 
 
-def test_every_part_can_be_replaced(one_gateway: Record) -> None:
+def test_field_initial_values_and_loss_can_be_replaced(one_gateway: Record) -> None:
     """A model, starting values and a loss of one's own."""
     rng = np.random.default_rng(0)
     start = random_gaussians(RECEIVERS[:1], 8, rng, size_deg=20.0)
@@ -225,22 +225,22 @@ def test_every_part_can_be_replaced(one_gateway: Record) -> None:
         calls.append((batch, height, width))
         return dr.mean(dr.square(prediction - truth))
 
-    heard: list[Progress] = []
+    received: list[Progress] = []
     config = settings("steps=1", "batch=2", "log_every=1", "holdout_steps_fraction=1")
     split = official(one_gateway)
     trainer = Trainer(one_gateway, split, config, field=small_field("wrf-gs"), initial=start, loss=squares)
     np.testing.assert_allclose(trainer.state.params()["position"].T, start.position_m, rtol=1e-6)
     rows = trainer.schedule.rows[0]
     greys = trainer.predictor()(one_gateway.tx_pos_m[rows])
-    trainer.run(heard.append)
+    trainer.run(received.append)
     assert calls == [(2, *SIZE)]
     expected = np.mean((greys - one_gateway.observation[0, rows]) ** 2)
-    assert heard[0].loss == pytest.approx(expected, rel=1e-4)
+    assert received[0].loss == pytest.approx(expected, rel=1e-4)
 
 
 def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
     """On the batch's rows at the batch's receiver, before the step; with 8, 12 and 18 Gaussians too."""
-    heard: list[Progress] = []
+    received: list[Progress] = []
     own = (
         "density.every=3",
         "density.start=0",
@@ -256,12 +256,12 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
         greys = Predictor(field, params, two_gateways.receivers, *SIZE)(two_gateways.tx_pos_m[rows], r)
         truth = two_gateways.observation[r, rows]
         expected.append(0.8 * np.abs(greys - truth).mean() + 0.2 * (1 - ssim(greys, truth).mean()))
-        trainer.run(heard.append, stop=stop_after(1))
-    np.testing.assert_allclose([p.loss for p in heard], expected, rtol=1e-4)
-    assert [p.gaussians for p in heard] == [8, 8, 12, 12, 12, 18, 18, 18, 18, 18]
+        trainer.run(received.append, stop=stop_after(1))
+    np.testing.assert_allclose([p.loss for p in received], expected, rtol=1e-4)
+    assert [p.gaussians for p in received] == [8, 8, 12, 12, 12, 18, 18, 18, 18, 18]
 
 
-def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
+def test_unsuitable_receivers_and_models_are_refused(one_gateway: Record) -> None:
     levels = replace(one_gateway, task="rssi", observation=one_gateway.observation[..., 0, 0])
     with pytest.raises(InputError, match="receiver model array does not report rssi; choose from power"):
         Trainer(levels, official(levels), settings("receiver=array"))
@@ -269,7 +269,7 @@ def test_data_of_another_kind_are_refused(one_gateway: Record) -> None:
         Trainer(one_gateway, official(one_gateway), settings("model=nerf2"))
 
 
-def test_points_as_a_start(one_gateway: Record, tmp_path: Path) -> None:
+def test_gaussians_start_on_a_point_cloud(one_gateway: Record, tmp_path: Path) -> None:
     cloud = np.random.default_rng(0).normal((0, 0, 3), size=(30, 3))
     np.savez(tmp_path / "cloud.npz", points=cloud)
     own = (f"initial.points={tmp_path / 'cloud.npz'}", "initial.opacity=0.3", "steps=1")
@@ -280,7 +280,7 @@ def test_points_as_a_start(one_gateway: Record, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_the_group_that_broke_is_named(model: str, one_gateway: Record) -> None:
+def test_non_finite_parameter_group_is_named(model: str, one_gateway: Record) -> None:
     """The loss is finite; one group's gradient alone is not, from the third step on."""
     trainer = Trainer(one_gateway, official(one_gateway), settings("steps=20", "log_every=20", model=model))
     trainer.run(stop=stop_after(2))
@@ -321,7 +321,7 @@ def test_squares_of_gradients_that_overflow_are_reported(one_gateway: Record) ->
     assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
 
 
-def test_no_checkpoint_holds_what_is_not_finite(one_gateway: Record) -> None:
+def test_checkpoints_hold_finite_values_only(one_gateway: Record) -> None:
     saved: list[dict[str, np.ndarray]] = []
     own = (
         "steps=30",

@@ -1,9 +1,9 @@
-"""The one place that finds LLVM or CUDA and sets Mitsuba's variant.
+"""Choice of LLVM or CUDA and of Mitsuba's variant.
 
-Dr.Jit loads the newest LLVM it finds as soon as it is imported, and an LLVM that is too old does not raise:
-15 and 16 end the process in the first kernel with a minimum or maximum. So every library is tried once in a
-process of its own (the verdict is remembered per file), and the one that passed is named to Dr.Jit before
-its first import. Call `init` before importing drjit, mitsuba or sionna.
+Dr.Jit loads the newest LLVM at its import, and one that is too old does not raise: 15 and 16 end the process in the
+first kernel with a minimum or maximum. So every library is tried once in a separate process (the verdict is cached per
+file), and the first that works is named to Dr.Jit before its import. Call `init` before importing drjit, mitsuba or
+sionna.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _TOO_EARLY = "Dr.Jit was imported before wrf_mi.backend.init() and"
 
 @dataclass(frozen=True)
 class Backend:
-    """What computes.
+    """Backend of Dr.Jit.
 
     Attributes:
         name: ``"llvm"`` or ``"cuda"``.
         variant: Mitsuba's variant.
-        llvm_path: the LLVM library in use; None for CUDA, or if it cannot be told.
+        llvm_path: the LLVM library in use; None for CUDA, or if unknown.
         llvm_version: e.g. ``"19.1.7"``; None for CUDA.
         device: name of the GPU or of the processor.
     """
@@ -61,14 +61,14 @@ _lock = threading.Lock()
 
 
 def init(backend: str = "auto", threads: int | None = None) -> Backend:
-    """Chooses what computes, imports Dr.Jit and Mitsuba and sets the variant; later calls return the same.
+    """Choose a backend, import Dr.Jit and Mitsuba and set the variant; later calls return the same backend.
 
     Args:
         backend: ``"auto"`` (CUDA if it works, else LLVM), ``"llvm"`` or ``"cuda"``.
-        threads: number of threads for LLVM kernels; None leaves Dr.Jit's own choice, all cores.
+        threads: number of threads for LLVM kernels; None: Dr.Jit's default, all cores.
 
     Raises:
-        BackendError: nothing usable was found, or another backend is already in use: one line with the remedy.
+        BackendError: no usable library, or another backend is already in use: one line with the remedy.
         InputError: unknown ``backend``, or fewer than one thread.
     """
     global _active
@@ -93,9 +93,9 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
 def set_threads(threads: int) -> None:
     """Change the number of threads that LLVM kernels run on.
 
-    What was traced or launched before has room for the sums of as many threads as there were then, and more would
-    write beyond it (Dr.Jit 1.5, ``scatter_reduce``), so it is computed first. `wrf_mi.backend.recorded` sees to
-    functions that are recorded.
+    Kernels traced or launched before have room for the sums of the threads at that time, and more threads write beyond
+    it (Dr.Jit 1.5, ``scatter_reduce``), so they are evaluated first. For recorded functions see
+    `wrf_mi.backend.recorded`.
 
     Args:
         threads: 1 or more.
@@ -109,14 +109,14 @@ def set_threads(threads: int) -> None:
 
 
 def choose(backend: str = "auto", *, fresh: bool = False) -> Backend:
-    """What `init` would use in a new process. Dr.Jit is not imported here.
+    """The backend that `init` uses in a new process; does not import Dr.Jit.
 
     Args:
-        backend: as in `init`.
-        fresh: try every library again, whatever is remembered.
+        backend: ``"auto"``, ``"llvm"`` or ``"cuda"``.
+        fresh: try every library again instead of using cached verdicts.
 
     Raises:
-        BackendError: nothing usable was found: one line with the remedy.
+        BackendError: no usable library: one line with the remedy.
         InputError: unknown ``backend``.
     """
     _check_arguments(backend, None)
@@ -132,9 +132,9 @@ def _check_arguments(backend: str, threads: int | None) -> None:
 
 
 def _start(backend: str) -> Backend:
-    """The choice for this process; names the LLVM to Dr.Jit if that is still possible."""
+    """The backend of this process; names its library to Dr.Jit if Dr.Jit is not imported yet."""
     if backend == "auto" and "mitsuba" in sys.modules:
-        # A variant that was set on purpose decides, if it is one that we can use.
+        # A usable variant that is already set is kept.
         variant = sys.modules["mitsuba"].variant()
         backend = next((name for name, ours in VARIANTS.items() if ours == variant), backend)
     if "drjit" in sys.modules:
@@ -184,7 +184,7 @@ def _good_llvm(*, ignore_variable: bool) -> LlvmLibrary | None:
 
 
 def _judge_loaded(backend: str) -> Backend:
-    """What Dr.Jit has already loaded, if it is good."""
+    """The backend that Dr.Jit has already loaded, if it is usable."""
     import drjit as dr
 
     cuda = None if backend == "llvm" else _choose_cuda(required=backend == "cuda", fresh=False)
@@ -198,7 +198,7 @@ def _judge_loaded(backend: str) -> Backend:
     version: tuple[int, ...] = dr.detail.llvm_version()
     path = _loaded_llvm()
     if path is None:
-        # Nothing says which file it is, so it cannot be tried: only its version can speak for it.
+        # The file is unknown and cannot be tried; its version decides.
         usable, reason = version[0] >= GOOD_FROM, f"which is older than {GOOD_FROM}"
     else:
         verdict = try_llvm(LlvmLibrary(path, version))
@@ -212,13 +212,13 @@ def _judge_loaded(backend: str) -> Backend:
 
 
 def _loaded_llvm() -> Path | None:
-    """The LLVM mapped into this process (Linux), or the one that was asked for."""
+    """The LLVM mapped into this process (Linux), or the one that `LLVM_VARIABLE` names."""
     try:
         with open("/proc/self/maps") as maps:
             files = {line.split(maxsplit=5)[5].strip() for line in maps if "/libLLVM" in line}
     except OSError:
         files = set()
-    # More than one (a graphics driver loads its own) leaves open which is Dr.Jit's.
+    # With several (a graphics driver loads another) Dr.Jit's is unknown.
     name = files.pop() if len(files) == 1 else os.environ.get(LLVM_VARIABLE)
     return Path(name) if name and Path(name).is_file() else None
 

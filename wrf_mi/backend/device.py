@@ -1,10 +1,9 @@
-"""From NumPy to memory of Dr.Jit's own: the one way in.
+"""Copies of NumPy arrays in memory that Dr.Jit owns.
 
-On a CPU, Dr.Jit 1.5 wraps NumPy's memory as it is. Three things are wrong with that. Kernels read whole packets of 8 or
-16 numbers, and so beyond the end of an array whose size is no multiple of them: where the next page is nobody's, the
-process ends. The memory is given back when one of Dr.Jit's own threads drops the last use, which needs Python's lock;
-a function that is being recorded holds it, and the process then hangs or ends. And kernels say how memory is aligned:
-what lies elsewhere in the next process would be compiled again. What is copied here belongs to Dr.Jit alone.
+On a CPU, Dr.Jit 1.5 wraps NumPy's memory, with three defects. Kernels read whole packets of 8 or 16 numbers, beyond the
+end of an array whose size is not a multiple: on an unmapped page the process ends. A thread of Dr.Jit that drops the
+last use frees the memory, which needs Python's lock: while a function is recorded the process hangs or ends. And
+kernels depend on the alignment of memory, so that another process compiles them again.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 PACKET = 64
-"""Numbers after the end of what Dr.Jit wraps, whatever they are: no packet of LLVM's is longer."""
+"""Readable numbers after the end of an array that Dr.Jit wraps: no packet of LLVM is longer."""
 HOST: dict[Any, type[np.generic]] = {
     dr.VarType.Float32: np.float32,
     dr.VarType.Float64: np.float64,
@@ -29,19 +28,19 @@ HOST: dict[Any, type[np.generic]] = {
 
 
 def on_device(values: ArrayLike, kind: Any) -> Any:
-    """All values in a row as an evaluated array of type ``kind``: floats, integers of 32 bits or a mask."""
+    """All values as a flat, evaluated array of type ``kind``: floats, integers of 32 bits or a mask."""
     wrapped = kind(with_room(values, HOST[dr.type_v(kind)]))
     if not dr.width(wrapped):
         return wrapped
-    # A gather of all or a sum with zero would be seen through: Dr.Jit then hands out the wrapped array itself.
-    own = wrapped & dr.opaque(kind, True) if dr.is_mask_v(kind) else wrapped * dr.opaque(kind, 1)
-    dr.eval(own)
+    # Dr.Jit removes a gather of all values or a sum with zero, and would return the wrapped array.
+    copy = wrapped & dr.opaque(kind, True) if dr.is_mask_v(kind) else wrapped * dr.opaque(kind, 1)
+    dr.eval(copy)
     dr.sync_thread()
-    return own
+    return copy
 
 
 def with_room(values: ArrayLike, kind: type[np.generic]) -> NDArray[Any]:
-    """A flat copy of all values with room behind it for the rest of a packet."""
+    """A flat copy of all values, with room for the rest of a packet after its end."""
     given = np.asarray(values)
     room: NDArray[Any] = np.zeros(given.size + PACKET, kind)[: given.size]
     np.copyto(room.reshape(given.shape), given, casting="unsafe")
@@ -60,9 +59,9 @@ def to_uint(values: ArrayLike) -> Any:
 
 def to_tensor(values: ArrayLike, kind: Any = None) -> Any:
     """A Dr.Jit tensor of the same shape, float32 or of another type of arrays ``kind``."""
-    own = mi.Float if kind is None else kind
-    tensor: Any = dr.tensor_t(own)
-    return tensor(on_device(values, own), np.shape(values))
+    kind = kind or mi.Float
+    tensor: Any = dr.tensor_t(kind)
+    return tensor(on_device(values, kind), np.shape(values))
 
 
 def to_vectors(rows: ArrayLike, kind: Any) -> Any:

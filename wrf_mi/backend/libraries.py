@@ -1,6 +1,6 @@
-"""Finds the LLVM and CUDA libraries on this machine without loading one into this process.
+"""Search for LLVM and CUDA libraries without loading one into this process.
 
-Names of the files: Debian and Ubuntu have ``libLLVM-14.so.1`` and ``libLLVM.so.19.1``, Fedora
+File names: Debian and Ubuntu have ``libLLVM-14.so.1`` and ``libLLVM.so.19.1``, Fedora
 ``libLLVM-17.so`` and ``libLLVM.so.20.1``, Homebrew ``libLLVM.dylib`` and ``libLLVM-19.dylib``.
 """
 
@@ -21,7 +21,7 @@ from .cache import file_key, recall, remember
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"
-"""The environment variables by which Dr.Jit is told which library to load."""
+"""Environment variables that name the libraries for Dr.Jit to load."""
 
 READ_TIMEOUT_S = 60
 """Loading an LLVM takes 0.1 s; a cold network disk may need much longer."""
@@ -40,8 +40,8 @@ class LlvmLibrary:
     """An LLVM shared library.
 
     Attributes:
-        path: the file itself, symbolic links resolved.
-        version: as far as it is known, e.g. ``(19, 1)`` or ``(14,)``; empty if it cannot be told.
+        path: the file, symbolic links resolved.
+        version: its known part, e.g. ``(19, 1)`` or ``(14,)``; empty if unknown.
     """
 
     path: Path
@@ -64,10 +64,9 @@ def version_from_name(name: str) -> tuple[int, ...] | None:
 
 
 def read_version(path: Path) -> tuple[int, ...]:
-    """The version that the library itself reports (LLVM 16 and newer), or ``()``.
+    """The version that the library reports (LLVM 16 and newer), or ``()``.
 
-    The library is loaded in a process of its own (LLVM registers global state and a foreign library
-    may end the process), once per file: the answer is kept in the user's cache folder.
+    The library is loaded once, in a separate process, as it may end it; the answer is stored in the user's cache.
     """
     key = f"version|{file_key(path)}"
     known = recall(key)
@@ -85,11 +84,11 @@ def read_version(path: Path) -> tuple[int, ...]:
 def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
     """All LLVM libraries of this machine, newest first.
 
-    If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file): whoever
-    sets it means it. Neither Dr.Jit nor an LLVM is loaded.
+    If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file). Neither Dr.Jit nor an
+    LLVM is loaded.
 
     Args:
-        ignore_variable: look at the usual places even so.
+        ignore_variable: ignore ``DRJIT_LIBLLVM_PATH``.
     """
     asked = None if ignore_variable else os.environ.get(LLVM_VARIABLE)
     files = [file for file in [Path(asked)] if file.is_file()] if asked else list(_llvm_files())
@@ -103,10 +102,7 @@ def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
 
 
 def find_cuda() -> Path | None:
-    """The NVIDIA driver's library if it is installed and a device is there to drive, else None.
-
-    Whether the two work together only a trial can tell (see ``probe``).
-    """
+    """The NVIDIA driver's library if it is installed and there is a device, else None (untested, see ``probe``)."""
     asked = os.environ.get(CUDA_VARIABLE)
     if asked:
         return Path(asked) if Path(asked).is_file() else None
@@ -128,12 +124,10 @@ def _llvm_files() -> Iterator[Path]:
 
 def _library_folders() -> list[Path]:
     """Existing folders in which a system's package manager, Conda or Homebrew puts shared libraries."""
-    listed = [
-        *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep),
-        *os.environ.get("DYLD_LIBRARY_PATH", "").split(os.pathsep),
-    ]
+    listed = [os.environ.get(f"{system}LD_LIBRARY_PATH", "").split(os.pathsep) for system in ("", "DY")]
     roots = [sys.prefix, os.environ.get("CONDA_PREFIX", "")]
-    patterns = [folder for folder in listed if folder] + [f"{root}/lib" for root in roots if root]
+    patterns = [folder for entries in listed for folder in entries if folder]
+    patterns += [f"{root}/lib" for root in roots if root]
     if sys.platform == "darwin":
         patterns += [
             "/opt/homebrew/opt/llvm*/lib",
@@ -159,7 +153,7 @@ def _library_folders() -> list[Path]:
 
 
 def _linker_cache(start: str) -> list[Path]:
-    """Libraries whose name starts with ``start`` that the dynamic linker knows (Linux only)."""
+    """Libraries of the dynamic linker's cache whose names start with ``start`` (Linux only)."""
     # Root's folders are often missing from a user's PATH.
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
     if ldconfig is None or sys.platform == "darwin":

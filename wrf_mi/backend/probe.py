@@ -1,4 +1,4 @@
-"""Tries a library in a process of its own before it is let into this one."""
+"""Trial of a library in a separate process before this one loads it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
 from .cache import file_key, recall, remember
@@ -25,10 +25,10 @@ OLDEST_TRIED = 17
 """LLVM 14 is refused by Dr.Jit 1.5; 15 and 16 have no instruction for a minimum or maximum and end the process."""
 
 TRIAL_TIMEOUT_S = 180
-"""A trial takes about a second; the first start of a CUDA driver may take a minute."""
+"""A trial takes about a second, with the first start of a CUDA driver up to a minute."""
 
 FAILURE_KEPT_S = 24 * 3600
-"""A failure is looked at again after a day: its cause may have been a busy GPU. `doctor` looks at once."""
+"""A failed library is tried again after a day: the GPU may have been busy. `wrf-mi doctor` tries at once."""
 
 _REASON_LENGTH = 160
 _SCRIPT = Path(__file__).with_name("trial.py")
@@ -36,12 +36,12 @@ _SCRIPT = Path(__file__).with_name("trial.py")
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a trial showed.
+    """Result of a trial.
 
     Attributes:
-        usable: it can be used.
-        reason: why not, as a verb phrase ("is too old for Dr.Jit"); empty if it can.
-        version: as the library itself reports it, e.g. ``"19.1.7"``; empty if it cannot be used.
+        usable: whether the library can be used.
+        reason: reason against it, a verb phrase ("is too old for Dr.Jit"); empty for a usable library.
+        version: version that the library reports, e.g. ``"19.1.7"``; empty for an unusable library.
         device: name of the GPU; empty for LLVM.
     """
 
@@ -52,51 +52,46 @@ class Verdict:
 
 
 def try_llvm(library: LlvmLibrary, *, fresh: bool = False) -> Verdict:
-    """Whether Dr.Jit works with an LLVM. ``fresh`` tries again whatever is remembered."""
+    """Whether Dr.Jit works with an LLVM; ``fresh`` ignores the cache."""
     if library.version and library.version[0] < OLDEST_TRIED:
         return Verdict(False, "is too old for Dr.Jit")
     return _try("llvm", LLVM_VARIABLE, library.path, fresh)
 
 
 def try_cuda(driver: Path, *, fresh: bool = False) -> Verdict:
-    """Whether Dr.Jit and Mitsuba work with the NVIDIA driver and a device. ``fresh`` as above."""
+    """Whether Dr.Jit and Mitsuba work with the NVIDIA driver and a device; ``fresh`` ignores the cache."""
     return _try("cuda", CUDA_VARIABLE, driver, fresh)
 
 
 def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
     try:
-        key = "|".join([name, file_key(library), *_surroundings(name)])
+        key = "|".join([name, file_key(library), *_environment(name)])
     except OSError as error:
         return Verdict(False, f"cannot be read: {error.strerror}")
     known = None if fresh else recall(key)
     if known is not None:
-        return Verdict(known["usable"], known["reason"], known["version"], known["device"])
+        return Verdict(**{field.name: known[field.name] for field in fields(Verdict)})
     verdict, final = _run_trial(VARIANTS[name], variable, library)
     if final:
-        remember(key, vars(verdict), None if verdict.usable else FAILURE_KEPT_S)
+        remember(key, vars(verdict), float("inf") if verdict.usable else FAILURE_KEPT_S)
     return verdict
 
 
-def _surroundings(name: str) -> list[str]:
-    """What a verdict depends on beside the file: a home folder may be shared by different machines."""
-    versions = []
-    for package in ("drjit", "mitsuba"):
-        try:
-            versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            versions.append(f"{package} ?")
+def _environment(name: str) -> list[str]:
+    """Packages, script, machine and devices; several machines may share a home folder."""
+    versions = [f"{package} {version(package)}" for package in ("drjit", "mitsuba")]
     devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if name == "cuda" else ""
     return [*versions, sha256(_SCRIPT.read_bytes()).hexdigest()[:12], platform.node(), devices]
 
 
 def _run_trial(variant: str, variable: str, library: Path) -> tuple[Verdict, bool]:
-    """The verdict, and whether it is worth remembering."""
+    """The verdict, and whether to store it."""
     with tempfile.TemporaryDirectory() as kernels:
         environment = os.environ | {
             variable: str(library),
-            # Kernels compiled earlier, by another library perhaps, must not hide what this one can do.
+            # Kernels that another library compiled must not be reused.
             "DRJIT_CACHE_DIR": kernels,
-            # The child must import the very packages that this process would.
+            # The child must import the same packages as this process.
             "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),
         }
         try:
@@ -122,14 +117,14 @@ def _run_trial(variant: str, variable: str, library: Path) -> tuple[Verdict, boo
 
 
 def _reason(status: int, errors: str) -> str:
-    """One short line of what a failed trial left behind."""
+    """Reason for a failed trial from its status and standard error."""
     missing = re.search(r"(\S+): cannot open shared object file", errors)
     if missing:
         return f"fails: {missing[1]} is missing"
     lines = [line.strip() for line in errors.splitlines() if line.strip()]
-    said = next((line for line in lines if line.startswith("LLVM ERROR")), lines[-1] if lines else "")
-    said = re.sub(r"\s*\b0x[0-9a-f]+\b[:,]?", "", said).removeprefix("RuntimeError: ")[:_REASON_LENGTH]
+    line = next((text for text in lines if text.startswith("LLVM ERROR")), lines[-1] if lines else "")
+    line = re.sub(r"\s*\b0x[0-9a-f]+\b[:,]?", "", line).removeprefix("RuntimeError: ")[:_REASON_LENGTH]
     if status < 0:
         ended = f"ends the process with {signal.Signals(-status).name}"
-        return f"{ended}: {said}" if said else ended
-    return f"fails: {said}" if said else f"fails with status {status}"
+        return f"{ended}: {line}" if line else ended
+    return f"fails: {line}" if line else f"fails with status {status}"

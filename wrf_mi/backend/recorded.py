@@ -12,15 +12,13 @@ import drjit as dr
 class Recorded:
     """A function that Dr.Jit records on its first call and replays from then on (`dr.freeze`).
 
-    Python's garbage collector waits meanwhile: an array that it frees while Dr.Jit records, one that wraps
-    NumPy's memory for instance, ends the process.
-
-    What was recorded has room for the sums of as many threads as there were then, and more threads write beyond it
-    (Dr.Jit 1.5): where there are more now, it is recorded anew.
+    Python's garbage collector is off meanwhile: freeing an array while Dr.Jit records, such as one that wraps NumPy's
+    memory, ends the process. A recording has room for the sums of the threads at that time, and more threads write
+    beyond it (Dr.Jit 1.5): with more threads the function is recorded anew.
 
     Args:
-        function: what is recorded.
-        state: arrays that the function reads beside its arguments, asked for before each call; None: it reads none.
+        function: function to record.
+        state: returns arrays that the function reads beside its arguments, called before each call; None: no arrays.
     """
 
     def __init__(self, function: Callable[..., Any], state: Callable[[], Any] | None = None) -> None:
@@ -33,7 +31,11 @@ class Recorded:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            self._fit_threads()
+            threads = dr.thread_count()
+            if threads > self._threads:
+                self._dropped += self._frozen.n_recordings
+                self._frozen.clear()
+                self._threads = threads
             return self._frozen(*arguments)
         finally:
             if collecting:
@@ -41,14 +43,6 @@ class Recorded:
 
     @property
     def n_recordings(self) -> int:
-        """How often the function was recorded."""
+        """Number of recordings of the function."""
         recordings: int = self._dropped + self._frozen.n_recordings
         return recordings
-
-    def _fit_threads(self) -> None:
-        """Drop what fewer threads have recorded."""
-        threads = dr.thread_count()
-        if threads > self._threads:
-            self._dropped += self._frozen.n_recordings
-            self._frozen.clear()
-            self._threads = threads

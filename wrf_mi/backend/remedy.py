@@ -1,7 +1,4 @@
-"""The one line that installs what Dr.Jit needs from this system: LLVM and, beside it, libatomic.
-
-Dr.Jit's wheel is linked to ``libatomic.so.1``, which a small Debian does not have.
-"""
+"""Commands that install LLVM, and libatomic, to which Dr.Jit's wheel is linked and which a small Debian lacks."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import subprocess
 import sys
 
 GOOD_FROM = 19
-"""Oldest LLVM that is known to work with Dr.Jit 1.5."""
+"""Oldest LLVM that works with Dr.Jit 1.5 in our tests."""
 
 
 def package_manager() -> str | None:
@@ -22,7 +19,7 @@ def package_manager() -> str | None:
 
 
 def apt_packages() -> list[str]:
-    """Packages of a good LLVM that the lists on this Debian or Ubuntu know, newest first; may be empty."""
+    """Packages of a suitable LLVM in the package lists of this Debian or Ubuntu, newest first; may be empty."""
     command = ["apt-cache", "search", "--names-only", "^libllvm[0-9]+"]
     try:
         listing = subprocess.run(command, capture_output=True, text=True).stdout
@@ -35,7 +32,7 @@ def apt_packages() -> list[str]:
 
 
 def install_commands() -> list[list[str]]:
-    """Commands of which each installs an LLVM, best first, without ``sudo``; empty for an unknown system."""
+    """Alternative commands that install an LLVM, best first, without ``sudo``; empty for an unknown system."""
     manager = package_manager()
     if manager == "apt-get":
         names = apt_packages() or [f"libllvm{GOOD_FROM}"]
@@ -46,11 +43,10 @@ def install_commands() -> list[list[str]]:
 
 
 def install_line() -> str:
-    """The command for a person to run, or advice where the package manager is another."""
+    """The command to run, or advice for a system without a known package manager."""
     commands = install_commands()
     if not commands:
         return f"install LLVM {GOOD_FROM} or newer, or set DRJIT_LIBLLVM_PATH to its libLLVM"
     sudo = "sudo " if commands[0][0] != "brew" and os.geteuid() != 0 else ""
-    # A small system has no package lists yet.
     update = f"{sudo}apt-get update && " if package_manager() == "apt-get" and not apt_packages() else ""
     return update + sudo + " ".join(commands[0])

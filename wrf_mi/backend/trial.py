@@ -1,8 +1,7 @@
-"""Tries whether Dr.Jit works with the library it is given; run as a script, in a process of its own.
+"""Trial of Dr.Jit with one library; run as a script in a separate process.
 
 ``python trial.py VARIANT`` prints one JSON line with the version and the device and ends with status 0,
-or fails in whatever way the library fails; an LLVM that lacks an instruction ends the process with SIGABRT.
-Only Dr.Jit and Mitsuba are imported, so that nothing else can be the cause.
+or fails; an LLVM that lacks an instruction ends the process with SIGABRT. It imports Dr.Jit and Mitsuba only.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ RELATIVE_TOLERANCE = 1e-5
 
 
 def check_arithmetic(dr: Any, number: Any) -> None:
-    """Minimum and maximum (which LLVM 15 and 16 lack) and common functions, against Python's own."""
+    """Minimum and maximum (which LLVM 15 and 16 lack) and common functions, against Python's functions."""
     x = dr.arange(number, N) * 0.25 - 10
     bounded = dr.minimum(dr.maximum(x, -3), 5)
     value = dr.sin(bounded) + dr.sqrt(bounded + 4) * dr.exp2(-bounded) + dr.select(x > 0, dr.rcp(x + 20), 0)
@@ -73,11 +72,11 @@ def cuda_device() -> str:
 
 
 def main(variant: str) -> None:
-    """Tries everything and prints what was found."""
+    """Run all checks and print version and device."""
     with contextlib.suppress(ImportError):
         import resource
 
-        # A failure is an answer here: it leaves no core file.
+        # A failed trial leaves no core file.
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     cuda = variant.startswith("cuda")
     device = cuda_device() if cuda else ""

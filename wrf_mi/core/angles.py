@@ -1,10 +1,8 @@
-"""The one place for directions, pixels and orientations.
+"""Directions, pixels and orientations.
 
-Azimuth runs from +x towards +y, elevation from the array's x-y plane towards its normal +z, both in
-the receiver's own frame and in radians. Sample (row r, column c) of an H x W spectrum is the *point*
-at elevation ``r * 90 / H`` degrees and azimuth ``c * 360 / W`` degrees; the azimuth wraps. (The
-WRF-GS+ paper puts column 0 at -180 degrees in its projection formulas and at 0 in its spectrum matrix;
-the measured data have it at 0.)
+Azimuth runs from +x towards +y, elevation from the array's x-y plane towards its normal +z, both in the receiver's
+frame and in radians. Sample (row r, column c) of an H x W spectrum is the *point* at elevation ``r * 90 / H`` degrees
+and azimuth ``c * 360 / W`` degrees; the azimuth wraps.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
-"""Largest accepted departure of a quaternion's norm from one: files carry five or more digits."""
+"""Largest accepted deviation of a quaternion's norm from one: files carry five or more digits."""
 
 
 def elevation_rad(height: int) -> FloatArray:
@@ -26,8 +24,7 @@ def elevation_rad(height: int) -> FloatArray:
 def sphere_elevation_rad(height: int) -> FloatArray:
     """Elevation of each of ``height`` rows over the full sphere, in radians, shape [height].
 
-    Row r lies at ``-90 + r * 180 / height`` degrees: row 0 points down, and the zenith has no row, as on the
-    hemisphere.
+    Row r lies at ``-90 + r * 180 / height`` degrees: row 0 points down, and no row at the zenith.
     """
     return np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
 
@@ -45,7 +42,7 @@ def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> FloatArray:
         elevation: radians, a shape that broadcasts with ``azimuth``.
 
     Returns:
-        The broadcast shape with a last axis (x, y, z).
+        Vectors of the broadcast shape with a last axis (x, y, z).
     """
     az, el = np.broadcast_arrays(np.asarray(azimuth, float), np.asarray(elevation, float))
     return np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
@@ -67,8 +64,7 @@ def equirectangular_sphere(height: int, width: int) -> FloatArray:
 def solid_angles(height: int, width: int) -> FloatArray:
     """Weight of each pixel in an integral over the upper hemisphere, [height * width], steradian.
 
-    cos(elevation) times the pixel's angles, by the trapezoidal rule: the horizon counts half, and half again in the
-    lower hemisphere.
+    cos(elevation) times the pixel's angles, by the trapezoidal rule: the horizon counts half in each hemisphere.
     """
     rows = np.cos(elevation_rad(height)) * (np.pi / 2 / height) * (2 * np.pi / width)
     rows[0] /= 2
@@ -86,7 +82,8 @@ def azimuth_elevation(vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:
 def rotation_matrix(quaternion_xyzw: ArrayLike) -> FloatArray:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] in the order x, y, z, w.
 
-    The quaternions are normalised first. Source: Shuster, "A survey of attitude representations" (1993).
+    The quaternions are normalised first; unknown ones (NaN), which SciPy refuses, give NaN. Source: Shuster, "A survey
+    of attitude representations" (1993).
     """
     q = np.asarray(quaternion_xyzw, float)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)

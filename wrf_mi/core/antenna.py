@@ -15,18 +15,17 @@ if TYPE_CHECKING:
     from .types import Record
 
 OMNIDIRECTIONAL = ("iso", "dipole", "hw_dipole")
-"""Names of Sionna RT's antenna patterns that are the same at all azimuths: isotropic, short and half-wave dipole."""
+"""Sionna RT's antenna patterns without dependence on azimuth: isotropic, short and half-wave dipole."""
 PATTERNS = (*OMNIDIRECTIONAL, "tr38901")
-"""Names of Sionna RT's antenna patterns; the last is the element of 3GPP TR 38.901."""
+"""Sionna RT's antenna patterns; the last is the element of 3GPP TR 38.901."""
 POLARIZATIONS = ("V", "H")
-"""Names of Sionna RT's polarisations with one port: slant angles of 0 and 90 degrees."""
+"""Sionna RT's polarisations with one port: slant angles of 0 and 90 degrees."""
 FRAMES = ("world", "array")
 
-# Rows: the array's axes x, y, z in those of a Sionna RT device, whose arrays lie in y-z with boresight +x:
-# array x = device y, array y = device z, array z = device x. A cyclic change, so a proper rotation.
+# Arrays of a Sionna RT device lie in y-z with boresight +x: array x = device y, array y = device z, array z = device x.
 DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-"""Quaternion of a frame that is the world's."""
+"""Quaternion of a frame parallel to the world's."""
 POLE = 1e-12
 """Squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does."""
 
@@ -35,15 +34,15 @@ POLE = 1e-12
 class Antenna:
     """Pattern and polarisation of an antenna.
 
-    The pattern is Sionna RT's function of zenith and azimuth angle in the antenna's own frame, whose z axis is the axis
+    The pattern is Sionna RT's function of zenith and azimuth angle in the antenna's frame, whose z axis is the axis
     of a dipole and whose x axis is the boresight of a directional element. The polarisation turns the field about the
     direction of propagation and leaves the pattern's amplitude as it is (model 2 of 3GPP TR 38.901, section 7.3.2).
 
     Attributes:
-        pattern: one of `PATTERNS`.
-        polarization: ``"V"``: along the unit vector of the zenith angle; ``"H"``: along that of the azimuth.
-        frame: ``"world"``: the antenna's z axis is the world's, however the array is turned. ``"array"``: the antenna
-            is turned with the array: its z axis is the array's y axis, its boresight the array's normal.
+        pattern: name in `PATTERNS`.
+        polarization: ``"V"``: along the unit vector of the zenith angle; ``"H"``: along the unit vector of the azimuth.
+        frame: ``"world"``: the antenna's z axis is the world's, for any orientation of the array. ``"array"``: its z
+            axis is the array's y axis, its boresight the array's normal.
     """
 
     pattern: str = "iso"
@@ -51,10 +50,10 @@ class Antenna:
     frame: str = "world"
 
     def __post_init__(self) -> None:
-        """Refuse unknown names, and a boresight that nothing tells.
+        """Refuse unknown names, and a directional pattern without orientation.
 
         Raises:
-            InputError: naming the attribute and what it may be.
+            InputError: naming the attribute and its values.
         """
         for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
             if getattr(self, name) not in known:
@@ -68,7 +67,7 @@ class Antenna:
 
     @property
     def turned(self) -> Antenna:
-        """The same antenna with its polarisation turned by 90 degrees."""
+        """The antenna with its polarisation turned by 90 degrees."""
         return replace(self, polarization="H" if self.polarization == "V" else "V")
 
     def to_world(self, orientation_xyzw: ArrayLike) -> FloatArray:
@@ -138,14 +137,14 @@ ANTENNA = Antenna()
 
 @dataclass(frozen=True)
 class AntennaOptions:
-    """What is stated of antennas in place of what the data say; None: as the data say.
+    """Antennas that replace those in the data; None: no replacement.
 
     Attributes:
         rx_pattern: pattern of every receiver's antennas.
-        rx_polarization: their polarisation.
-        rx_frame: their frame.
+        rx_polarization: polarisation of every receiver's antennas.
+        rx_frame: frame of every receiver's antennas.
         tx_pattern: pattern of the transmitter's antenna.
-        tx_polarization: its polarisation.
+        tx_polarization: polarisation of the transmitter's antenna.
     """
 
     rx_pattern: str | None = None
@@ -155,8 +154,8 @@ class AntennaOptions:
     tx_polarization: str | None = None
 
     def __bool__(self) -> bool:
-        """Whether anything is stated."""
-        return any(getattr(self, one.name) is not None for one in fields(self))
+        """Whether any attribute is stated."""
+        return any(getattr(self, field.name) is not None for field in fields(self))
 
     def of(self, record: Record) -> Record:
         """A record with these antennas.
@@ -166,13 +165,11 @@ class AntennaOptions:
         """
         if not self:
             return record
-        stated = {"pattern": self.rx_pattern, "polarization": self.rx_polarization, "frame": self.rx_frame}
-        own = {key: value for key, value in stated.items() if value is not None}
-        receivers = tuple(replace(one, antenna=replace(one.antenna, **own)) for one in record.receivers)
-        stated = {"pattern": self.tx_pattern, "polarization": self.tx_polarization}
-        sent = {key: value for key, value in stated.items() if value is not None}
-        return replace(record, receivers=receivers, tx_antenna=replace(record.tx_antenna, **sent))
+        stated = [(*field.name.split("_"), getattr(self, field.name)) for field in fields(self)]
+        rx, tx = ({key: value for end, key, value in stated if end == which and value} for which in ("rx", "tx"))
+        receivers = tuple(replace(receiver, antenna=replace(receiver.antenna, **rx)) for receiver in record.receivers)
+        return replace(record, receivers=receivers, tx_antenna=replace(record.tx_antenna, **tx))
 
 
 AS_STATED = AntennaOptions()
-"""Antennas as the data state them."""
+"""Antennas as in the data."""

@@ -1,4 +1,4 @@
-"""Geometry of antenna arrays: elements in the array's x-y plane, boresight +z (see `wrf_mi.core.angles`)."""
+"""Geometry of antenna arrays: elements in the array's x-y plane, boresight +z (`wrf_mi.core.angles`)."""
 
 from __future__ import annotations
 

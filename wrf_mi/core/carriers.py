@@ -19,12 +19,12 @@ MOST_NAMED = 4
 def by_carrier(
     carriers_hz: FloatArray, of_carrier: Callable[[float, IntArray], NDArray[Any]], axis: int = 0
 ) -> NDArray[Any]:
-    """What is computed for the rows of each carrier in turn, put together in the order of the rows.
+    """Values computed carrier by carrier, in the order of the rows.
 
     Args:
-        carriers_hz: of each row [m], Hz.
-        of_carrier: ``of_carrier(carrier_hz, rows)``: values of the rows of these numbers.
-        axis: of the values that counts rows.
+        carriers_hz: carrier of each row [m], Hz.
+        of_carrier: ``of_carrier(carrier_hz, rows)``: values of the rows with these numbers.
+        axis: axis of the values that counts rows.
     """
     every = [(carrier, np.flatnonzero(carriers_hz == carrier)) for carrier in np.unique(carriers_hz)]
     found = np.concatenate([of_carrier(float(carrier), rows) for carrier, rows in every], axis=axis)
@@ -32,8 +32,8 @@ def by_carrier(
 
 
 def carriers_text(carriers_hz: FloatArray) -> str:
-    """Which carriers rows have, in words, such as ``rows at 2 carriers, 920000000, 2440000000 Hz``."""
-    known = [f"{one:.10g}" for one in np.unique(carriers_hz)]
+    """Carriers of rows in words, such as ``rows at 2 carriers, 920000000, 2440000000 Hz``."""
+    known = [f"{carrier:.10g}" for carrier in np.unique(carriers_hz)]
     if len(known) == 1:
         return f"rows at {known[0]} Hz"
     named = ", ".join(known) if len(known) <= MOST_NAMED else f"{known[0]} to {known[-1]}"

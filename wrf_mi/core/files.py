@@ -1,4 +1,4 @@
-"""Writing so that a reader never sees half of it, and reading text with errors that name the line."""
+"""Atomic writing of files and folders, and reading with errors that name file and remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .errors import InputError
 
 
 def one_line(error: object) -> str:
-    """The message of an error of another library, on one line."""
+    """The message of another library's error on one line."""
     return " ".join(str(error).split())
 
 
@@ -49,12 +49,12 @@ _REMEDIES = {
 
 
 def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
-    """What the operating system refused and the remedy for that, in one line.
+    """An error of the operating system and its remedy, on one line.
 
     Args:
-        error: of the system.
-        path: the file or folder that it was for; by default the one that the error names.
-        what: that could not be done to it, such as "cannot be written".
+        error: error of the system.
+        path: file or folder; None: the one that the error names.
+        what: verb phrase, such as "cannot be written".
     """
     file = path or (error.filename2 if error.filename2 is not None else error.filename)
     text = one_line(error.strerror or error)
@@ -66,7 +66,7 @@ def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a UTF-8 text file without line ends, trailing blank lines left out.
+    """The lines of a UTF-8 text file without line ends and trailing blank lines.
 
     Raises:
         InputError: the file is missing or not text.
@@ -84,12 +84,12 @@ def text_lines(path: Path) -> list[str]:
 
 @contextmanager
 def readable(path: Path, missing: str, remedy: str) -> Iterator[None]:
-    """Says in one line that a file of ours cannot be read, whatever the block that reads it finds.
+    """Turn any error of a block that reads a file into one line.
 
     Args:
         path: the file.
-        missing: the whole line where it is not there.
-        remedy: end of the line where it is damaged.
+        missing: message for a missing file.
+        remedy: end of the message for a damaged file.
 
     Raises:
         InputError: naming the file.
@@ -105,14 +105,14 @@ def readable(path: Path, missing: str, remedy: str) -> Iterator[None]:
 
 
 def stored_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an ``.npz`` file; to be called within `readable`."""
+    """All arrays of an ``.npz`` file; call it within `readable`."""
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
         return {key: stored[key] for key in stored.files}
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it when the block ends well and vanishes otherwise."""
+    """A temporary path beside ``path`` that replaces it if the block succeeds and is removed otherwise."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -124,11 +124,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
-    """A temporary folder beside ``path`` that takes its name when the block ends well and vanishes otherwise.
+    """A temporary folder beside ``path`` that takes its name if the block succeeds and is removed otherwise.
 
     Args:
         path: the folder to make.
-        replace: let it take the place of an existing one.
+        replace: replace an existing folder.
 
     Raises:
         InputError: ``path`` exists and may not be replaced, or cannot be written.
@@ -153,14 +153,14 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, content: bytes | str) -> Path:
-    """Write a small file whole or not at all."""
+    """Write a small file atomically."""
     with atomic_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> Path:
-    """Write an ``.npz`` file of plain arrays whole or not at all."""
+    """Write an ``.npz`` file of plain arrays atomically."""
     with atomic_file(path) as part, part.open("wb") as stream:
         save: Any = np.savez_compressed if compressed else np.savez
         save(stream, **arrays)

@@ -1,9 +1,9 @@
-"""Propagation paths between transmitters and receivers as plain arrays, and the file that keeps them."""
+"""Propagation paths between transmitters and receivers as plain arrays, and their file format."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from .angles import FloatArray
 from .errors import InputError
-from .files import one_line, write_arrays
+from .files import readable, stored_arrays, write_arrays
 from .types import IntArray
 
 FORMAT = 1
-"""Version of a file of paths."""
+"""Version of the file format."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,13 @@ class Paths:
             phase exp(-j k length) of travelling.
         length_m: unfolded length, shape [p], metres, float64.
         departure: unit vector in which the wave leaves the transmitter, world frame, shape [p, 3].
-        arrival: unit vector from the receiver to where the wave comes from, world frame, shape [p, 3].
+        arrival: unit vector from the receiver against the direction of propagation, world frame, shape [p, 3].
         interactions: kind of each interaction from transmitter to receiver, uint8, shape [p, depth]: the values of
             Sionna RT's ``InteractionType`` (1 reflection, 2 scattering, 4 transmission, 8 diffraction), 0 beyond
             the last.
         vertices_m: interaction points, world frame, metres, shape [p, depth, 3], NaN beyond the last.
-        objects: index into ``object_names`` of what is met there, int32, shape [p, depth], -1 beyond the last.
+        objects: index into ``object_names`` of the surface of each interaction, int32, shape [p, depth], -1 beyond the
+            last.
         object_names: names of the scene's surfaces.
         n_tx: transmitters traced, with or without a path.
         n_rx: receivers traced, with or without a path.
@@ -59,21 +60,16 @@ class Paths:
         return len(self.tx)
 
     def __post_init__(self) -> None:
-        """Reject arrays of shapes that do not belong together.
+        """Reject arrays of inconsistent shapes.
 
         Raises:
             ValueError: naming the array.
         """
-        count = len(self.tx)
         depth = self.interactions.shape[1] if self.interactions.ndim == 2 else -1
-        shapes: dict[str, tuple[int, ...]] = {
-            "departure": (count, 3),
-            "arrival": (count, 3),
-            "interactions": (count, depth),
-        }
-        shapes |= {"objects": (count, depth), "vertices_m": (count, depth, 3)}
-        for name in ("tx", "rx", "gain", "length_m", *shapes):
-            expected, found = shapes.get(name, (count,)), getattr(self, name).shape
+        more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
+        more |= {"objects": (depth,), "vertices_m": (depth, 3)}
+        for name in _ARRAYS:
+            expected, found = (len(self.tx), *more.get(name, ())), getattr(self, name).shape
             if found != expected:
                 raise ValueError(f"Paths: {name} has shape {list(found)}, expected {list(expected)}")
 
@@ -85,20 +81,19 @@ class Paths:
 
     def select(self, which: NDArray[Any]) -> Paths:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
-        kept = {f.name: value[which] for f in fields(self) if isinstance(value := getattr(self, f.name), np.ndarray)}
-        return Paths(**kept, object_names=self.object_names, n_tx=self.n_tx, n_rx=self.n_rx)
+        return replace(self, **{name: getattr(self, name)[which] for name in _ARRAYS})
 
 
 _ARRAYS = tuple(f.name for f in fields(Paths) if f.name not in ("object_names", "n_tx", "n_rx"))
 
 
 def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write paths to a compressed ``.npz`` of plain arrays, whole or not at all.
+    """Write paths to a compressed ``.npz`` of plain arrays, atomically.
 
     Args:
-        file: to write.
-        paths: its fields become keys of the same name.
-        extra: further arrays beside them, by other names.
+        file: file to write.
+        paths: paths, whose fields become keys of the same name.
+        extra: further arrays by other names.
     """
     arrays: dict[str, Any] = {name: getattr(paths, name) for name in _ARRAYS}
     arrays |= {"object_names": np.asarray(paths.object_names, dtype=str), "n_tx": paths.n_tx, "n_rx": paths.n_rx}
@@ -106,7 +101,7 @@ def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None =
 
 
 def load_paths(file: str | Path) -> Paths:
-    """Read what `save_paths` wrote; nothing but arrays is read.
+    """Read a file of `save_paths`.
 
     Raises:
         InputError: missing, damaged, or of another format version.
@@ -115,11 +110,10 @@ def load_paths(file: str | Path) -> Paths:
 
 
 def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
-    """The paths of a file and the further arrays beside them; see `load_paths`."""
+    """The paths of a file and the further arrays beside them (`load_paths`)."""
     path = Path(file)
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
+    with readable(path, f"{path}: missing; trace the paths first", "trace the paths anew"):
+        arrays = stored_arrays(path)
         version = int(arrays.pop("format"))
         if version == FORMAT:
             names = tuple(str(name) for name in arrays.pop("object_names"))
@@ -127,10 +121,6 @@ def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
             paths = Paths(
                 **{name: arrays.pop(name) for name in _ARRAYS}, object_names=names, n_tx=counts[0], n_rx=counts[1]
             )
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; trace the paths first") from None
-    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{path}: not a readable file of paths ({one_line(error)}); trace them anew") from None
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
     return paths, arrays

@@ -1,4 +1,4 @@
-"""What a model predicts: a value and, where the model states one, its standard deviation."""
+"""Predictions of a model: mean and, where the model states it, standard deviation."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Prediction:
     """Predictions for m transmitters at one receiver.
 
     Attributes:
-        mean: [m, *shape of an observation], as `wrf_mi.core.Record` has it: grey in 0..1, dBm, or complex coefficients.
-        std: standard deviation of observation minus mean, real, the same shape and unit; of a complex coefficient
+        mean: [m, *shape of an observation], as in `wrf_mi.core.Record`: grey in 0..1, dBm, or complex coefficients.
+        std: standard deviation of observation minus mean, real, of the mean's shape and unit; for a complex coefficient
             sqrt(E |h - mean|^2). None: the model states none.
     """
 
@@ -28,7 +28,7 @@ class Prediction:
         """Refuse shapes that differ.
 
         Raises:
-            ValueError: naming both.
+            ValueError: naming both shapes.
         """
         if self.std is not None and np.shape(self.mean) != np.shape(self.std):
             raise ValueError(f"Prediction: mean {np.shape(self.mean)} and std {np.shape(self.std)} differ in shape")
@@ -38,7 +38,7 @@ class Prediction:
         """The standard deviation of a model that states one.
 
         Raises:
-            ValueError: it states none.
+            ValueError: the model states none.
         """
         if self.std is None:
             raise ValueError("Prediction: the model states no standard deviation")

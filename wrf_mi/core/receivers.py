@@ -1,4 +1,4 @@
-"""Receivers as a user names them, and as every file that holds some stores them."""
+"""Receivers by name or number, and their arrays in files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .files import one_line
 from .types import Receiver
 
 SHOWN = 20
-"""Names that an error lists at most."""
+"""Largest number of names in an error message."""
 KEYS = (
     "receiver_name",
     "receiver_position_m",
@@ -26,15 +26,15 @@ KEYS = (
     "receiver_elements_m",
 )
 UNKNOWN = -1
-"""Number of elements of a receiver whose array is not known."""
+"""Stored number of elements of a receiver without a known array."""
 
 
 def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
-    """Index of a receiver that is given by its name or by its number.
+    """Index of a receiver.
 
     Args:
-        receivers: in the record's order.
-        receiver: its name (a string), or its number from 0 (an integer).
+        receivers: receivers in the record's order.
+        receiver: name (a string), or number from 0 (an integer).
 
     Raises:
         InputError: no such receiver, or several of that name.
@@ -44,11 +44,11 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
     >>> receiver_index(both, "kitchen"), receiver_index(both, 0), receiver_index(both, "0")
     (0, 0, 1)
     """
-    names = [one.name for one in receivers]
+    names = [known.name for known in receivers]
     if isinstance(receiver, str):
         if names.count(receiver) > 1:
             numbers = ", ".join(str(index) for index, name in enumerate(names) if name == receiver)
-            raise InputError(f"receiver {receiver!r}: name of several; give one's number, of {numbers}")
+            raise InputError(f"receiver {receiver!r}: name of several; give a number, of {numbers}")
         index = names.index(receiver) if receiver in names else -1
     else:
         try:
@@ -65,30 +65,29 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
 def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
     """Arrays of n receivers by the names `KEYS`.
 
-    Shapes: [n], [n, 3] in metres, [n, 4], [n, 3] words of the antennas, [n] elements of each array, and [all, 3] their
-    positions in the receivers' frames, metres.
+    Shapes: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of each array;
+    [all, 3] positions of all elements in the receivers' frames, metres.
     """
-    arrays = [one.array_m for one in receivers]
+    arrays = [receiver.array_m for receiver in receivers]
     return {
-        "receiver_name": np.array([one.name for one in receivers]),
-        "receiver_position_m": np.stack([one.position_m for one in receivers]),
-        "receiver_orientation_xyzw": np.stack([one.orientation_xyzw for one in receivers]),
-        "receiver_antenna": np.array([astuple(one.antenna) for one in receivers]),
+        "receiver_name": np.array([receiver.name for receiver in receivers]),
+        "receiver_position_m": np.stack([receiver.position_m for receiver in receivers]),
+        "receiver_orientation_xyzw": np.stack([receiver.orientation_xyzw for receiver in receivers]),
+        "receiver_antenna": np.array([astuple(receiver.antenna) for receiver in receivers]),
         "receiver_elements": np.array([UNKNOWN if array is None else len(array) for array in arrays]),
         "receiver_elements_m": np.concatenate([np.zeros((0, 3)), *(array for array in arrays if array is not None)]),
     }
 
 
 def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]:
-    """The receivers that `receiver_arrays` stored.
+    """Receivers from the arrays of `receiver_arrays`.
 
     Raises:
-        KeyError: one of `KEYS` is missing.
-        InputError: an antenna that is none.
+        KeyError: a key of `KEYS` is missing.
+        InputError: an invalid antenna.
     """
     counts = arrays["receiver_elements"]
-    ends = np.cumsum(np.maximum(counts, 0))
-    places = np.split(arrays["receiver_elements_m"], ends[:-1])
-    elements = [None if count == UNKNOWN else own for count, own in zip(counts, places, strict=True)]
+    split = np.split(arrays["receiver_elements_m"], np.cumsum(np.maximum(counts, 0))[:-1])
+    elements = [None if count == UNKNOWN else array_m for count, array_m in zip(counts, split, strict=True)]
     columns = zip(*(arrays[key] for key in KEYS[:4]), elements, strict=True)
-    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), own) for n, p, q, words, own in columns)
+    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), array_m) for n, p, q, words, array_m in columns)

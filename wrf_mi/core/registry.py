@@ -1,4 +1,4 @@
-"""Registries: objects by name, of this package, of installed packages and of this process."""
+"""Registries: objects by name, from this package, installed packages and this process."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ def resolve(address: str) -> Any:
 
 
 class Registry(Mapping[str, Entry], Generic[Entry]):
-    """Objects by name; what one needs is imported when it is asked for.
+    """Objects by name; an entry is imported at its first use.
 
     Args:
-        what: an entry is, for messages.
-        group: of the entry points by which installed packages add entries.
-        own: entries of this package by name, or their addresses ``module:attribute``.
+        what: noun for an entry, for messages.
+        group: group of the entry points by which installed packages add entries.
+        builtin: entries of this package by name, or their addresses ``module:attribute``.
     """
 
-    def __init__(self, what: str, group: str, own: Mapping[str, Entry | str]) -> None:
-        self._what, self._known = what, dict(own)
+    def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str]) -> None:
+        self._what, self._known = what, dict(builtin)
         self._others = {point.name: point for point in entry_points(group=group)}
         self._twice = self._known.keys() & self._others.keys()
 
@@ -36,7 +36,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Add an entry for this process.
 
         Raises:
-            InputError: a name that is taken.
+            InputError: the name is taken.
         """
         if name in self:
             raise InputError(f"{self._what} {name!r}: there is one of that name; choose another")
@@ -44,8 +44,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     def __getitem__(self, name: str) -> Entry:
         if name in self._twice:
-            place = self._others[name].value
-            raise InputError(f"{self._what} {name!r}: an installed package adds one of that name ({place}); remove it")
+            address = self._others[name].value
+            raise InputError(f"{self._what} {name!r}: an installed package ({address}) adds the same name; remove it")
         if name not in self._known:
             self._known[name] = self._others[name].load()
         entry = self._known[name]

@@ -1,20 +1,37 @@
-"""Settings: frozen dataclasses of plain values, from nested dictionaries and from ``key=value``."""
+"""Settings: frozen dataclasses of plain values, from nested dictionaries and from ``key=value``, checked by pydantic.
+
+The range of a number is part of its type (`Count`, `Share`, ...); `check` applies it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import types
+import json
 import typing
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
-from typing import Any, TypeVar, cast
+from functools import cache
+from typing import Annotated, Any, TypeVar, cast
 
 import yaml
+from pydantic import Field, TypeAdapter, ValidationError
 
 from .errors import InputError
 
+Count = Annotated[int, Field(ge=1, description="1 or more")]
+Positive = Annotated[float, Field(gt=0, description="more than 0")]
+Share = Annotated[float, Field(ge=0, le=1, description="0 to 1")]
+ShareBelow1 = Annotated[float, Field(ge=0, lt=1, description="0 or more and less than 1")]
+Inside = Annotated[float, Field(gt=0, lt=1, description="more than 0 and less than 1")]
+NOT_NEGATIVE = Field(ge=0, description="0 or more")
+"""Range of numbers for which a class of settings states no other."""
 
-def flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+Settings = TypeVar("Settings")
+"""A frozen dataclass of plain values or of such dataclasses."""
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted names and values of a nested dictionary."""
     for key, value in values.items():
         if isinstance(value, dict):
@@ -23,16 +40,57 @@ def flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-Settings = TypeVar("Settings")
-"""A frozen dataclass of plain values or of such dataclasses."""
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(hint)
+
+
+def _range(limits: Any) -> tuple[TypeAdapter[Any], str]:
+    return TypeAdapter(Annotated[float, limits, Field(allow_inf_nan=False)]), limits.description
+
+
+@cache
+def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
+    """Ranges of all fields of a class, as if they were numbers; a subclass that changes a default keeps the range."""
+    hints = [typing.get_type_hints(base, include_extras=True) for base in reversed(kind.__mro__)]
+    items = (item for found in hints for item in found.items())
+    stated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
+    return {field.name: _range(stated.get(field.name, NOT_NEGATIVE)) for field in dataclasses.fields(kind)}
+
+
+def check(settings: Any, prefix: str = "") -> None:
+    """Refuse numbers of settings that are not finite or out of their range, nested ones included.
+
+    Raises:
+        InputError: naming the setting, its value and the range.
+    """
+    kind: Any = type(settings)
+    for name, (adapter, words) in _ranges(kind).items():
+        value = getattr(settings, name)
+        if dataclasses.is_dataclass(value):
+            check(value, f"{prefix}{name}.")
+        elif isinstance(value, int | float):
+            try:
+                adapter.validate_python(value)
+            except ValidationError:
+                raise InputError(f"setting {prefix}{name}: {value} is out of range, choose {words}") from None
 
 
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
-    """The same for any dataclass of settings."""
+    """Settings from a nested dictionary; what it does not name keeps its default.
+
+    Args:
+        kind: dataclass of the settings.
+        values: nested as the dataclass is.
+        source: name of the file or option, for messages.
+
+    Raises:
+        InputError: an unknown name, or a value of the wrong type or out of its range.
+    """
     return cast(Settings, _build(kind, values, source, ""))
 
 
-def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
+def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}, setting {prefix[:-1] or 'top'}: expected a mapping, got {values!r}")
     hints = typing.get_type_hints(kind)
@@ -42,79 +100,63 @@ def _build(kind: type, values: Any, source: str, prefix: str) -> Any:
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
-        if dataclasses.is_dataclass(hints[key]):
-            arguments[key] = _build(hints[key], value, source, f"{name}.")
-        else:
-            arguments[key] = _convert(value, hints[key], name, source)
+        convert = _build if dataclasses.is_dataclass(hints[key]) else _convert
+        arguments[key] = convert(hints[key], value, source, f"{name}." if convert is _build else name)
     return kind(**arguments)
 
 
-def _convert(value: Any, kind: Any, name: str, source: str) -> Any:
-    choices = typing.get_args(kind)
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):  # X | None, int | Literal["auto"]
-        words = [word for choice in choices for word in typing.get_args(choice)]
-        if (value is None and types.NoneType in choices) or value in words:
-            return value
-        kind = next(choice for choice in choices if choice is not types.NoneType)
-        choices = typing.get_args(kind)
-    if typing.get_origin(kind) is typing.Literal:
-        if value not in choices:
-            raise InputError(f"{source}, setting {name}: {value!r}; choose from {', '.join(map(str, choices))}")
-        return value
-    if typing.get_origin(kind) is tuple:
-        parts = value if isinstance(value, list | tuple) else []
-        kinds = choices[:1] * len(parts) if Ellipsis in choices else choices
-        if not parts or len(parts) != len(kinds):
-            count = "" if Ellipsis in choices else f"{len(kinds)} "
-            raise InputError(f"{source}, setting {name}: expected a list of {count}values, got {value!r}")
-        return tuple(_convert(one, own, name, source) for one, own in zip(parts, kinds, strict=True))
-    good = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
-    # YAML reads 1e-3 as text.
-    if kind is float and isinstance(value, int | float | str) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except (ValueError, OverflowError):
-            good = False
-    if not good:
-        raise InputError(f"{source}, setting {name}: expected {kind.__name__}, got {value!r}")
-    return value
+def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
+    """A value of the type ``hint``."""
+    if isinstance(value, str) and float in (hint, *typing.get_args(hint)):
+        with suppress(ValueError):
+            value = float(value)  # YAML 1.1 reads 1e-3 as text
+    try:
+        # JSON has lists in place of tuples; else nothing is converted.
+        return _adapter(hint).validate_json(json.dumps(value, default=str), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+    text = f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
+    if first["type"] == "literal_error":
+        text = f"{value!r}; choose from " + first["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
+    elif first["type"] in ("tuple_type", "missing", "too_long", "too_short"):
+        parts = typing.get_args(hint)
+        count = "" if Ellipsis in parts else f"{len(parts)} "
+        text = f"expected a list of {count}values, got {value!r}"
+    raise InputError(f"{source}, setting {name}: {text}")
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
-    """Settings (`TrainConfig`, or those of a physics model) with ``key=value`` applied in order; keys dotted, values
-    YAML.
+    """Settings with ``key=value`` applied in order; keys dotted, values YAML.
 
     Raises:
-        InputError: no ``=``, an unknown key, or a value of the wrong type.
+        InputError: no ``=``, an unknown key, or a value of the wrong type or out of its range.
     """
     values: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]
+    known = [name for name, _ in flat(values)]
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: expected key=value, e.g. --set steps=2000")
-        *parents, last = key.strip().split(".")
-        node: Any = values
-        for parent in parents:
-            node = node.get(parent) if isinstance(node, dict) else None
-        if not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
-            known = [name for name, _ in flat(dataclasses.asdict(config), "")]  # type: ignore[call-overload]
+        if key.strip() not in known:
             close = get_close_matches(key.strip(), known, n=3)
             meant = f"did you mean {' or '.join(close)}? " if close else ""
             remedy = f"{meant}All are listed by `wrf-mi train --help-settings`"
             raise InputError(f"--set {setting}: unknown setting {key.strip()}; {remedy}")
+        *parents, last = key.strip().split(".")
+        node = values
+        for parent in parents:
+            node = node[parent]
         try:
             node[last] = yaml.safe_load(text) if text.strip() else ""
-        except (yaml.YAMLError, ValueError):  # the latter from dates that are none
-            raise InputError(f"--set {setting}: {text!r} is no YAML value; quote text that is none") from None
-    return cast(Settings, _build(type(config), values, "--set", ""))
+        except (yaml.YAMLError, ValueError):  # the latter from text that looks like a date
+            raise InputError(f"--set {setting}: {text!r} is no YAML value; put text in quotes") from None
+    return settings_from(type(config), values, "--set")
 
 
 def describe(settings: Any) -> str:
-    """One line a setting, with its default, for ``wrf-mi train --help-settings``."""
-    values = dataclasses.asdict(settings)
-    return "\n".join(f"{name}={_shown(value)}" for name, value in flat(values, ""))
+    """One line a setting, ``key=value`` with its default, for ``wrf-mi train --help-settings``."""
 
+    def shown(value: Any) -> Any:
+        return "null" if value is None else list(value) if isinstance(value, tuple) else value
 
-def _shown(value: Any) -> Any:
-    """As ``--set`` takes it."""
-    return "null" if value is None else list(value) if isinstance(value, tuple) else value
+    return "\n".join(f"{name}={shown(value)}" for name, value in flat(dataclasses.asdict(settings)))

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ..core.settings import ShareBelow1
+from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 
 EvaluationName = Literal["splatted", "traced"]
 """Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
@@ -39,14 +44,14 @@ class TracedConfig:
         tilt: rate of the planes' tilts, rad.
     """
 
-    depth: int = 3
+    depth: Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")] = 3
     reflections: int = 3
     transmission: bool = True
-    rays: int = 1 << 16
-    faint: float = 1e-3
-    pattern_degree: int = 0
+    rays: Annotated[int, Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
+    faint: ShareBelow1 = 1e-3
+    pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 0
     materials: Literal["named", "surface"] = "named"
-    alone: float = 0.25
+    alone: ShareBelow1 = 0.25
     material: float = 0.05
     gain: float = 0.05
     pattern: float = 0.01

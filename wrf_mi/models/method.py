@@ -15,10 +15,9 @@ from ..core.angles import FloatArray
 from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..training.session import FitSession
+from ..training.session import OnProgress as OnProgress
 
 Settings = TypeVar("Settings")
-OnProgress = Callable[[str, float], None]
-"""Progress callback: stage, and fraction of it that is done, 0 to 1."""
 PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
 """Attributes that `Inputs` and `wrf_mi.core.Record` share."""
 

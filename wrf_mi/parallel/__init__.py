@@ -7,14 +7,12 @@
 """
 
 from .children import run_module
-from .parts import row_parts
-from .scheduler import Scheduler, SchedulerFailed, SerialScheduler, open_scheduler
+from .scheduler import Scheduler, SchedulerFailed, open_scheduler, row_parts
 from .worker import worker_threads
 
 __all__ = [
     "Scheduler",
     "SchedulerFailed",
-    "SerialScheduler",
     "open_scheduler",
     "row_parts",
     "run_module",

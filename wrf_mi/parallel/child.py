@@ -1,6 +1,6 @@
-"""A module run by `wrf_mi.parallel.run_module`: ``python -m wrf_mi.parallel.child THREADS MODULE ARGUMENTS``.
+"""Child process of `wrf_mi.parallel.run_module`: ``python -m wrf_mi.parallel.child THREADS MODULE ARGUMENTS``.
 
-Not imported by the package, as Python runs it as the main module.
+The package does not import it: Python runs it as the main module.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ def _end_with_parent() -> None:
 
 
 def main(threads: str, module: str, *arguments: str) -> None:
-    """What the child does: watch the pipe, choose threads (0: all cores), and be that module."""
-    # A worker ignores Ctrl-C, and that is inherited.
+    """Watch the pipe, set the number of threads (0: all cores) and run the module."""
+    # Workers ignore Ctrl-C, and children inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if int(threads):

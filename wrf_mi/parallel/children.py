@@ -1,8 +1,8 @@
 """Modules run as child processes that end with their parent, however that ends.
 
-A worker that is killed cannot stop its children, and its part starts again on another worker: a child that lived on
-would write to the same run folder. So a child holds a pipe from its parent and ends at once when that closes, see
-`wrf_mi.parallel.child`.
+A worker that is killed cannot stop its children, and its part starts again on another worker: both children would
+write to the same run folder. So a child holds a pipe from its parent and ends when that closes
+(`wrf_mi.parallel.child`).
 """
 
 from __future__ import annotations
@@ -17,22 +17,17 @@ from .worker import given_up, worker_threads
 
 POLL_S = 0.5
 GRACE_S = 30.0
-"""For a child that was asked to stop: it finishes its step and writes a checkpoint."""
+"""Time for a child that is stopped to finish its step and write a checkpoint."""
 
 
 def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None) -> tuple[int, str]:
     """Run ``python -m module arguments`` and wait for it.
 
-    In a worker the child computes with the worker's number of threads and says nothing; it is stopped, as by Ctrl-C,
-    when the client gives the part up. Elsewhere it writes to this process's standard error.
-
-    Args:
-        module: its name.
-        arguments: of the command line.
-        quiet: keep what it says on standard error instead of showing it; None: in a worker only.
+    In a worker the child computes with the worker's number of threads and prints nothing; it is stopped, as by Ctrl-C,
+    when the client cancels the part. Elsewhere it writes to this process's standard error unless ``quiet``.
 
     Returns:
-        The exit status, and the last line on standard error where that was kept.
+        The exit status, and the last line of a quiet child's standard error.
 
     Raises:
         KeyboardInterrupt: in this process; the child has ended then.
@@ -40,9 +35,9 @@ def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None)
     threads = worker_threads()
     kept = threads is not None if quiet is None else quiet
     call = [sys.executable, "-m", "wrf_mi.parallel.child", str(threads or 0), module, *arguments]
-    with tempfile.TemporaryFile("w+", errors="replace") as said:
-        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said if kept else None}
-        # In a group of its own: Ctrl-C on a terminal reaches this process, which passes it on once.
+    with tempfile.TemporaryFile("w+", errors="replace") as errors:
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": errors if kept else None}
+        # In a separate process group: Ctrl-C on a terminal reaches this process alone, which passes it on once.
         child = subprocess.Popen(call, process_group=0, **streams)  # type: ignore[call-overload]
         try:
             status = _wait(child)
@@ -51,8 +46,8 @@ def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None)
             raise
         finally:
             child.stdin.close()
-        said.seek(0)
-        lines = [line.strip() for line in said if line.strip()]
+        errors.seek(0)
+        lines = [line.strip() for line in errors if line.strip()]
     return status, lines[-1] if lines else ""
 
 

@@ -1,26 +1,30 @@
-"""The one interface to what computes many parts: this process, workers on this machine, or a Dask cluster."""
+"""Parts of a task on a scheduler: this process, workers on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
 import logging
 import os
 import queue
+import sys
 import uuid
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..core import InputError
 from ..core.files import one_line
-from .progress import Parts
-from .worker import run_part, this_place
+from .worker import run_part, worker_environment
 
 CONNECT_S = 10.0
-"""A scheduler that runs answers within milliseconds; a busy one within seconds."""
+"""Time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds."""
 POLL_S = 1.0
-
-Each = Callable[[int, Any], None]
+PARTS_EACH = 8
+"""Parts for each worker: a slow or late worker leaves the others at most an eighth of its share."""
+LINES = 10
+"""Lines of progress in all where standard error is a file."""
 
 
 class SchedulerFailed(RuntimeError):
@@ -29,13 +33,68 @@ class SchedulerFailed(RuntimeError):
     exit_status = 1
 
 
-class Scheduler(Protocol):
-    """Computes parts; a context manager that gives back what it started."""
+def row_parts(count: int, workers: int, least: int = 1, most: int = 1024) -> list[slice]:
+    """Consecutive slices that cover ``count`` rows, for a number of workers, nearly equal in size.
+
+    A part has ``least`` rows at least (but for the last), where it costs something whatever its size, and ``most`` at
+    most, which bounds the size of a message and the loss with a worker.
+    """
+    size = min(max(-(-count // (PARTS_EACH * workers)), least), most)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+class PartsProgress(Progress):
+    """Progress over parts on standard error: a bar on a terminal; elsewhere a line at each tenth.
+
+    Args:
+        what: present participle for the description.
+        total: rows in all parts.
+        lines: whether to print these lines.
+    """
+
+    def __init__(self, what: str, total: int, lines: bool) -> None:
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._what, self._total, self._lines = what, total, lines
+        self._done, self._shown, self._waits = 0, 0, False
+        self._bar = self.add_task(what, total=total)
+
+    def add(self, rows: int, workers: int) -> None:
+        """Count further rows as done, by this number of workers."""
+        self._done, self._waits = self._done + rows, False
+        by = f"{workers} worker{'s' * (workers != 1)}"
+        self.update(self._bar, completed=self._done, description=f"{self._what}, {by}")
+        if self._lines and self.disable and self._done * LINES // self._total > self._shown:
+            self._shown = self._done * LINES // self._total
+            print(f"{self._what}: {self._done} of {self._total}, {by}", file=sys.stderr, flush=True)
+
+    def waiting(self) -> None:
+        """State that there is no worker at the moment."""
+        self.update(self._bar, description=f"{self._what}, waiting for a worker")
+        if self.disable and not self._waits:
+            print(f"{self._what}: waiting for a worker to connect to the scheduler", file=sys.stderr, flush=True)
+        self._waits = True
+
+
+class Scheduler:
+    """Computes the parts of a task; a context manager that closes what it started.
+
+    Without a client parts are computed one after the other in this process, without progress of its own. Dask gives
+    the parts of a lost worker to another one, three times each.
+
+    Args:
+        client: ``distributed.Client``, connected; None: this process.
+        cluster: cluster to be closed with the scheduler; None: it goes on running.
+    """
+
+    def __init__(self, client: Any | None = None, cluster: Any | None = None) -> None:
+        self._client, self._cluster = client, cluster
 
     @property
     def workers(self) -> int:
-        """Processes that compute at this moment, 1 at least."""
-        ...
+        """Number of workers at this moment, 1 at least."""
+        return 1 if self._client is None else max(len(self._client.nthreads()), 1)
 
     def map(
         self,
@@ -45,145 +104,71 @@ class Scheduler(Protocol):
         *,
         what: str = "computing",
         sizes: Sequence[int] | None = None,
-        each: Each | None = None,
+        each: Callable[[int, Any], None] | None = None,
     ) -> list[Any]:
         """``[function(part) for part in parts]``, or with an opener ``function(opener(), part)``.
 
         Args:
-            function: a function of a module that workers can import, or a `functools.partial` of one.
-            parts: independent of each other; they and the results travel between processes.
+            function: function of a module that workers can import, or a `functools.partial` of one.
+            parts: independent parts; they and the results travel between processes.
             opener: opens what all parts need; called once in each process that computes some of them.
-            what: is done, for the progress on standard error: a bar on a terminal, else a line at each tenth.
-            sizes: rows in each part, for the same; None: one each.
-            each: hears the index and the result of each part as it is there, in whatever order, once; then there are
-                no lines of progress.
+            what: present participle for the progress on standard error: a bar on a terminal, else a line at each tenth.
+            sizes: rows in each part, for the progress; None: one each.
+            each: called with index and result of each part once it is computed, in any order; then no lines of
+                progress are printed.
 
         Returns:
             A result for each part, in their order.
 
         Raises:
-            InputError: that of a part, as it is; the parts that are left are cancelled then.
+            InputError: raised by a part; the parts that are left are cancelled.
             SchedulerFailed: the scheduler, or several workers in a row that computed the same part, were lost.
         """
-        ...
-
-    def __enter__(self) -> Self:
-        """Itself."""
-        ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Give back what was started."""
-        ...
-
-
-class SerialScheduler:
-    """One part after the other in this process."""
-
-    workers = 1
-
-    def map(
-        self,
-        function: Callable[..., Any],
-        parts: Sequence[Any],
-        opener: Callable[[], Any] | None = None,
-        *,
-        what: str = "computing",
-        sizes: Sequence[int] | None = None,
-        each: Each | None = None,
-    ) -> list[Any]:
-        """See `Scheduler.map`; without progress, as parts show their own."""
-        first = () if opener is None else (opener(),)
-        results = []
-        for index, part in enumerate(parts):
-            results.append(function(*first, part))
-            if each is not None:
-                each(index, results[-1])
-        return results
-
-    def __enter__(self) -> Self:
-        """Itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing was started."""
-
-
-class DaskScheduler:
-    """Parts as tasks of a Dask scheduler. Dask gives the parts of a lost worker to another one, three times each.
-
-    Args:
-        client: ``distributed.Client``, connected.
-        cluster: to be closed with it; None: it runs on without us.
-    """
-
-    def __init__(self, client: Any, cluster: Any | None = None) -> None:
-        self._client, self._cluster = client, cluster
-
-    @property
-    def workers(self) -> int:
-        """Workers that the scheduler has at this moment, 1 at least."""
-        return max(len(self._client.nthreads()), 1)
-
-    def map(
-        self,
-        function: Callable[..., Any],
-        parts: Sequence[Any],
-        opener: Callable[[], Any] | None = None,
-        *,
-        what: str = "computing",
-        sizes: Sequence[int] | None = None,
-        each: Each | None = None,
-    ) -> list[Any]:
-        """See `Scheduler.map`."""
-        token = uuid.uuid4().hex
-        task = partial(run_part, this_place(), token, opener, function)
-        sizes = [1] * len(parts) if sizes is None else sizes
         results: list[Any] = [None] * len(parts)
+        if self._client is None:
+            first = () if opener is None else (opener(),)
+            for k, part in enumerate(parts):
+                results[k] = function(*first, part)
+                if each is not None:
+                    each(k, results[k])
+            return results
+        token = uuid.uuid4().hex
+        task = partial(run_part, worker_environment(), token, opener, function)
+        sizes = [1] * len(parts) if sizes is None else sizes
         done: queue.SimpleQueue[str] = queue.SimpleQueue()
         index = {f"{what.replace(' ', '-')}-{token}-{k}": k for k in range(len(parts))}
         futures = {future.key: future for future in self._client.map(task, parts, key=list(index), pure=False)}
         try:
             for future in futures.values():
                 future.add_done_callback(lambda future: done.put(future.key))
-            with Parts(what, sum(sizes), lines=each is None) as bar:
+            with PartsProgress(what, sum(sizes), lines=each is None) as progress:
                 while futures:
-                    key = self._next(done, bar)
-                    place = index[key]
-                    results[place] = _result(futures[key], what)
-                    # Dask forgets it now: a worker that is lost later takes no result with it.
-                    del futures[key]
-                    bar.advance(sizes[place], self.workers)
+                    try:
+                        key = done.get(timeout=POLL_S)
+                    except queue.Empty:  # for however long: a cluster may have to start workers first
+                        if self._client.status == "running" and not self._client.nthreads():
+                            progress.waiting()
+                        continue
+                    k = index[key]
+                    # Dask forgets a result that was fetched: a worker that is lost later takes none with it.
+                    results[k] = _result(futures.pop(key), what)
+                    progress.add(sizes[k], self.workers)
                     if each is not None:
-                        each(place, results[place])
+                        each(k, results[k])
         except BaseException:
             self._client.cancel(list(futures.values()), force=True)
             raise
         return results
 
-    def _next(self, done: queue.SimpleQueue[str], bar: Parts) -> str:
-        """Key of the next part that is done, however long that takes: a cluster may have to start workers first."""
-        while True:
-            try:
-                return done.get(timeout=POLL_S)
-            except queue.Empty:
-                if self._client.status == "running" and not self._client.nthreads():
-                    bar.waiting()
-
     def __enter__(self) -> Self:
-        """Itself."""
+        """The scheduler."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the connection, and the workers that were started here."""
-        self._client.close()
-        if self._cluster is not None:
-            self._cluster.close()
+        for started in (self._client, self._cluster):
+            if started is not None:
+                started.close()
 
 
 def _result(future: Any, what: str) -> Any:
@@ -193,36 +178,36 @@ def _result(future: Any, what: str) -> Any:
         return future.result()
     except KilledWorker as error:
         reason = f"{what}: {error.allowed_failures + 1} workers in a row ended in one part"
-        remedy = "for want of memory, or by a crash that their log tells; use fewer workers on a machine"
+        remedy = "for want of memory, or by a crash (see their log); use fewer workers on a machine"
         raise SchedulerFailed(f"{reason}, {remedy}") from None
     except CancelledError:
-        # So Dask ends all tasks when the connection breaks.
+        # Dask cancels all tasks when the connection breaks.
         raise SchedulerFailed(f"{what}: the Dask scheduler was lost; start it, and the command again") from None
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"):
             raise
         raise InputError(f"workers: {one_line(error)}; install wrf-mi where scheduler and workers run") from None
     except InputError as error:
-        raise error from None
+        raise error from None  # without the traceback of the worker
 
 
 def open_scheduler(text: str | None) -> Scheduler:
-    """What computes.
+    """Open a scheduler.
 
     Args:
         text: ``local`` (a worker for each core of this machine), ``local:N`` (N of them), or the address of a running
             Dask scheduler (``tcp://host:port`` or ``host:port``); None: this process, serially.
 
     Returns:
-        To be used in a ``with`` statement. Workers that are started here compute with one thread each, unless
+        A context manager. Workers that are started here compute with one thread each, unless
         ``OMP_NUM_THREADS`` says otherwise. A script that starts some needs ``if __name__ == "__main__":``.
 
     Raises:
-        InputError: another text, no scheduler at the address, or Dask is not installed.
+        InputError: any other text, no scheduler at the address, or Dask is not installed.
         BackendError: neither LLVM nor CUDA can be used here.
     """
     if text is None:
-        return SerialScheduler()
+        return Scheduler()
     count = _local_workers(text)
     address = text if "://" in text else f"tcp://{text}"
     if count is None and not _has_port(address):
@@ -231,13 +216,13 @@ def open_scheduler(text: str | None) -> Scheduler:
         from distributed import Client, LocalCluster
     except ImportError:
         raise InputError("--scheduler: needs Dask; install it with: pip install 'wrf-mi[cluster]'") from None
-    this_place()  # what cannot compute is told before anything is started
-    # What Dask says of lost and restarted workers is told by the progress, or by the error that ends the command.
+    worker_environment()  # fails before anything is started where nothing can compute
+    # Lost and restarted workers show in the progress, or in the error that ends the command.
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     if count is None:
         try:
-            return DaskScheduler(Client(address, timeout=CONNECT_S, set_as_default=False))
+            return Scheduler(Client(address, timeout=CONNECT_S, set_as_default=False))
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(
                 f"--scheduler {text}: no Dask scheduler answers there ({one_line(error)}); start one: docs/cluster.md"
@@ -247,12 +232,12 @@ def open_scheduler(text: str | None) -> Scheduler:
         threads_per_worker=1,
         host="127.0.0.1",
         dashboard_address=":0",
-        preload=["wrf_mi.parallel.local_worker"],
-        # Dask would end a worker at its share of the memory, where one process alone may use all.
+        preload=["wrf_mi.parallel.worker"],
+        # By default Dask ends a worker at its share of the memory.
         memory_limit=None,
         silence_logs=logging.CRITICAL,
     )
-    return DaskScheduler(Client(cluster, set_as_default=False), cluster)
+    return Scheduler(Client(cluster, set_as_default=False), cluster)
 
 
 def _local_workers(text: str) -> int | None:

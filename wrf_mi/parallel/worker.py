@@ -1,10 +1,11 @@
-"""What happens inside a worker: the place of the client, one part at a time, and what is opened once."""
+"""Parts inside a worker: the environment of the client, one part at a time, and an opener called once."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
 import platform
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -18,20 +19,20 @@ from ..core import InputError
 VARIABLES = "WRF_MI_"
 """Environment variables with this beginning are set in workers as they are in the client."""
 THREADS = "OMP_NUM_THREADS"
-"""Says how many threads Dr.Jit uses in a worker. Dask sets it to 1 unless whoever starts the worker has set it."""
+"""Number of threads of Dr.Jit in a worker. Dask sets it to 1 unless it is set where the worker is started."""
 PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")
-"""Their versions must be the client's, or results differ in more than the last digit."""
+"""Packages whose versions must be the client's, or results differ in more than the last digit."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where and with what the client computes: workers take it over before each part.
+class WorkerEnvironment:
+    """Environment of the client, which workers adopt before each part.
 
     Attributes:
-        folder: working directory, by which relative paths are meant.
+        folder: working directory, to which relative paths refer.
         variables: environment variables that begin with `VARIABLES`.
         backend: ``"llvm"`` or ``"cuda"``.
-        versions: of Python and `PACKAGES`.
+        versions: versions of Python and `PACKAGES`.
     """
 
     folder: str
@@ -40,16 +41,16 @@ class Place:
     versions: tuple[tuple[str, str], ...]
 
 
-def this_place() -> Place:
-    """The place of this process.
+def worker_environment() -> WorkerEnvironment:
+    """The environment of this process.
 
     Raises:
         BackendError: neither LLVM nor CUDA can be used here.
     """
     variables = tuple(sorted((k, v) for k, v in os.environ.items() if k.startswith(VARIABLES)))
-    # Where Mitsuba is there already, what it was given decides; else its import can wait.
+    # The import of Mitsuba can wait where nothing has imported it yet.
     backend = init() if "mitsuba" in sys.modules else choose()
-    return Place(os.getcwd(), variables, backend.name, _versions())
+    return WorkerEnvironment(os.getcwd(), variables, backend.name, _versions())
 
 
 @cache
@@ -68,52 +69,54 @@ _in_worker = threading.local()
 _opened: tuple[str, Any] = ("", None)
 
 
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the client, which ends its workers (``preload``)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def run_part(
-    place: Place, token: str, opener: Callable[[], Any] | None, function: Callable[..., Any], part: Any
+    environment: WorkerEnvironment,
+    token: str,
+    opener: Callable[[], Any] | None,
+    function: Callable[..., Any],
+    part: Any,
 ) -> Any:
-    """Compute one part in a worker.
+    """Compute one part in a worker: ``function(part)``, or ``function(opener(), part)``.
 
     A worker with several threads still computes one part at a time: Dr.Jit traces one program per process, and the
-    working directory is the process's too.
-
-    Args:
-        place: of the client.
-        token: of the call of ``map``; what ``opener`` gives is kept until another one comes.
-        opener: makes the first argument of ``function``; None: there is none.
-        function: of ``part``.
-        part: what to compute.
+    working directory belongs to the process. The result of ``opener`` is kept until a call with another ``token``.
 
     Raises:
-        InputError: this worker cannot stand in for the client; or what ``opener`` or ``function`` raise.
+        InputError: the environment differs from the client's; or raised by ``opener`` or ``function``.
     """
     global _opened
     with _one_at_a_time:
-        _enter(place)
+        _enter(environment)
         _in_worker.active = True
         try:
             if opener is None:
                 return function(part)
             if _opened[0] != token:
-                _opened = ("", None)  # the old one goes before the new one needs its memory
+                _opened = ("", None)  # frees the memory of the old one first
                 _opened = (token, opener())
             return function(_opened[1], part)
         finally:
             _in_worker.active = False
 
 
-def _enter(place: Place) -> None:
-    own = dict(_versions())
-    for name, version in place.versions:
-        if own[name] != version:
-            what = f"worker on {platform.node()}: {name} {own[name]}, but {version} where the command runs"
-            raise InputError(f"{what}; install the same versions on both")
+def _enter(environment: WorkerEnvironment) -> None:
+    installed, worker = dict(_versions()), f"worker on {platform.node()}"
+    for name, version in environment.versions:
+        if installed[name] != version:
+            text = f"{worker}: {name} {installed[name]}, but {version} where the command runs"
+            raise InputError(f"{text}; install the same versions on both")
     try:
-        os.chdir(place.folder)
+        os.chdir(environment.folder)
     except OSError as error:
-        what = f"worker on {platform.node()}: cannot enter {place.folder} ({error.strerror})"
-        raise InputError(f"{what}; run the command in a folder that workers see under the same name") from None
-    os.environ.update(place.variables)
-    init(place.backend, threads=_threads())
+        text = f"{worker}: cannot enter {environment.folder} ({error.strerror})"
+        raise InputError(f"{text}; run the command in a folder that workers see under the same name") from None
+    os.environ.update(environment.variables)
+    init(environment.backend, threads=_threads())
 
 
 def _threads() -> int:
@@ -122,12 +125,12 @@ def _threads() -> int:
 
 
 def worker_threads() -> int | None:
-    """Threads that a part in a worker may use; None in a process that is no worker, which may use all cores."""
+    """Threads that a part in a worker may use; None in any other process, which may use all cores."""
     return _threads() if getattr(_in_worker, "active", False) else None
 
 
 def given_up() -> bool:
-    """Whether the client no longer wants the part that this thread computes; False in a process that is no worker."""
+    """Whether the client has cancelled the part that this thread computes; False in any other process."""
     if not getattr(_in_worker, "active", False):
         return False
     from distributed import get_worker

@@ -23,7 +23,7 @@ from typing import Any
 
 from ..core import AntennaOptions, InputError
 from ..core.files import one_line, write_atomically
-from ..parallel import Scheduler, SerialScheduler, run_module
+from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .api import plan_run
@@ -172,7 +172,7 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
         count = f"{len(finished)} of {len(sweep.runs)}"
         print(f"{sweep.runs[index].folder.name}: {headline} ({count})", file=sys.stderr, flush=True)
 
-    return (scheduler or SerialScheduler()).map(_run, sweep.runs, what="sweeping", each=each)
+    return (scheduler or Scheduler()).map(_run, sweep.runs, what="sweeping", each=each)
 
 
 def _claim(sweep: Sweep) -> None:

@@ -1,4 +1,4 @@
-"""Tasks: what observations are, how they are scored and which instrument reports them."""
+"""Tasks: form of observations, score and instrument."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ ENTRY_POINTS = "wrf_mi.tasks"
 
 _TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {t.name: t for t in (spectrum.TASK, rssi.TASK, csi.TASK)})
 TASKS: Mapping[str, Task] = _TASKS
-"""Every task by the name that records bear (`wrf_mi.core.Record.task`)."""
+"""Every task by its name in `wrf_mi.core.Record.task`."""
 
 
 def register(task: Task) -> None:
     """Add a task for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
 
     Raises:
-        InputError: a name that is taken.
+        InputError: the name is taken.
     """
     _TASKS.add(task.name, task)
 
@@ -32,25 +32,25 @@ def task_of(record: Record) -> Task:
     """The task of a record.
 
     Raises:
-        InputError: a name that no task bears.
+        InputError: an unknown task.
     """
     return known_task(record.task, record.source or record.name)
 
 
 def instrument_of(record: Record) -> Instrument:
-    """The instrument behind a record, for ray tracing.
+    """The instrument of a record, for ray tracing.
 
     Raises:
-        InputError: a name that no task bears, or data that do not tell positions, carrier or array.
+        InputError: an unknown task, or data without positions, carrier or array.
     """
     return task_of(record).instrument(record)
 
 
 def known_task(name: str, place: str) -> Task:
-    """The task of a name; ``place`` is where that stands, for the message.
+    """The task of a name; ``place`` names its source in the message.
 
     Raises:
-        InputError: no task bears it.
+        InputError: an unknown task.
     """
     if name not in TASKS:
         raise InputError(f"{place}: task {name!r}; known are {', '.join(TASKS)}")
@@ -61,7 +61,7 @@ def require(record: Record, *names: str, why: str) -> None:
     """Refuse a record of another task than those named.
 
     Raises:
-        InputError: ``why`` says what they are needed for.
+        InputError: the message ends with ``why``.
     """
     if record.task not in names:
         raise InputError(f"{record.name}: holds {record.task}; {why}")

@@ -1,6 +1,6 @@
-"""What fields are told and compared with, for spectra, signal strengths and channels, as NumPy arrays.
+"""Inputs and targets of fields for spectra, signal strengths and channels, as NumPy arrays.
 
-With an uplink each antenna of each row is a condition of its own, as in NeRF2's code; else each position is one.
+With an uplink each antenna of each row is a condition, as in NeRF2's code; else each position is one.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from ..core.types import IntArray
 from . import task_of
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-"""The quaternion x, y, z, w of a receiver whose frame is the world's."""
+"""Quaternion x, y, z, w of a frame parallel to the world's."""
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
-    """Uplink channels as features, and the complex number that each was divided by.
+    """Uplink channels as features, and the complex divisor of each.
 
-    Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, so that
-    what the radios add to amplitude and phase, the same in both links, is no part of what must be learned.
+    Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, which
+    removes the radios' amplitude and phase, equal in both links.
 
     Args:
         uplink: [m, antennas, subcarriers], complex and finite.
@@ -51,12 +51,12 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
 
 @dataclass(frozen=True)
 class Outputs:
-    """How many complex numbers the rays bring, and what they stand for.
+    """Complex numbers of a ray.
 
     Attributes:
-        by_uplink: the radiance network knows the uplink channel in place of the position.
-        antennas: of the base station; each is a condition of its own with the uplink, else an output.
-        frequencies_hz: of each output, [outputs]; 0 where the data do not tell.
+        by_uplink: whether the uplink channel is the condition instead of the position.
+        antennas: antennas of the base station; each is a condition with the uplink, else an output.
+        frequencies_hz: frequency of each output, [outputs]; 0 where unknown.
     """
 
     by_uplink: bool
@@ -65,7 +65,7 @@ class Outputs:
 
     @property
     def count(self) -> int:
-        """Complex numbers a ray brings."""
+        """Number of complex numbers of a ray."""
         return len(self.frequencies_hz)
 
 
@@ -76,10 +76,10 @@ def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
 
 
 def outputs_of(record: Record) -> Outputs:
-    """What the record asks for.
+    """The outputs for a record.
 
     Raises:
-        InputError: an uplink with another number of antennas than the downlink, or of several receivers.
+        InputError: different numbers of antennas in uplink and downlink, or an uplink beside several receivers.
     """
     if not task_of(record).is_complex:
         known = record.frequencies_hz
@@ -102,13 +102,13 @@ def outputs_of(record: Record) -> Outputs:
 
 
 def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
-    """The receivers of a record, with poses that are finite.
+    """The receivers of a record, with finite poses.
 
-    With an uplink in the transmitter's place nothing is told in the world's frame, so a receiver whose position is not
-    known defines that frame: it is put at the origin, upright unless its orientation is known.
+    With an uplink as the condition a receiver of unknown position defines the world frame: at the origin, upright
+    unless its orientation is known.
 
     Raises:
-        InputError: a pose that is not known, where transmitters are told by their positions.
+        InputError: an unknown pose, where transmitters are described by positions.
     """
     placed = []
     for receiver in record.receivers:
@@ -126,10 +126,10 @@ def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
 
 
 def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
-    """The uplink of rows that are predicted.
+    """The uplink of rows to predict.
 
     Raises:
-        InputError: they have none.
+        InputError: it is None.
     """
     if uplink is None:
         raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
@@ -137,7 +137,7 @@ def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
 
 
 def channel_scales(record: Record, rows: IntArray) -> FloatArray:
-    """Units of each receiver's channels in given rows [n_rx] (see `wrf_mi.tasks.Task.unit`); 1 for other tasks."""
+    """Units of each receiver's channels in given rows [n_rx] (`wrf_mi.tasks.Task.unit`); 1 for other tasks."""
     task = task_of(record)
     if not task.is_complex:
         return np.ones(len(record.receivers))
@@ -147,10 +147,10 @@ def channel_scales(record: Record, rows: IntArray) -> FloatArray:
 def truth_of(
     record: Record, outputs: Outputs, receiver: int, rows: IntArray, scales: FloatArray
 ) -> NDArray[np.float32]:
-    """What the networks are compared with, one row for each condition.
+    """Targets of the networks, one row for each condition.
 
     Greys [n, pixels]; powers [n, 1] in dBm; channels, real parts and then imaginary ones, [n, 2 outputs] in units of
-    the receiver's of ``scales``, or [n * antennas, 2 outputs] divided as `normalised_uplink` divided the uplink.
+    the receiver's ``scales``, or [n * antennas, 2 outputs] divided as in `normalised_uplink`.
     """
     seen = record.observation[receiver, rows]
     if not task_of(record).is_complex:
@@ -166,7 +166,7 @@ def truth_of(
 
 
 def channels_from(parts: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]) -> NDArray[np.complex64]:
-    """Undo `truth_of`: channels of ``shape`` from [conditions, 2 outputs]."""
+    """Channels of ``shape`` from targets [conditions, 2 outputs], the inverse of `truth_of`."""
     half = parts.shape[1] // 2
     channel = np.asarray(parts[:, :half] + 1j * parts[:, half:])
     if isinstance(divisor, np.ndarray):

@@ -30,17 +30,17 @@ class Csi(Task):
     )
 
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """See `wrf_mi.tasks.scores.cea_db`."""
+        """Channel estimation accuracy (`wrf_mi.tasks.scores.cea_db`)."""
         return cea_db(prediction, truth)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
-        """The mean squared difference over what was received."""
+        """Mean squared difference over received observations."""
         from .losses import squared_error
 
         return squared_error(prediction, truth)
 
     def unit(self, observed: NDArray[Any]) -> float:
-        """Root mean square of a receiver's channels: one far away counts as much as a near one."""
+        """Root mean square of a receiver's channels: far and near receivers then have equal weight."""
         size = np.square(np.abs(np.asarray(observed, complex)))
         power = float(np.nanmean(size)) if np.isfinite(size).any() else 0.0
         return power**0.5 if power > 0 else 1.0
@@ -55,28 +55,28 @@ class Csi(Task):
         return ChannelInstrument(single.receivers, frequencies, record.tx_antenna)
 
     def check(self, record: Record) -> None:
-        """Refuse numbers of rows, antennas, subcarriers and frequencies that differ."""
-        place, shape = record.source or record.name, record.observation.shape
+        """Refuse inconsistent numbers of rows, antennas, subcarriers and frequencies."""
+        source, shape = record.source or record.name, record.observation.shape
         if len(shape) not in (3, 4):
             text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"
-            raise InputError(f"{place}: channel coefficients {list(shape)}; {text}")
+            raise InputError(f"{source}: channel coefficients {list(shape)}; {text}")
         frequencies = record.frequencies_hz
         if frequencies is not None and len(frequencies) not in (1, shape[-1]):
-            raise InputError(_differ(place, "", shape[-1], len(frequencies)))
+            raise InputError(_differ(source, "", shape[-1], len(frequencies)))
         if record.uplink is None:
             return
         antennas = shape[2] if len(shape) == 4 else 1
         if record.uplink.ndim != 3 or record.uplink.shape[:2] != (shape[1], antennas):
             raise InputError(
-                f"{place}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
+                f"{source}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
                 "antennas; give both for the same ones"
             )
         if record.uplink_hz is not None and len(record.uplink_hz) != record.uplink.shape[2]:
-            raise InputError(_differ(place, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
+            raise InputError(_differ(source, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
 
 
-def _differ(place: str, what: str, subcarriers: int, frequencies: int) -> str:
-    return f"{place}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
+def _differ(source: str, what: str, subcarriers: int, frequencies: int) -> str:
+    return f"{source}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
 
 
 TASK = Csi()

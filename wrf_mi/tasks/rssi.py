@@ -20,7 +20,7 @@ class Rssi(Task):
     block, label, higher_is_better = "abs_error_db", "absolute error (dB)", False
     axes, in_decibel = 0, True
     receiver = receiver_with_scene = "power"
-    # Of 0 to 1.6 m the best on tenths of flat-ble's training run that were held out in turn, in the order of time.
+    # Best of 0 to 1.6 m in a tenfold cross-validation, in the order of time, on flat-ble's training run.
     neighbours, softening_m = 100, 0.4
     heading, quantity = "received signal strength", "RSSI (dBm)"
     note = (
@@ -29,11 +29,11 @@ class Rssi(Task):
     )
 
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """See `wrf_mi.tasks.scores.abs_error_db`."""
+        """Absolute error (`wrf_mi.tasks.scores.abs_error_db`)."""
         return abs_error_db(prediction, truth)
 
     def unit(self, observed: NDArray[Any]) -> float:
-        """Ten decibels: errors are then of the size that learning rates are for."""
+        """Ten decibels: errors are then of the size that the learning rates expect."""
         return 10.0
 
     def instrument(self, record: Record) -> PowerInstrument:

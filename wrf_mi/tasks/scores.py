@@ -1,4 +1,4 @@
-"""The one place where each metric is computed."""
+"""Scores: the only implementation of each metric."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 
 EXACT = np.finfo(float).eps ** 2
-"""Smallest relative squared error that float64 can show."""
+"""Smallest relative squared error that float64 resolves."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
 
@@ -76,7 +76,7 @@ def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     _check(predicted, expected)
     error = np.square(np.abs(predicted - expected)).sum(axis=-1)
     power = np.square(np.abs(expected)).sum(axis=-1)
-    # A prediction without any error would be infinitely accurate; float64 cannot tell more than this.
+    # The accuracy of an exact prediction is that of float64.
     ratio = np.maximum(np.divide(error, power, out=np.full(power.shape, np.nan), where=power > 0), EXACT)
     result: FloatArray = -10 * np.log10(ratio)
     return result
@@ -99,7 +99,7 @@ def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> 
 def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:
     if prediction.shape != truth.shape:
         raise InputError(f"prediction {prediction.shape} and truth {truth.shape} differ in shape")
-    # Without this a method that fails where it is hard would be scored on the rest.
+    # A model may not skip rows.
     wrong = int(np.count_nonzero(~np.isfinite(prediction) & ~np.isnan(truth)))
     if wrong:
         raise InputError(f"prediction: {wrong} of {truth.size} values are not finite where the truth is known")

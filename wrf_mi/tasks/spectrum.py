@@ -28,12 +28,12 @@ class Spectrum(Task):
     )
 
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """See `wrf_mi.tasks.scores.ssim`."""
+        """Structural similarity (`wrf_mi.tasks.scores.ssim`)."""
         return ssim(prediction, truth)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
-        """The papers' loss, see `wrf_mi.tasks.spectrum_loss.spectrum_loss`."""
-        from .spectrum_loss import spectrum_loss
+        """Loss of the papers (`wrf_mi.tasks.losses.spectrum_loss`)."""
+        from .losses import spectrum_loss
 
         return spectrum_loss(prediction, truth, batch, shape[0], shape[1], ssim_weight)[0]
 

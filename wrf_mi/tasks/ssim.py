@@ -34,7 +34,7 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
 
     Args:
         prediction: flat Dr.Jit float array of ``batch * height * width`` values (a data range of one).
-        truth: the same shape and type; taken as constant.
+        truth: array of the same shape and type; taken as constant.
         batch: number of images.
         height: rows, at least 7.
         width: columns, at least 7.
@@ -61,7 +61,7 @@ def _check(prediction: Any, truth: Any, batch: int, height: int, width: int) -> 
 
 
 def _store(values: list[Any], float_type: Any) -> Any:
-    """Write four arrays [n] as one interleaved array [4 n]."""
+    """Interleave four arrays [n] into one [4 n]."""
     n = max(dr.width(v) for v in values)
     out = dr.empty(float_type, 4 * n)
     index = dr.arange(dr.uint32_array_t(float_type), n)
@@ -70,19 +70,17 @@ def _store(values: list[Any], float_type: Any) -> Any:
 
 
 def _middle(x: Any, y: Any, image: Any, height: int, width: int) -> tuple[Any, Any]:
-    """The middle pixel of an image, from which all of its pixels are counted.
+    """Central pixel of an image, from which its values are counted.
 
-    The reverse pass takes x_p - mean_x as a difference of two sums over windows. Counted from zero, a flat image's
-    would have no digit left.
+    The reverse pass computes x_p - mean_x as a difference of two sums over windows, which cancels on flat images.
     """
-    place = image * (height * width) + (height // 2 * width + width // 2)
-    return dr.gather(type(x), x, place), dr.gather(type(y), y, place)
+    centre = image * (height * width) + (height // 2 * width + width // 2)
+    return dr.gather(type(x), x, centre), dr.gather(type(y), y, centre)
 
 
 def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
-    """Of 7 pixels of a row: means of x and y from `_middle`, squared deviations of both together, and co-deviations.
-
-    Shape [batch * height, width - 6, 4].
+    """Moments of 7 pixels of a row, [batch * height, width - 6, 4]: means of x and y from `_middle`, sum of their
+    squared deviations, co-deviation.
     """
     inner = width - BORDER
     i = dr.arange(dr.uint32_array_t(type(x)), batch * height * inner)
@@ -101,12 +99,11 @@ def _row_moments(x: Any, y: Any, batch: int, height: int, width: int) -> Any:
 
 
 def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) -> tuple[Any, Any]:
-    """Similarity [batch, height - 6, width - 6] of each window, and what the reverse pass needs of it.
+    """Similarity [batch, height - 6, width - 6] of each window, and the coefficients of the reverse pass.
 
-    With the derivatives of the similarity by mean (a), variance (b) and covariance (c) of a window, pixel p
-    receives sum over its windows of a / 49 + b * 2 (x_p - mean_x) / 48 + c * (y_p - mean_y) / 48, which is
-    box(offset) + x_p box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0), where x and y count
-    from `_middle`.
+    With the derivatives of the similarity by mean (a), variance (b) and covariance (c) of a window, pixel p receives
+    the sum over its windows of a / 49 + b * 2 (x_p - mean_x) / 48 + c * (y_p - mean_y) / 48, which is box(offset) + x_p
+    box(by_x) + y_p box(by_y); the second result holds (offset, by_x, by_y, 0), with x and y relative to `_middle`.
     """
     float_type = type(moments)
     inner_h, inner_w = height - BORDER, width - BORDER
@@ -115,18 +112,18 @@ def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) 
     start = i + image * (BORDER * inner_w)
     rows = [dr.gather(quads(float_type), moments, start + k * inner_w) for k in range(WINDOW)]
     total = sum(rows)
-    own_x, own_y = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
+    mean_x, mean_y = total[0] * (1 / WINDOW), total[1] * (1 / WINDOW)
     squares: Any = 0
     products: Any = 0
     for row in rows:
-        dx, dy = row[0] - own_x, row[1] - own_y
+        dx, dy = row[0] - mean_x, row[1] - mean_y
         squares = dr.fma(dx, dx, dr.fma(dy, dy, squares))
         products = dr.fma(dx, dy, products)
     variances = (total[2] + WINDOW * squares) * (1 / (PIXELS - 1))
     covariance = (total[3] + WINDOW * products) * (1 / (PIXELS - 1))
 
     mid_x, mid_y = _middle(x, y, image, height, width)
-    ux, uy = mid_x + own_x, mid_y + own_y
+    ux, uy = mid_x + mean_x, mid_y + mean_y
     means_below = dr.rcp(dr.fma(ux, ux, dr.fma(uy, uy, C1)))
     spread_below = dr.rcp(variances + C2)
     means = dr.fma(2 * ux, uy, C1) * means_below
@@ -135,9 +132,9 @@ def _windows(x: Any, y: Any, moments: Any, batch: int, height: int, width: int) 
     by_x = similarity * spread_below * (-2 / (PIXELS - 1))
     by_y = means * spread_below * (2 / (PIXELS - 1))
     # (uy - ux means) without its cancellation: means = 1 - apart^2 means_below.
-    apart = (mid_y - mid_x) + (own_y - own_x)
+    apart = (mid_y - mid_x) + (mean_y - mean_x)
     by_mean = spread * apart * dr.fma(ux * apart, means_below, 1) * means_below * (2 / PIXELS)
-    offset = by_mean - by_x * own_x - by_y * own_y
+    offset = by_mean - by_x * mean_x - by_y * mean_y
     return similarity, _store([offset, by_x, by_y, float_type(0)], float_type)
 
 

@@ -1,4 +1,4 @@
-"""What a task is: the form of an observation, its score, its references and the instrument behind it."""
+"""Tasks: form of an observation, score, references and instrument."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ UPLINK = "uplink"
 
 
 class Task(ABC):
-    """A kind of observation and all that depends on it.
+    """A kind of observation with its score, loss and instrument.
 
-    A task of another package is a subclass, an instance of which an entry point of the group ``wrf_mi.tasks`` names.
+    A task of another package is an instance of a subclass, which an entry point of the group ``wrf_mi.tasks`` names.
 
     Attributes:
-        name: as in `wrf_mi.core.Record.task`.
+        name: name in `wrf_mi.core.Record.task`.
         block: key of the score in ``metrics.json``.
-        label: of the score, for tables and axes.
-        digits: of the score, after the decimal point.
+        label: label of the score, for tables and axes.
+        digits: digits of the score after the decimal point.
         higher_is_better: whether the score is an accuracy or an error.
         axes: number of axes of one observation, at one receiver and row.
-        more_axes: that it may have beside these (antennas); all of them together are one observation.
-        image: whether an observation is an image, which pictures show as such; else its level is drawn over positions.
+        more_axes: number of optional further axes (antennas) of an observation.
+        image: whether an observation is shown as an image; else its level is drawn over positions.
         is_complex: whether observations are complex.
-        receiver: name of the receiver model by which a field is trained (`wrf_mi.graph.receivers`).
-        receiver_with_scene: of that with which paths of a scene are trained beside it.
-        in_decibel: whether observations are powers in decibels, whose level each receiver counts from an origin of its
-            own: a propagation law describes them, and offsets are fitted to training rows.
-        neighbours: training rows that the reference interpolates between (inverse-distance weighting).
-        softening_m: distance that is added to each of theirs, metres.
+        receiver: name of the default receiver model (`wrf_mi.graph.receivers`).
+        receiver_with_scene: name of the default receiver model beside the paths of a scene.
+        in_decibel: whether observations are powers in decibels with an offset of each receiver: a propagation law
+            describes them, and offsets are fitted to training rows.
+        neighbours: training rows of the reference, inverse-distance weighting.
+        softening_m: addend of the distances in the reference, metres.
         from_uplink: words for the second reference, of data with an uplink; "" where the task has none.
-        heading: of the task.
-        quantity: what is drawn over positions, with its unit.
-        note: one sentence for readers of a table.
+        heading: heading of the task.
+        quantity: quantity that is drawn over positions, with its unit.
+        note: sentence for readers of a table.
     """
 
     name: ClassVar[str]
@@ -65,7 +65,7 @@ class Task(ABC):
 
     @abstractmethod
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """One value for each observation of ``axes`` axes.
+        """Score of each observation of ``axes`` axes.
 
         Args:
             prediction: any shape that ends with an observation's.
@@ -74,14 +74,14 @@ class Task(ABC):
 
     @abstractmethod
     def instrument(self, record: Record) -> Instrument:
-        """The instrument behind a record of this task, for ray tracing.
+        """The instrument of a record of this task, for ray tracing.
 
         Raises:
-            InputError: the data do not tell what it takes.
+            InputError: the data lack positions, carrier or array.
         """
 
     def check(self, record: Record) -> None:  # noqa: B027 - most tasks have nothing to check
-        """Refuse a record whose parts do not fit together.
+        """Refuse a record with inconsistent parts.
 
         Raises:
             InputError: naming what differs.
@@ -94,41 +94,41 @@ class Task(ABC):
 
     @property
     def references(self) -> dict[str, str]:
-        """Words for each reference that the task may have by its key, the first that a run has being its headline."""
-        blend = {self.reference: f"blend of {self.neighbours} nearest"}
-        return {UPLINK: self.from_uplink} | blend if self.from_uplink else blend
+        """Words for each possible reference by its key; the first that a run has is its headline."""
+        idw = {self.reference: f"blend of {self.neighbours} nearest"}
+        return {UPLINK: self.from_uplink} | idw if self.from_uplink else idw
 
     def headline(self, stored: Container[str]) -> str | None:
-        """The reference that stands for all: the first of `references` among those stored; None without any."""
+        """The first of `references` among the stored ones; None without any."""
         return next((key for key in self.references if key in stored), None)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
-        """What training makes small, a Dr.Jit float of one value: the mean absolute difference over what was received.
+        """Loss of the training, a Dr.Jit float of one value: mean absolute difference over received observations.
 
         Args:
             prediction: flat Dr.Jit floats of a batch, divided by the receiver's `unit`.
-            truth: the same; NaN where nothing was received.
+            truth: array of the same shape; NaN where nothing was received.
             batch: number of observations.
-            shape: of one; complex ones with a last axis of real and imaginary part.
-            ssim_weight: weight of an image's structure, 0 to 1.
+            shape: shape of an observation; complex ones have a last axis of real and imaginary part.
+            ssim_weight: weight of an image's structural term, 0 to 1.
         """
         from .losses import absolute_error
 
         return absolute_error(prediction, truth)
 
     def unit(self, observed: NDArray[Any]) -> float:
-        """What observations of one receiver [n, ...], NaN where nothing was received, are divided by in the loss."""
+        """Unit in the loss of a receiver's observations [n, ...], NaN where nothing was received."""
         return 1.0
 
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
-        """Scores of observations [n, ...] while a model is trained: those of `of_rows`, by any faster way."""
+        """Scores of observations [n, ...] in training: as `of_rows`, by a faster implementation where there is one."""
         return np.asarray(self.of_rows(np.asarray(prediction)[None], np.asarray(truth)[None])[0], float)
 
     def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Score of each receiver and row.
 
         Args:
-            prediction: [n_rx, m, ...], see `wrf_mi.core.Record`.
+            prediction: [n_rx, m, ...], as in `wrf_mi.core.Record`.
             truth: the same shape.
 
         Returns:
@@ -142,17 +142,17 @@ class Task(ABC):
 
 
 def carrier_hz(record: Record, stated_in: str) -> FloatArray:
-    """Frequencies of a record whose transmitters and receivers have known positions, as ray tracing needs.
+    """Frequencies of a record with known positions, as ray tracing needs.
 
     Args:
-        record: of any task.
-        stated_in: key and file that would state the frequency, for the message.
+        record: measurements of any task.
+        stated_in: key and file of the frequency, for the message.
 
     Raises:
-        InputError: a position or the frequency is not known.
+        InputError: an unknown position or frequency.
     """
-    places = [record.tx_pos_m, *(receiver.position_m for receiver in record.receivers)]
-    if not all(np.isfinite(place).all() for place in places):
+    positions = [record.tx_pos_m, *(receiver.position_m for receiver in record.receivers)]
+    if not all(np.isfinite(position_m).all() for position_m in positions):
         raise InputError(f"{record.name}: positions unknown, so there is nothing to trace between; use another method")
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state {stated_in}")

@@ -18,17 +18,17 @@ Params = dict[str, Any]
 
 
 class NumericsError(RuntimeError):
-    """A loss, gradient, parameter or moment was not finite; says at which step, and which of them."""
+    """A loss, gradient, parameter or moment is not finite; the message names step and quantity."""
 
     exit_status = 1
 
 
 @dataclass
 class NonFiniteReport:
-    """The first step whose loss, parameters, gradient or its square were not finite; from then on no step is taken.
+    """First step whose loss, parameters, gradient or squared gradient were not finite; no step is taken after it.
 
     Attributes:
-        step: its number from 1; 0: none so far.
+        step: number of the step from 1; 0: all finite so far.
         groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
     """
 
@@ -37,32 +37,29 @@ class NonFiniteReport:
 
     @classmethod
     def none(cls, names: Iterable[str]) -> NonFiniteReport:
-        """None so far, for parameters of these names."""
+        """An empty report for parameters of these names."""
         none = cls(mi.UInt32(0), dr.zeros(mi.Float, 1 + len(watched_groups(names))))
         dr.make_opaque(none)  # a constant would be recorded as one
         return none
 
 
 def watched_groups(names: Iterable[str]) -> list[str]:
-    """The parameters that `NonFiniteReport` watches, in its order, after the loss.
+    """Names of the parameters that `NonFiniteReport` watches, in its order, after the loss.
 
-    Attributes of Gaussians and of the traced side are watched themselves, a layer through its bias, whose gradient is
-    the sum of all that reaches the layer.
+    Parameters of Gaussians and of the traced side are watched directly, a layer through its bias, whose gradient is the
+    sum of all gradients that reach the layer.
     """
     return [n for n in names if "." not in n or n.endswith(".bias") or n.startswith(TRACED_NAMES)]
 
 
 def _health(param: Any) -> Any:
-    """A number that is finite where a parameter, its gradient and the square of that, which Adam takes, are.
-
-    A Gaussian whose shape or place is NaN is not seen, so that the loss alone would not tell.
-    """
+    """A number that is finite where a parameter, its gradient and the squared gradient, which Adam uses, are finite."""
     return dr.sum(dr.square(dr.grad(param).array) + dr.abs(dr.detach(param).array))
 
 
 def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
-    """Parameters of the coming step, whose learning rates are set to ``factor`` times ``rates``."""
-    # A rate of its own for each parameter: Adam multiplies a shared array in place, once a parameter.
+    """Parameters of the next step, whose learning rates are set to ``factor`` times ``rates``."""
+    # A separate array for each parameter: Adam multiplies a shared array in place, once a parameter.
     adam.set_learning_rate({name: factor * rates[name] for name in rates})
     return {name: adam[name] for name in rates}
 
@@ -70,19 +67,20 @@ def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
 def guarded_step(
     adam: Adam, params: Params, loss: Any, mean: Params, decay: Any, number: Any, trouble: NonFiniteReport
 ) -> tuple[Params, NonFiniteReport, Any]:
-    """Differentiate a loss and take a step of Adam in place, unless something is or was not finite.
+    """Differentiate a loss of ``params`` (`rated_params`) and take a step of Adam in place, unless a value is or was
+    not finite.
 
     Args:
-        adam: owns the parameters.
-        params: from `rated_params`; they hold gradients afterwards.
-        loss: of these, one value.
+        adam: optimiser that owns the parameters.
+        params: parameters, which hold gradients afterwards.
+        loss: loss, one value.
         mean: running mean of the parameters.
-        decay: of the running mean.
-        number: of the step, from 1.
-        trouble: so far.
+        decay: decay of the running mean.
+        number: number of the step, from 1.
+        trouble: report so far.
 
     Returns:
-        Running mean, report, and whether the step was taken; none of them evaluated.
+        Running mean, report, and whether the step was taken; all unevaluated.
     """
     dr.backward(loss)
     sums = [dr.detach(loss), *(_health(params[name]) for name in watched_groups(params))]

@@ -1,9 +1,7 @@
-"""What a training run leaves in its folder until it has ended.
+"""Files of a training run in progress, each written atomically.
 
-    checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
-    log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_score, held_out, gaussians
-
-Every file appears whole or not at all.
+checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
+log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_score, held_out, gaussians
 """
 
 from __future__ import annotations
@@ -30,9 +28,9 @@ CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 
 
 def write_checkpoint(folder: Path, loop: TrainingLoop, beside: Mapping[str, NDArray[Any]] | None = None) -> None:
-    """Write ``checkpoint.npz``: enough to go on, and further arrays ``beside`` it."""
-    own = {"format": np.asarray(FORMAT), "seconds": np.asarray(loop.seconds)}
-    write_arrays(folder / CHECKPOINT, {**loop.state.arrays(), **own, **(beside or {})})
+    """Write ``checkpoint.npz``, with further arrays ``beside`` the loop's state."""
+    header = {"format": np.asarray(FORMAT), "seconds": np.asarray(loop.seconds)}
+    write_arrays(folder / CHECKPOINT, {**loop.state.arrays(), **header, **(beside or {})})
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
@@ -52,10 +50,10 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
 
 
 def checkpoint_seconds(folder: Path) -> float:
-    """Training time up to the checkpoint in a folder; 0 without one.
+    """Training time up to the checkpoint in a folder; 0 without a checkpoint.
 
     Raises:
-        InputError: as `read_checkpoint`.
+        InputError: damaged, or of another format version.
     """
     return float(read_checkpoint(folder)["seconds"]) if (folder / CHECKPOINT).exists() else 0.0
 
@@ -71,7 +69,7 @@ def append_log(folder: Path, progress: Progress) -> None:
 
 
 def cut_log(folder: Path, step: int) -> None:
-    """Drop lines after ``step``: what was logged after the checkpoint that a run goes on from happens again."""
+    """Drop lines after ``step``, the step of the checkpoint from which a run resumes."""
     path = folder / LOG
     if path.is_file():
         lines = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]

@@ -29,24 +29,24 @@ Params = dict[str, NDArray[np.float32]]
 SCORED = 64
 """Views, spread over the training rows, on which Gaussians are scored."""
 COPIES = 4
-"""Positions near each training row at which a smaller network learns from the larger one."""
+"""Positions near each training row for distillation."""
 NEAR_M = 0.2
 """Standard deviation of such a position from its row, metres: less than the distance between rows."""
 
 
 @dataclass(frozen=True)
 class Compression:
-    """How a field is made smaller.
+    """Settings of a compression.
 
     Attributes:
-        budget: Gaussians to keep; 0: all.
-        width: neurons a layer of a smaller network; 0: as it is.
-        layers: hidden layers of a smaller network; 0: as they are.
-        terms: make it a factorised field (`wrf_mi.gaussians.factorised`) of so many terms, whose network does not see
-            Gaussians, with the sizes above; 0: the model stays.
-        distil: steps in which a smaller network learns the larger one's spectra.
-        fine_tune: steps on the training rows after all that.
-        precision: of the numbers that are stored, see `wrf_mi.training.packed`.
+        budget: number of Gaussians to keep; 0: all.
+        width: neurons a layer of a smaller network; 0: unchanged.
+        layers: hidden layers of a smaller network; 0: unchanged.
+        terms: terms of a factorised field (`wrf_mi.gaussians.factorised`) that replaces the model, with the sizes
+            above; 0: the model is kept.
+        distil: steps in which a smaller network learns the larger network's spectra.
+        fine_tune: final steps on the training rows.
+        precision: precision of the stored numbers (`wrf_mi.training.packed`).
     """
 
     budget: int = 0
@@ -58,7 +58,7 @@ class Compression:
     precision: str = "half"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be done.
+        """Refuse invalid values.
 
         Raises:
             InputError: naming the setting.
@@ -71,14 +71,14 @@ class Compression:
 
     @property
     def other_network(self) -> bool:
-        """Whether the network is exchanged."""
+        """Whether the network is replaced."""
         return bool(self.width or self.layers or self.terms)
 
 
 def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, split: Split) -> NDArray[np.float64]:
-    """How much spectra change without a Gaussian: mean over training views of the mean |change| of a pixel, [n].
+    """Mean |change| of a pixel over training views when a Gaussian is removed, [n].
 
-    Each alone is taken away, see `wrf_mi.gaussians.removal`: a dark Gaussian that hides a strong one counts too.
+    Each Gaussian is removed alone (`wrf_mi.gaussians.removal`), so a dark Gaussian that hides a strong one counts.
     """
     field, plane = make_field(config), perception_plane(*map(int, record.observation.shape[-2:]), mi.Float)
     tensors = {name: to_tensor(values) for name, values in params.items()}
@@ -94,7 +94,7 @@ def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, s
 
 
 def prune(params: Params, names: tuple[str, ...], score: NDArray[np.float64], budget: int) -> Params:
-    """Parameters of the ``budget`` Gaussians with the largest score, in their old order; networks as they are."""
+    """Parameters of the ``budget`` Gaussians with the largest score, in their old order; networks are unchanged."""
     kept = np.sort(np.argsort(-score, kind="stable")[:budget])
     return {name: values[:, kept] if name in names else values for name, values in params.items()}
 
@@ -103,7 +103,7 @@ def _exchanged(config: TrainConfig, params: Params, how: Compression) -> tuple[T
     """Settings and parameters with a new, untrained network of another size or kind."""
     network, model = config.network, config.model
     if how.terms and model != "factorised":
-        # Sizes that were chosen for another kind of network say nothing here.
+        # Sizes of another kind of network do not apply.
         network, model = NetworkConfig(), "factorised"
     network = replace(
         network,
@@ -111,24 +111,24 @@ def _exchanged(config: TrainConfig, params: Params, how: Compression) -> tuple[T
         layers=how.layers or network.layers,
         terms=how.terms or network.terms,
     )
-    own = replace(config, model=model, network=network)
-    # The Gaussians are kept; how many there are and how strong is all that a new network's start depends on.
-    where = params["position"].T.astype(float)
-    start = InitialGaussians(where, np.ones(len(where)), config.initial.opacity, config.initial.signal)
-    fresh = make_field(own).init(start, np.random.default_rng([config.seed, 3]))
+    changed = replace(config, model=model, network=network)
+    # The starting values of a network depend on number and strength of the Gaussians only.
+    centres = params["position"].T.astype(float)
+    start = InitialGaussians(centres, np.ones(len(centres)), config.initial.opacity, config.initial.signal)
+    fresh = make_field(changed).init(start, np.random.default_rng([config.seed, 3]))
     kept = {name for name in fresh if "." not in name and name in params and params[name].shape == fresh[name].shape}
-    return own, {name: params[name] if name in kept else fresh[name] for name in fresh}
+    return changed, {name: params[name] if name in kept else fresh[name] for name in fresh}
 
 
 def _taught(config: TrainConfig, params: Params, record: Record, split: Split) -> Record:
-    """What the field says at the training rows and near them, as a record."""
+    """Predictions of the field at the training rows and near them, as a record."""
     known = record.tx_pos_m[split.all_train]
     near = np.repeat(known, COPIES, axis=0)
     near = near + np.random.default_rng([config.seed, 4]).normal(0, NEAR_M, near.shape)
     positions = np.concatenate([known, near])
     height, width = map(int, record.observation.shape[-2:])
-    say = Predictor(make_field(config), params, record.receivers, height, width)
-    spectra = np.stack([say(positions, r) for r in range(len(record.receivers))])
+    predict = Predictor(make_field(config), params, record.receivers, height, width)
+    spectra = np.stack([predict(positions, r) for r in range(len(record.receivers))])
     return replace(record, tx_pos_m=positions, observation=spectra, official=None, folds=None, tx_heading_rad=None)
 
 
@@ -138,14 +138,14 @@ def _fit(
     config: TrainConfig,
     params: Params,
     steps: int,
-    on_progress: Callable[..., None],
+    on_progress: Any,
 ) -> Params:
-    """Train given parameters for some steps on given rows, all Gaussians kept."""
+    """Train given parameters for some steps on given rows, without density control."""
     nothing = np.empty(0, np.int64)
     density, optimiser = replace(config.density, every=0), config.optimiser
     optimiser = replace(optimiser, warm_up=min(optimiser.warm_up, max(1, steps // 10)))
-    own = replace(config, steps=steps, holdout_steps_fraction=0.0, density=density, optimiser=optimiser)
-    trainer = Trainer(record, Split("compress", config.seed, rows, nothing, nothing), own, state=FitState(params))
+    config = replace(config, steps=steps, holdout_steps_fraction=0.0, density=density, optimiser=optimiser)
+    trainer = Trainer(record, Split("compress", config.seed, rows, nothing, nothing), config, state=FitState(params))
     trainer.run(on_progress)
     return trainer.state.mean_params()
 
@@ -158,21 +158,21 @@ def compress(
     how: Compression,
     on_progress: Callable[[str, int, Progress], None] = lambda stage, steps, progress: None,
 ) -> tuple[TrainConfig, Params]:
-    """A smaller field from a trained one. Reads training rows alone.
+    """A smaller field from the settings and parameters of a trained one, by training and validation rows only.
 
     Args:
         config: settings of the trained field.
         params: its parameters.
-        record: that it was fitted to.
-        split: whose training and validation rows are used.
-        how: what is made smaller.
-        on_progress: hears of progress: stage, its steps, and the progress.
+        record: record of its fit.
+        split: split of its fit.
+        how: settings of the compression.
+        on_progress: progress callback: stage, its number of steps, and the progress.
 
     Returns:
-        Settings and parameters, these still in single precision.
+        Settings and parameters, still in single precision.
 
     Raises:
-        InputError: a larger budget or network than there is.
+        InputError: a larger budget than there are Gaussians.
     """
     count, teacher = params["position"].shape[1], (config, params)
     if how.budget > count:
@@ -183,9 +183,9 @@ def compress(
     if how.other_network:
         config, params = _exchanged(config, params, how)
         if how.distil:
-            lesson = _taught(*teacher, record, split)
-            rows = np.arange(len(lesson.tx_pos_m))
-            params = _fit(lesson, rows, config, params, how.distil, lambda p: on_progress("distil", how.distil, p))
+            taught = _taught(*teacher, record, split)
+            rows = np.arange(len(taught.tx_pos_m))
+            params = _fit(taught, rows, config, params, how.distil, lambda p: on_progress("distil", how.distil, p))
     if how.fine_tune:
         rows = split.all_train
         params = _fit(record, rows, config, params, how.fine_tune, lambda p: on_progress("fine-tune", how.fine_tune, p))

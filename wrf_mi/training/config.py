@@ -1,48 +1,50 @@
-"""The settings of a fit: frozen dataclasses, written to and read from ``config.yaml``."""
+"""Settings of a fit: frozen dataclasses, written to and read from ``config.yaml``."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import with_settings
+from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
 from ..gaussians.encoding import unambiguous_scale
 from ..gaussians.skip import Skip
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
-from .loop_config import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, RANGES, SHARE, AdamConfig, LoopConfig, Range, checked
+from .loop_config import AdamConfig, LoopConfig
+
+AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
 
 
 @dataclass(frozen=True)
 class InitialConfig:
-    """Where Gaussians start.
+    """Starting values of Gaussians: random, or from one of ``points``, ``mesh`` and ``paths``.
 
     Attributes:
-        gaussians: how many.
-        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres: on its points.
-        mesh: scene that `wrf_mi.tracing.open_scene` opens: on its surfaces.
-        paths: such a scene: where traced paths of the training transmitters come from. Of the three one at most;
-            with none of them Gaussians start at random.
-        size_deg: standard deviation of a random Gaussian as its receiver sees it, degrees.
+        gaussians: number of Gaussians.
+        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres.
+        mesh: scene (`wrf_mi.tracing.open_scene`) on whose surfaces they start.
+        paths: scene whose traced paths of the training transmitters they start from.
+        size_deg: standard deviation of a random Gaussian as seen from its receiver, degrees.
         nearest_m: smallest distance of a random Gaussian from its receiver, metres.
         farthest_m: largest distance, metres.
         opacity: alpha at a footprint's centre.
-        signal: deviation of the starting signals.
+        signal: standard deviation of the starting signals.
     """
 
-    gaussians: int = 270
+    gaussians: Count = 270
     points: str = ""
     mesh: str = ""
     paths: str = ""
-    size_deg: float = 7.0
-    nearest_m: float = 1.0
-    farthest_m: float = 8.0
-    opacity: float = 0.4
+    size_deg: AcuteAngle = 7.0
+    nearest_m: Positive = 1.0
+    farthest_m: Positive = 8.0
+    opacity: Inside = 0.4
     signal: float = 0.3
 
 
@@ -51,32 +53,32 @@ class EncodingConfig:
     """Positional encoding (`wrf_mi.gaussians.encoding`).
 
     Attributes:
-        position_octaves: of Gaussians, L + 1 of the paper.
-        position_scale_m: metres per unit, of Gaussians.
-        tx_octaves: of transmitters.
-        tx_scale_m: metres per unit, of transmitters; 0: as many as tell all training transmitters apart, see
-            `LEAST_TX_SCALE_M`.
+        position_octaves: octaves for Gaussians, L + 1 of the paper.
+        position_scale_m: metres per unit for Gaussians.
+        tx_octaves: octaves for transmitters.
+        tx_scale_m: metres per unit for transmitters; 0: the smallest multiple of `LEAST_TX_SCALE_M` that distinguishes
+            all training transmitters.
     """
 
-    position_octaves: int = 4
-    position_scale_m: float = 4.0
+    position_octaves: Count = 4
+    position_scale_m: Positive = 4.0
     tx_octaves: int = 4
     tx_scale_m: float = 0.0
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Size of the networks, which are most of a field's size and time.
+    """Size of the networks, which dominate a field's size and time.
 
     Attributes:
         width: neurons of a layer; 0: the paper's (256 for WRF-GS+, 128 for WRF-GS), 128 for a factorised field.
         layers: hidden layers; 0: the paper's eight, three for a factorised field. WRF-GS+ joins its input again
             half-way.
-        terms: of a factorised field; 0: 32.
-        static_geometry: WRF-GS+ moves signals alone with the transmitter, not rotation and scale: the map from
-            signals to the receiver is then the same for all transmitters.
-        phase_hz: carrier frequency of a phase that signals of WRF-GS+ have from the distance of the transmitter's
-            image, which ``initial.paths`` tells, else of the transmitter; 0: none.
+        terms: terms of a factorised field; 0: 32.
+        static_geometry: WRF-GS+ moves only signals with the transmitter, not rotation and scale: the map from signals
+            to the receiver is then the same for all transmitters.
+        phase_hz: carrier frequency of a phase of WRF-GS+'s signals by the distance of the transmitter's image (from
+            ``initial.paths``), else of the transmitter; 0: none.
     """
 
     width: int = 0
@@ -88,17 +90,18 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """The field as one antenna sees it: all directions end in one number, so they may be coarse.
+    """Directions of a single antenna, which may be coarse as their signals are summed.
 
     Attributes:
         height: elevations of each hemisphere.
         columns: azimuths.
-        components: complex signals of a Gaussian at most, coefficients of the principal components of channels.
+        components: largest number of complex signals of a Gaussian, coefficients of the principal components of
+            channels.
     """
 
-    height: int = 9
-    columns: int = 36
-    components: int = 6
+    height: Count = 9
+    columns: Count = 36
+    components: Count = 6
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class OptimiserConfig(AdamConfig):
         rotation: rate of quaternions.
         opacity: rate of opacity logits.
         signal: rate of static signals.
-        level: rate of the logarithm of the unit in which each receiver sees the field, where it has one.
+        level: rate of the logarithm of each receiver's unit of the field, where it has one.
     """
 
     position: float = 5e-3
@@ -124,7 +127,7 @@ class OptimiserConfig(AdamConfig):
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Adaptive density control (Kerbl et al. 2023, section 5.2), see `wrf_mi.gaussians.density`.
+    """Adaptive density control (Kerbl et al. 2023, section 5.2; `wrf_mi.gaussians.density`).
 
     Attributes:
         every: steps between two rounds; 0 turns it off.
@@ -132,22 +135,22 @@ class DensityConfig:
         stop: share of the steps after the last round.
         growth_fraction: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a
             round.
-        max_gaussians: number of Gaussians that is never passed.
-        split_deg: a grown Gaussian larger than this is split, a smaller one cloned, degrees.
-        least_opacity: a Gaussian below this is pruned (alpha blending).
+        max_gaussians: largest number of Gaussians.
+        split_deg: size above which a growing Gaussian is split instead of cloned, degrees.
+        least_opacity: opacity below which a Gaussian is pruned (alpha blending).
         reset_every: rounds between two opacity resets; 0 turns them off.
-        reset_opacity: opacity that a reset leaves at most.
+        reset_opacity: largest opacity after a reset.
     """
 
     every: int = 1000
-    start: float = 0.05
-    stop: float = 0.4
-    growth_fraction: float = 0.05
-    max_gaussians: int = 320
-    split_deg: float = 5.0
-    least_opacity: float = 0.005
+    start: Share = 0.05
+    stop: Share = 0.4
+    growth_fraction: Share = 0.05
+    max_gaussians: Count = 320
+    split_deg: Positive = 5.0
+    least_opacity: Inside = 0.005
     reset_every: int = 0
-    reset_opacity: float = 0.05
+    reset_opacity: Inside = 0.05
 
 
 @dataclass(frozen=True)
@@ -158,16 +161,16 @@ class LossConfig:
         ssim_weight: eta.
     """
 
-    ssim_weight: float = 0.2
+    ssim_weight: Share = 0.2
 
 
 PATHS_ALONE = "ray-tracing"
 """Name of the model that trains the paths of a scene without Gaussians."""
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
-"""Steps after which more gain nothing on held-out rows (docs/speed.md); `OTHERWISE` for a model that is not here."""
+"""Steps after which held-out scores no longer improve (docs/speed.md); `OTHERWISE` for other models."""
 OTHERWISE = 15000
 LEAST_TX_SCALE_M = 1.0
-"""Metres per unit of transmitters within two metres; doubled for wider ones as often as needed."""
+"""Metres per unit for transmitters within two metres; doubled for wider regions as often as needed."""
 
 
 @dataclass(frozen=True)
@@ -175,25 +178,24 @@ class TrainConfig(LoopConfig):
     """All settings of a fit of Gaussians, of the paths of a scene, or of both.
 
     Attributes:
-        steps: optimiser steps; 0: as many as the model needs, see `LONG_ENOUGH`.
-        batch: transmitters in a step, at most.
+        steps: optimiser steps; 0: as in `LONG_ENOUGH`.
+        batch: largest number of transmitters in a step.
         model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
-        seed: of starting values and of the order of rows.
-        deterministic: bit-identical results from run to run, at the price of computing on one thread of the CPU.
-        loss: the loss of images.
-        receiver: how the field becomes what is observed, a name of `wrf_mi.graph.receivers`. Of spectra ``"pixel"``:
-            its magnitude at each direction (the papers'), ``"array"``: the Bartlett spectrum of the array's element
-            signals, scaled as the instrument does; ``"auto"``: array with a scene, else pixel. Of signal strengths
-            ``"power"``, of channels ``"csi"``.
-        evaluation: how Gaussians become signals on directions, in steps and predictions alike: ``"splatted"``, or
-            ``"traced"`` by ``mi.render`` with the Mitsuba plugins, where walls of a scene attenuate what is behind
-            them; a step then takes several times as long, and nothing is skipped.
-        view: how an antenna sees the field, where observations are no spectra.
-        skip: what predictions do not evaluate, and the error that this may make in a grey; steps evaluate all.
+        seed: seed of starting values and of the order of rows.
+        deterministic: bit-identical results from run to run, on one thread of the CPU.
+        loss: loss of images.
+        receiver: receiver model (`wrf_mi.graph.receivers`). For spectra ``"pixel"``: magnitude at each direction (the
+            papers'), ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does;
+            ``"auto"``: array with a scene, else pixel. For signal strengths ``"power"``, for channels ``"csi"``.
+        evaluation: evaluation of Gaussians in steps and predictions: ``"splatted"``, or ``"traced"`` by ``mi.render``
+            with the Mitsuba plugins, where walls of a scene attenuate what lies behind them; a step then takes several
+            times as long, and nothing is skipped.
+        view: directions of an antenna, where observations are not spectra.
+        skip: contributions that predictions omit, and the largest error of a grey; steps evaluate all.
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
 
-    steps: int = 0
+    steps: Annotated[int, NOT_NEGATIVE] = 0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     model: str = "wrf-gs+"
     seed: int = 0
@@ -210,22 +212,22 @@ class TrainConfig(LoopConfig):
     traced: TracedConfig = field(default_factory=TracedConfig)
 
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
-        """The same with the number of steps and the scale of transmitters that are meant.
-
-        Args:
-            tx_pos_m: training transmitters [n, 3], metres.
-        """
+        """The settings with number of steps and scale for the training transmitters [n, 3] in metres."""
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
         scale = self.encoding.tx_scale_m or unambiguous_scale(tx_pos_m, LEAST_TX_SCALE_M)
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
-        """Refuse values that no fit can use."""
-        values = checked(self, _RANGES)
-        sources = [name for name in ("points", "mesh", "paths") if values[f"initial.{name}"]]
+        """Refuse values that no fit can use.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        super().__post_init__()
+        sources = [name for name in ("points", "mesh", "paths") if getattr(self.initial, name)]
         if len(sources) > 1:
             raise InputError(f"settings initial.{' and initial.'.join(sources)}: Gaussians start from one; choose it")
-        nearest, farthest = values["initial.nearest_m"], values["initial.farthest_m"]
+        nearest, farthest = self.initial.nearest_m, self.initial.farthest_m
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
         if self.evaluation == TRACED and self.skip.error:
@@ -234,49 +236,19 @@ class TrainConfig(LoopConfig):
             )
 
 
-_RANGES: Mapping[str, Range] = {
-    **RANGES,
-    "steps": NOT_NEGATIVE,
-    "loss.ssim_weight": SHARE,
-    "initial.gaussians": COUNT,
-    "initial.size_deg": (lambda x: 0 < x < 90, "more than 0 and less than 90"),
-    "initial.nearest_m": POSITIVE,
-    "initial.farthest_m": POSITIVE,
-    "initial.opacity": INSIDE,
-    "encoding.position_octaves": COUNT,
-    "encoding.position_scale_m": POSITIVE,
-    "view.height": COUNT,
-    "view.columns": COUNT,
-    "view.components": COUNT,
-    "density.start": SHARE,
-    "density.stop": SHARE,
-    "density.growth_fraction": SHARE,
-    "density.max_gaussians": COUNT,
-    "density.split_deg": POSITIVE,
-    "density.least_opacity": INSIDE,
-    "density.reset_opacity": INSIDE,
-    "traced.alone": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-    "traced.depth": (lambda x: 0 <= x <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
-    "traced.rays": (lambda x: 1 <= x <= MAX_RAYS, f"1 to {MAX_RAYS}"),
-    "traced.faint": (lambda x: 0 <= x < 1, "0 or more and less than 1"),
-    "traced.pattern_degree": (lambda x: 0 <= x <= MAX_DEGREE, f"0 to {MAX_DEGREE}"),
-}
-"""What numbers may be, and words for it; `NOT_NEGATIVE` where nothing is said here."""
-
-
 PAPER = (
     "encoding.position_octaves=10",
     "encoding.position_scale_m=1",
     "encoding.tx_octaves=10",
     "encoding.tx_scale_m=1",
 )
-"""What the paper states and the defaults depart from: L = 9 for Gaussians and transmitter (section V-A).
+"""Settings of the paper that differ from the defaults: L = 9 for Gaussians and transmitter (section V-A).
 
-It states no scale of coordinates; metres are taken. The loss, the networks and Adam are the paper's anyway.
+The paper states no scale of coordinates; metres are assumed. Loss, networks and Adam are the paper's by default.
 """
 
 QUICK = ("steps=6000",)
-"""The shorter schedule of the demo."""
+"""Shorter schedule of the demo."""
 
 ONE_ANTENNA = (
     "batch=16",
@@ -289,11 +261,11 @@ ONE_ANTENNA = (
     "validate_every=500",
     "patience=8",
 )
-"""What a field of signal strengths or channels departs from one of spectra in: it ends in few numbers."""
+"""Settings of a field of signal strengths or channels that differ from a field of spectra: few numbers result."""
 PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every=50", "patience=8", "density.every=0")
-"""What paths alone depart in: few parameters are fitted, soon."""
+"""Settings of paths alone: few parameters converge soon."""
 PATHS_OF_IMAGES = ("batch=8",)
-"""And where observations are images, each of thousands of numbers."""
+"""Further settings where observations are images of thousands of numbers."""
 HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "gain": ("traced.gain=0.05",),
@@ -302,9 +274,9 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "patterns": ("traced.pattern=0.03", "traced.pattern_degree=3"),
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
 }
-"""What of the traced side can be fitted, by name; rates as ``--set`` takes them."""
+"""Trainable parts of the traced side by name; rates as ``--set`` takes them."""
 JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05")
-"""What Gaussians beside the paths of a scene depart in, for one antenna: few parameters of paths are fitted soon."""
+"""Settings of Gaussians beside the paths of a scene for one antenna: the few parameters of paths converge soon."""
 JOINT_IMAGES = (
     "batch=8",
     "steps=1500",
@@ -313,16 +285,12 @@ JOINT_IMAGES = (
     "validate_every=50",
     "patience=6",
 )
-"""And where observations are images: paths explain most of one, to which Gaussians add next to nothing at first."""
+"""Settings where observations are images: paths explain most of one, and Gaussians add little at first."""
 
 
 def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
-    """What a fit to a task's observations departs in from `TrainConfig`, as ``--set`` takes it.
-
-    Args:
-        task: its name.
-        image: whether an observation is an image.
-        with_scene: whether paths of a scene are trained together with the Gaussians.
+    """Settings of a task that differ from `TrainConfig`, as ``--set`` takes them; ``image``: whether observations are
+    images.
     """
     if image:
         return JOINT_IMAGES if with_scene else ()
@@ -330,7 +298,7 @@ def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:
-    """The settings that a fit to a task's observations begins with, alone or beside the paths of a scene."""
+    """Default settings for a task, without or with the paths of a scene."""
     return with_settings(TrainConfig(), task_settings(task, task == "spectrum", with_scene))
 
 
@@ -338,19 +306,19 @@ def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfi
     """The settings of a fit of paths alone.
 
     Args:
-        parts: what is fitted, of `CALIBRATED`; all else is held.
+        parts: names in `CALIBRATED` of what is fitted; the other parts are held.
         images: whether observations are images.
 
     Raises:
-        InputError: none of these, or nothing.
+        InputError: no part, or an unknown one.
     """
     chosen = tuple(parts)
     unknown = [part for part in chosen if part not in CALIBRATED]
     if unknown or not chosen:
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
     moved = [setting for part in chosen for setting in CALIBRATED[part]]
-    own = PATHS_OF_IMAGES if images else ()
-    return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *own, *HELD, *moved])
+    more = PATHS_OF_IMAGES if images else ()
+    return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *more, *HELD, *moved])
 
 
 PRESETS: Mapping[str, tuple[str, ...]] = {"default": (), "paper": PAPER, "quick": QUICK}

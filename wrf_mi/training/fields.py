@@ -1,4 +1,4 @@
-"""The field of Gaussians that a configuration names."""
+"""Field of Gaussians from a configuration."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from .config import TrainConfig
 
 
 def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> Field:
-    """The model that a configuration names.
+    """The field of a configuration.
 
     Args:
         config: settings.
         components: complex signals of a Gaussian.
-        features: number of features that tell of a transmitter in place of its position; 0: its position.
+        features: number of features that describe a transmitter instead of its position; 0: its position.
 
     Raises:
-        InputError: no trainable model of that name, or transmitters whose scale is still open.
+        InputError: no trainable model of that name, unsuitable settings, or an unresolved scale of transmitters.
     """
     if config.model not in FIELDS:
         raise InputError(f"model {config.model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
@@ -34,7 +34,7 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
     if n.layers:
         sizes["layers"] = n.layers
     if n.static_geometry and config.model != "wrf-gs+":
-        raise InputError(f"setting network.static_geometry: {config.model} moves signals alone anyway; leave it away")
+        raise InputError(f"setting network.static_geometry: {config.model} always moves signals alone; omit it")
     if config.model == "wrf-gs":
         if n.width:
             sizes["signal_widths"] = (n.width, max(1, n.width // 2))
@@ -43,11 +43,11 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
             sizes["skip"] = n.layers // 2
         sizes["static_geometry"], sizes["phase_hz"] = n.static_geometry, n.phase_hz
     if n.phase_hz and config.model != "wrf-gs+":
-        raise InputError(f"setting network.phase_hz: {config.model} has no such phase; leave it away")
+        raise InputError(f"setting network.phase_hz: {config.model} has no such phase; omit it")
     if n.phase_hz and (components > 1 or features):
-        raise InputError("setting network.phase_hz: belongs to one signal a Gaussian and to positions; leave it away")
+        raise InputError("setting network.phase_hz: needs one signal a Gaussian and positions; omit it")
     if n.terms:
         if config.model != "factorised":
-            raise InputError(f"setting network.terms: {config.model} has none; leave it away")
+            raise InputError(f"setting network.terms: {config.model} has none; omit it")
         sizes["terms"] = n.terms
     return FIELDS[config.model](encoding=encoding, **sizes)

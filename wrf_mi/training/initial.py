@@ -1,38 +1,196 @@
-"""Where the Gaussians of a fit start, as its settings say."""
+"""Starting values of Gaussians: random, on a point cloud, on a mesh's surfaces, or from traced paths.
+
+A receiver observes a specular path as if it came from the transmitter's image. Paths of the training transmitters give
+directions, powers and distances of arriving waves: clusters of their last points of interaction become Gaussians of
+that power. A mesh alone gives the surfaces that can scatter.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
-from ..core import InputError, Record
+from ..core import InputError, Paths, Receiver, Record
+from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..gaussians import InitialGaussians, gaussians_from_points, random_gaussians
+from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_gaussians
 from ..scene.points import read_points
 from ..tracing import open_scene, trace_paths
 from ..tracing.scenes import MESHES
 from ..tracing.surfaces import scene_surfaces
 from .config import InitialConfig
-from .initial_paths import gaussians_from_mesh, gaussians_from_paths
+
+LEAST_SCALE_M = 0.02
+"""Smallest starting scale, for a cluster of a single point."""
+LEAST_SHARE = 1e-3
+"""Smallest starting power relative to the strongest cluster, so that weak Gaussians can grow."""
+
+
+@dataclass(frozen=True)
+class PathGaussians(InitialGaussians):
+    """Starting values with a signal and an opacity of each Gaussian.
+
+    Attributes:
+        signals: complex, shape [n]: amplitude relative to the strongest times ``signal``, and phase of the path.
+        opacities: alpha at the centre of each, shape [n].
+        image_map: affine map [n, 3, 4] of the transmitter to the image that each Gaussian represents: image = A [x, 1].
+    """
+
+    signals: NDArray[np.complex128] = field(kw_only=True)
+    opacities: FloatArray = field(kw_only=True)
+    image_map: FloatArray = field(kw_only=True)
+
+    def opacity_logit(self) -> NDArray[np.float32]:
+        """The parameter ``opacity``, shape [1, n], as a logit."""
+        return np.log(self.opacities / (1 - self.opacities))[None].astype(np.float32)
+
+    def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
+        """The parameter ``signal`` [2, n] from the paths; nothing is drawn."""
+        return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
+
+    def image(self) -> NDArray[np.float32]:
+        """The parameter ``image``, shape [12, n], from the chains of surfaces of the paths."""
+        return np.ascontiguousarray(self.image_map.reshape(-1, 12).T, np.float32)
+
+
+def gaussians_from_paths(
+    paths: Paths,
+    tx_pos_m: FloatArray,
+    receivers: tuple[Receiver, ...],
+    count: int,
+    rng: np.random.Generator,
+    opacity: float = 0.4,
+    signal: float = 0.3,
+) -> PathGaussians:
+    """Gaussians on clusters of the last points of interaction of traced paths (of direct paths: the transmitter).
+
+    Points are clustered by direction and distance from their receiver, weighted by power; a cluster's mean is the
+    centre, its spread the scale, its mean power the signal and (relative to the strongest) the opacity. The affine map
+    from transmitter to image is fitted to the cluster's strongest chain of surfaces by least squares.
+
+    Args:
+        paths: paths of the training transmitters.
+        tx_pos_m: these transmitters [n, 3], metres.
+        receivers: receivers of the paths.
+        count: number of Gaussians.
+        rng: generator of the clusters' first centres.
+        opacity: opacity of the strongest Gaussian; the weakest has a tenth of it.
+        signal: amplitude of the strongest Gaussian.
+
+    Raises:
+        InputError: no path.
+    """
+    if not len(paths):
+        raise InputError("start from paths: no path arrives; trace more kinds of path, or start at random")
+    row = np.arange(len(paths))
+    bounces = paths.bounces
+    last = paths.vertices_m[row, np.maximum(bounces - 1, 0)]
+    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
+    rx = np.stack([receiver.position_m for receiver in receivers])[paths.rx]
+    away = last - rx
+    distance = np.linalg.norm(away, axis=1)
+    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
+    features = np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
+    power = np.abs(paths.gain) ** 2
+    drawn = rng.choice(len(paths), min(len(paths), 40 * count), replace=False)
+    few = min(count, len(np.unique(np.round(features[drawn], 6), axis=0)))
+    centres, _ = kmeans2(features[drawn], few, iter=20, minit="++", rng=rng)
+    label = cKDTree(centres).query(features)[1].astype(np.int64)
+    used = np.unique(label)
+    # With fewer clusters than Gaussians random clusters are taken more than once.
+    chosen = np.concatenate([used, rng.choice(used, count - len(used))]) if len(used) < count else used
+    position, scale = np.empty((count, 3)), np.empty(count)
+    strength, phase = np.empty(count), np.empty(count)
+    affine = np.empty((count, 3, 4))
+    for index, cluster in enumerate(chosen):
+        members = np.flatnonzero(label == cluster)
+        total = power[members].sum()
+        share = power[members] / total if total > 0 else np.full(len(members), 1 / len(members))
+        position[index] = share @ last[members]
+        square = share @ ((last[members] - position[index]) ** 2).sum(axis=1)
+        scale[index] = max(np.sqrt(square / 3), LEAST_SCALE_M)
+        strength[index] = total / paths.n_tx  # mean over all transmitters
+        phase[index] = np.angle(paths.gain[members[np.argmax(power[members])]])
+        affine[index] = _image_map(paths, tx_pos_m, receivers, members)
+    repeated = np.bincount(chosen, minlength=len(centres))[chosen]
+    relative = np.maximum(strength / repeated / strength.max(), LEAST_SHARE)
+    amplitude = signal * np.sqrt(relative)
+    opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
+    jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
+    return PathGaussians(
+        position + jitter,
+        scale,
+        opacity,
+        signal,
+        signals=amplitude * np.exp(1j * phase),
+        opacities=opacities,
+        image_map=affine,
+    )
+
+
+def gaussians_from_mesh(
+    triangles_m: FloatArray, count: int, rng: np.random.Generator, opacity: float = 0.4, signal: float = 0.3
+) -> InitialGaussians:
+    """Gaussians on a mesh's surfaces, drawn evenly by area, with scales as in `gaussians_from_points`.
+
+    Args:
+        triangles_m: corners [f, 3, 3], metres.
+        count: number of Gaussians, at least 4.
+        rng: generator of the points.
+        opacity: alpha at the centre.
+        signal: standard deviation of the starting signals.
+
+    Raises:
+        InputError: no surface.
+    """
+    corners = np.asarray(triangles_m, float).reshape(-1, 3, 3)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not area.sum() > 0:
+        raise InputError("start from a mesh: it has no surface; give triangles with an area")
+    face = rng.choice(len(corners), count, p=area / area.sum())
+    a, b = rng.random((2, count, 1))
+    flip = a + b > 1
+    a, b = np.where(flip, 1 - a, a), np.where(flip, 1 - b, b)
+    first, second, third = corners[face].transpose(1, 0, 2)
+    start = gaussians_from_points(first + a * (second - first) + b * (third - first), count, rng)
+    return InitialGaussians(start.position_m, start.scale_m, opacity, signal)
+
+
+def _image_map(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], members: IntArray) -> FloatArray:
+    """Affine map [3, 4] from transmitter to image of the strongest chain among some paths."""
+    strongest = members[np.argmax(np.abs(paths.gain[members]))]
+    chain = (paths.objects[members] == paths.objects[strongest]).all(axis=1)
+    same = members[chain & (paths.rx[members] == paths.rx[strongest])]
+    rx = receivers[int(paths.rx[strongest])].position_m
+    image = rx + paths.arrival[same] * paths.length_m[same, None]
+    x = tx_pos_m[paths.tx[same]]
+    mean_x, mean_i = x.mean(axis=0), image.mean(axis=0)
+    # A chain of reflections is an orthogonal map (Kabsch 1976).
+    u, s, vt = np.linalg.svd((image - mean_i).T @ (x - mean_x))
+    linear = np.eye(3) if len(same) < 4 or s[-1] < 1e-6 else u @ vt
+    return np.column_stack([linear, mean_i - linear @ mean_x])
 
 
 def initial_gaussians(
     config: InitialConfig, record: Record, rows: IntArray, rng: np.random.Generator, sphere: bool = False
 ) -> InitialGaussians:
-    """Starting values of the Gaussians.
+    """Starting values of the Gaussians by the settings.
 
     Args:
-        config: which start; see there.
-        record: whose receivers look at them.
-        rows: training rows: only their transmitters' paths are traced.
-        rng: draws what is drawn.
-        sphere: random ones are seen in all directions, or else in the receivers' upper hemispheres.
+        config: settings.
+        record: record whose receivers observe the Gaussians.
+        rows: training rows, whose transmitters' paths are traced.
+        rng: random generator.
+        sphere: random Gaussians lie in all directions instead of the receivers' upper hemispheres.
 
     Raises:
-        InputError: a file or scene that cannot be used, or paths to trace and no carrier frequency.
+        InputError: an unusable file or scene, or paths to trace without a carrier frequency.
     """
     if config.paths:
         if Path(config.paths).suffix.lower() in MESHES:
@@ -42,11 +200,11 @@ def initial_gaussians(
         if record.frequencies_hz is None:
             raise InputError(f"setting initial.paths: {record.name} states no carrier frequency; start otherwise")
         scene = open_scene(config.paths, float(record.frequencies_hz[0]))
-        here = record.tx_pos_m[rows]
-        paths = trace_paths(scene, here, record.receivers, tx_antenna=record.tx_antenna).paths
-        return gaussians_from_paths(paths, here, record.receivers, config.gaussians, rng, config.opacity, config.signal)
+        tx, receivers = record.tx_pos_m[rows], record.receivers
+        paths = trace_paths(scene, tx, receivers, tx_antenna=record.tx_antenna).paths
+        return gaussians_from_paths(paths, tx, receivers, config.gaussians, rng, config.opacity, config.signal)
     if config.mesh:
-        # Only its geometry counts: any frequency and material will do.
+        # The geometry does not depend on frequency and material.
         bare = Path(config.mesh).suffix.lower() in MESHES
         scene = open_scene(config.mesh, 1e9, material=PERFECT if bare else None)
         triangles = scene_surfaces(scene).triangles

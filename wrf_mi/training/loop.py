@@ -20,17 +20,17 @@ from .state import FitState
 
 @dataclass(frozen=True)
 class Progress:
-    """What a listener hears at each log line.
+    """Progress at a log line.
 
     Attributes:
         step: steps taken.
-        seconds: training time so far, over all sittings.
+        seconds: training time so far, resumed runs included.
         loss: mean over the steps since the last line.
         validation_score: median on the validation rows, where it was just computed.
         held_out: whether the validation rows are still kept out of training.
-        gaussians: their number; 0 where there are none.
+        gaussians: number of Gaussians; 0 without a field.
         left_s: estimated seconds to the end.
-        label: of the score.
+        label: name of the score.
     """
 
     step: int
@@ -44,15 +44,15 @@ class Progress:
 
 
 class TrainingLoop(ABC):
-    """Steps of Adam, with validation, the choice of the best moment, progress and checkpoints.
+    """Steps of Adam, with validation, early stopping, progress and checkpoints.
 
     Attributes:
         config: settings of the loop.
-        schedule: what happens at which step.
-        state: between two steps.
-        seconds: training time so far, over all sittings.
-        label: of the validation score.
-        higher_is_better: which way of that is better.
+        schedule: rows and learning rates of each step.
+        state: state between two steps.
+        seconds: training time so far, resumed runs included.
+        label: name of the validation score.
+        higher_is_better: direction of the validation score.
     """
 
     config: LoopConfig
@@ -64,7 +64,7 @@ class TrainingLoop(ABC):
 
     @abstractmethod
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
-        """Take the step after ``state.step`` steps; the loss before it, and the report after it."""
+        """Take the step after ``state.step`` steps; returns the loss before it and the report after it."""
 
     @abstractmethod
     def validate(self) -> float:
@@ -72,10 +72,10 @@ class TrainingLoop(ABC):
 
     @abstractmethod
     def record_functions(self) -> None:
-        """Forget recorded kernels, which hold for the former state."""
+        """Discard recorded kernels, which are valid for the former state only."""
 
     def adapt(self) -> None:
-        """Take a round of density control, after a step of ``schedule.density``."""
+        """Run a round of density control, after a step of ``schedule.density``."""
         raise NotImplementedError("no density control without Gaussians")
 
     def run(
@@ -87,16 +87,16 @@ class TrainingLoop(ABC):
         """Train from the current step to the last.
 
         Args:
-            on_progress: hears of progress every ``log_every`` steps and at the end.
-            save: called for a checkpoint, every ``checkpoint_every`` steps, when stopped and at the end.
-            stop: asked after each step; True ends the run there.
+            on_progress: called every ``log_every`` steps and at the end.
+            save: writes a checkpoint; called every ``checkpoint_every`` steps, when stopped and at the end.
+            stop: stop condition, called after each step.
 
         Returns:
             Whether the last step was reached.
 
         Raises:
-            NumericsError: a loss or gradient that is not finite, raised right after that step, which was not taken:
-                parameters are as before it. Or parameters or moments that are not, found before a score or checkpoint.
+            NumericsError: a loss or gradient is not finite, raised right after that step, which leaves the parameters
+                unchanged; or parameters or moments are not finite, found before a score or checkpoint.
         """
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
@@ -123,8 +123,10 @@ class TrainingLoop(ABC):
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / taken * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
-                told = state.step, self.seconds, losses[0] / since, score, held_out, state.gaussians, left, self.label
-                on_progress(Progress(*told))
+                loss = losses[0] / since
+                on_progress(
+                    Progress(state.step, self.seconds, loss, score, held_out, state.gaussians, left, self.label)
+                )
                 losses, since = dr.zeros(mi.Float), 0
                 if score is not None and choosing and self.choose(score):
                     state, schedule = self.state, self.schedule
@@ -138,7 +140,7 @@ class TrainingLoop(ABC):
         return state.step == config.steps
 
     def choose(self, score: float) -> bool:
-        """Keep the best moment; once no better one is waited for, go on from it. Whether the fit did."""
+        """Keep the best state; without improvement for ``patience`` scores go on from it. True: the fit went back."""
         state = self.state
         state.keep_best(score if self.higher_is_better else -score)
         if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
@@ -150,7 +152,7 @@ class TrainingLoop(ABC):
         return True
 
     def _require_finite(self, trouble: NonFiniteReport) -> None:
-        """Raise `NumericsError` where a step was troubled or a parameter is not finite."""
+        """Raise `NumericsError` after a step without finite values, or with parameters that are not finite."""
         step = int(trouble.step[0])
         # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
         groups = (self.state.params(), *self.state.moments()[:2])

@@ -1,9 +1,8 @@
-"""Parameters in few bits, as a handful of plain arrays.
+"""Parameters with 32, 16 or 8 bits a number, as a few plain arrays.
 
-``single`` keeps 32 bits a number, ``half`` 16 (IEEE 754 binary16: a relative error of 2^-11 at most), ``8bit`` 8 for
-large matrices, those of networks and of a factorised field's signals, and 16 for all else: what places, shapes and
-hides Gaussians, biases, and heads of few rows. A row of a matrix then has its own lowest value and step, and a number
-is wrong by half a step at most.
+``single`` stores 32 bits a number, ``half`` 16 (IEEE 754 binary16: a relative error of 2^-11 at most), ``8bit`` 8 for
+large matrices (of networks and of a factorised field's signals) and 16 for all else. In 8 bits each row of a matrix has
+its lowest value and a step, and the error of a number is half a step at most.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from ..core import InputError
 PRECISIONS = ("single", "half", "8bit")
 LEVELS = 255
 MOST_ROWS_IN_FULL = 4
-"""A quaternion has so many; a matrix with more is large enough for a lowest value and a step of its own a row."""
+"""Largest number of rows that are stored in 16 bits, as of quaternions."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -30,7 +29,7 @@ def _in_bytes(rows: int, columns: int, precision: str) -> bool:
 
 
 def pack_params(params: Arrays, precision: str) -> dict[str, NDArray[Any]]:
-    """Parameters [k, n] each as flat arrays: names, shapes, and the numbers of all in a row.
+    """Flat arrays of parameters [k, n] each: names, shapes and concatenated numbers.
 
     Raises:
         InputError: an unknown precision, or a number too large for it.
@@ -43,7 +42,7 @@ def pack_params(params: Arrays, precision: str) -> dict[str, NDArray[Any]]:
             wide.append(values.ravel())
             continue
         first, last = values.min(axis=1), values.max(axis=1)
-        # What is stored is what is read: codes are found with the step as it is rounded.
+        # Codes refer to the stored, rounded values.
         first, size = (a.astype(np.float32) for a in (first, (last - first) / LEVELS))
         low.append(first)
         step.append(size)
@@ -66,7 +65,7 @@ def pack_params(params: Arrays, precision: str) -> dict[str, NDArray[Any]]:
 
 
 def unpack_params(packed: Arrays) -> dict[str, NDArray[np.float32]]:
-    """The parameters of `pack_params` in single precision."""
+    """Parameters from the arrays of `pack_params`, in single precision."""
     precision, params = str(packed["packed_precision"]), {}
     number, row, code = 0, 0, 0
     for name, shape in zip(packed["packed_name"], packed["packed_shape"], strict=True):

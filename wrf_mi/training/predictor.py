@@ -1,4 +1,4 @@
-"""What receivers report of a trained graph, for new transmitters."""
+"""Reports of a trained graph's receivers for new transmitters."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from ..tracing.traced_field import TracedField
 
 TOGETHER = 16
-"""Transmitters whose Gaussians, or paths and Gaussians, are evaluated together."""
+"""Transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch."""
 TRACED_NUMBERS = 512
-"""With paths, of small observations as many as have so many numbers: each search for paths has its price."""
+"""With paths, numbers in a batch of small observations: each search for paths has a fixed cost."""
 
 
 class Predictor:
@@ -44,17 +44,16 @@ class Predictor:
 
     Args:
         field: the model.
-        params: its parameters as NumPy arrays, and those of the traced side.
-        receivers: poses, by which spectra are asked for.
+        params: parameters of the field and of the traced side, as NumPy arrays.
+        receivers: the receivers to predict for.
         height: rows of a spectrum.
-        width: columns.
-        skip: what is not evaluated.
-        operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear
-            map from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction. It leaves nothing
-            out, whatever ``skip`` says.
-        store: folder in which operators are kept from process to process; None: in memory alone.
-        graph: of the field, these receivers and a scene; None: the field alone, seen by pixel receivers.
-        reach: where the Gaussians are trusted; None: everywhere.
+        width: columns of a spectrum.
+        skip: contributions that are not evaluated.
+        operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear map
+            from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction. It ignores ``skip``.
+        store: folder in which operators are stored; None: in memory only.
+        graph: graph of the field, these receivers and a scene; None: the field alone, with pixel receivers.
+        reach: region in which the Gaussians are used; None: everywhere.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class Predictor:
     ) -> None:
         self.receivers, self.reach = tuple(receivers), reach
         self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
-        # The operator and the recorded prediction are the splatted magnitude at each direction.
+        # Operator and recorded prediction give the splatted magnitude at each direction.
         self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
         self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
         self._poses = [device_pose(r) for r in self.receivers]
@@ -84,10 +83,10 @@ class Predictor:
         self.update({name: to_tensor(values) for name, values in params.items()})
 
     def update(self, params: Params) -> None:
-        """Use other parameters (Dr.Jit tensors) from now on."""
+        """Replace the parameters (Dr.Jit tensors)."""
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
-            # A recording holds for one number of Gaussians, see `Trainer.record_functions`.
+            # A recording is valid for one number of Gaussians.
             self._predict = None if self._field is None else CompiledPredictor(self._field, self._skip)
             self._count, self._reports = count, {}
         self._params, self._still = params, None
@@ -105,7 +104,7 @@ class Predictor:
         return self._field
 
     def static_geometry(self) -> StaticOperator:
-        """The field as operators; forgotten when parameters change."""
+        """The field as operators; rebuilt when parameters change."""
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
             size = self._plane.height, self._plane.width
@@ -118,16 +117,18 @@ class Predictor:
         return self.graph.form.headings
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
-        """What a receiver observes in rows of a record, see `__call__`."""
+        """Predictions [m, ...] for rows of a record at one receiver (`__call__`)."""
         uplink = None if record.uplink is None else record.uplink[rows]
         heading = record.tx_heading_rad[rows] if self.uses_heading and record.tx_heading_rad is not None else None
         return self(record.tx_pos_m[rows], receiver, uplink, heading)
 
     def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
-        """Headings as an array, where they are used."""
+        """Checked headings, or None where they are not used."""
         if (tx_heading_rad is not None) != self.uses_heading:
-            text = "needs headings; give heading_rad" if self.uses_heading else "does not know how it is turned"
-            raise InputError(f"transmitter: the model {text}{'' if self.uses_heading else '; leave heading_rad away'}")
+            text = "needs headings; give heading_rad"
+            if not self.uses_heading:
+                text = "does not know how the transmitter is turned; leave heading_rad away"
+            raise InputError(f"transmitter: the model {text}")
         if tx_heading_rad is None:
             return None
         heading = np.asarray(tx_heading_rad, float)
@@ -138,7 +139,7 @@ class Predictor:
     def _traced(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
     ) -> Any:
-        """What a receiver reports of both sides, flat, unrecorded; positions without paths are learned ones alone."""
+        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         side = self.graph.trace(tx_pos_m, receiver, heading_rad)
         if side is not None:
             side.refresh(self._params)
@@ -159,17 +160,17 @@ class Predictor:
     def of_side(
         self, tx_pos_m: FloatArray, receiver: int, side: TracedField | None, slots: IntArray, weight: NDArray[Any]
     ) -> NDArray[Any]:
-        """What a receiver reports of transmitters whose paths are known.
+        """Predictions for transmitters whose paths are known.
 
         Args:
             tx_pos_m: positions [m, 3], metres.
-            receiver: its number.
+            receiver: number of the receiver.
             side: its traced side, or None.
-            slots: rows of that [m].
-            weight: of the Gaussians' signal [m], 0 to 1.
+            slots: rows of the traced side [m].
+            weight: weight of the Gaussians' signal [m], 0 to 1.
 
         Returns:
-            As `__call__`.
+            Predictions as of `__call__`.
         """
 
         def found(part: slice) -> Any:
@@ -178,7 +179,7 @@ class Predictor:
         return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """What a receiver reports of conditions [3 or features, at most `TOGETHER`], recorded, flat."""
+        """Report for conditions [3 or features, at most `TOGETHER`], recorded, flat."""
         if receiver not in self._reports:
             report = self.graph.report(receiver, None, skip=self._skip)
 
@@ -186,42 +187,42 @@ class Predictor:
                 with dr.suspend_grad():
                     return report(params, batch)
 
-            # What is made from NumPy's memory at first use must be there before a recording.
+            # Arrays that are made from NumPy's memory at first use must exist before a recording.
             evaluated(report, self._params, condition[:, :1], receiver, self._poses[receiver], self._plane)
             self._reports[receiver] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
-        # Their number is a constant of the recorded kernels: the last ones are filled up with copies.
+        # The batch size is a constant of the recorded kernels: copies fill the last batch.
         count = condition.shape[1]
         filled = np.minimum(np.arange(TOGETHER), count - 1)
         tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
         dr.make_opaque(slots)
-        own = None if weight is None else to_float(weight[filled])
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, own)
+        weights = None if weight is None else to_float(weight[filled])
+        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, weights)
         found = self._reports[receiver](self._params, batch)
         return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
 
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
-        """What a receiver reports of positions [m, 3] or features [m, features], complex numbers as such."""
+        """Reports for positions [m, 3] or features [m, features], complex numbers as such."""
         weight = None if self.reach is None else self.reach.weight(given, receiver)
         if weight is not None and weight.any() and not weight.all():
-            # Where Gaussians are not trusted they are not evaluated.
+            # Gaussians of weight 0 are not evaluated.
             parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
-            turned = [None if heading_rad is None else heading_rad[part] for part in parts]
-            found = [self._reported(given[part], receiver, own) for part, own in zip(parts, turned, strict=True)]
+            headings = [None if heading_rad is None else heading_rad[part] for part in parts]
+            found = [self._reported(given[part], receiver, yaw) for part, yaw in zip(parts, headings, strict=True)]
             return np.concatenate(found)[np.argsort(np.concatenate(parts))]
 
         if self.graph.scene is None and weight is not None and not weight.any():
             return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
 
         def evaluate(part: slice) -> Any:
-            own = None if weight is None else weight[part]
+            weights = None if weight is None else weight[part]
             if self._recordable:
-                return self._learned(given[part].T, receiver, own)
-            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], own)
+                return self._learned(given[part].T, receiver, weights)
+            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], weights)
 
         return self._in_parts(len(given), receiver, evaluate)
 
     def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
-        """Reports of so many transmitters from the flat ones of parts of them."""
+        """Reports for all transmitters, from flat reports of batches."""
         shape = self.graph.models[receiver].shape
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
@@ -245,21 +246,21 @@ class Predictor:
         uplink: NDArray[Any] | None = None,
         tx_heading_rad: ArrayLike | None = None,
     ) -> NDArray[Any]:
-        """What one receiver observes of transmitters.
+        """Predict the observations of transmitters at one receiver.
 
         Args:
             tx_pos_m: positions [m, 3], world frame, metres.
             receiver: name, or number from 0, of one of ``receivers``.
-            uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them; positions are not
-                looked at then.
+            uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them instead of
+                positions.
             tx_heading_rad: yaw of each transmitter [m], radians, if and only if ``uses_heading``.
 
         Returns:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
 
         Raises:
-            InputError: positions of another shape or not finite, no uplink or headings where they are needed, headings
-                where they are not used, or no such receiver.
+            InputError: positions of another shape or not finite, missing uplink or headings, headings that are not
+                used, or no such receiver.
         """
         index = receiver_index(self.receivers, receiver)
         if self.graph.form.features:

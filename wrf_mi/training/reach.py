@@ -1,13 +1,12 @@
-"""How far from the training transmitters Gaussians correct what an observation is without them.
+"""Distance from the training transmitters up to which Gaussians correct a prediction.
 
     w(x) = exp(-(d(x) / reach)^2)
 
-d is the distance from a transmitter to the nearest one that trained, and w scales the Gaussians' signal: beside the
-paths of a scene, and for channels, whose value without Gaussians is zero. Paths hold everywhere, while Gaussians
-interpolate between neighbours; beyond some fraction of a wavelength, which the data tell, what they add is noise. So
-the reach is chosen on rows held out in groups: validation rows are drawn among the training rows and lie near these.
-
-A reach of 0 switches the Gaussians off, an infinite one trusts them everywhere.
+d is the distance from a transmitter to the nearest training transmitter, and w scales the Gaussians' signal: beside the
+paths of a scene, and for channels, whose value without Gaussians is zero. Gaussians interpolate between neighbours;
+farther away than a fraction of a wavelength they add noise. The reach is chosen on rows held out in groups, because
+validation rows are drawn among the training rows and lie near them. A reach of 0 switches the Gaussians off, an
+infinite one uses them everywhere.
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 
 GROUPS = 10
-"""Clusters of training positions, a few of which are held out together."""
+"""Clusters of training positions, some of which are held out together."""
 ROWS_OF_GROUP = 4
-"""Rows that a cluster has on average, at least."""
+"""Least average number of rows of a cluster."""
 HELD_OUT = 0.25
-"""Share of the training rows that are held out in clusters, about."""
+"""Approximate share of the training rows that are held out in clusters."""
 LENGTHS = 7
-"""Reaches that are tried beside 0: each twice the one before, the last four times the largest distance held out."""
+"""Number of reaches tried beside 0: each twice the one before, the last four times the largest distance held out."""
 
 NEGLIGIBLE = 1e-4
-"""Weight below which Gaussians are not evaluated, so that no signal changes by more than this share of theirs."""
+"""Weight below which Gaussians are not evaluated: the largest relative change of their signal."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Where a field's Gaussians are trusted.
+    """Region in which a field's Gaussians are used.
 
     Attributes:
-        known_m: transmitters that trained, of each receiver those that it observed, [k, 3] in metres.
+        known_m: training transmitters that each receiver observed, [k, 3] in metres.
         length_m: the reach, metres.
     """
 
@@ -51,7 +50,7 @@ class Reach:
     length_m: float
 
     def distance(self, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
-        """Distance of transmitters [m, 3] from the nearest known one, metres; infinite where there is none."""
+        """Distance of transmitters [m, 3] from the nearest training transmitter, metres; infinite without any."""
         known = self.known_m[receiver]
         return np.asarray(cKDTree(known).query(tx_pos_m)[0]) if len(known) else np.full(len(tx_pos_m), np.inf)
 
@@ -63,8 +62,8 @@ class Reach:
         return np.where(weight < NEGLIGIBLE, 0, weight).astype(np.float32)
 
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
-        """Reaches to choose from by held-out transmitters [m, 3] of each receiver, from 0 upwards."""
-        found = [self.distance(own, r) for r, own in enumerate(tx_pos_m) if len(own) and len(self.known_m[r])]
+        """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
+        found = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]
         largest = float(np.max(np.concatenate(found), initial=0.0)) if found else 0.0
         return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
 
@@ -73,11 +72,11 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     """The split with clusters of its training rows moved to the validation rows, seeded by the split.
 
     Args:
-        split: of a record.
+        split: split of a record.
         tx_pos_m: positions of all rows [n, 3], metres.
 
     Returns:
-        Validation rows near training rows and away from them. The split itself where its rows are too few.
+        A split with validation rows near training rows and far from them; ``split`` itself if its rows are too few.
     """
     rows: IntArray = split.train
     count = min(GROUPS, len(rows) // ROWS_OF_GROUP, len(np.unique(tx_pos_m[rows], axis=0)))
@@ -104,25 +103,25 @@ def choose_reach(
     score: Callable[[int, NDArray[np.float32]], FloatArray],
     higher_is_better: bool,
 ) -> tuple[float, float]:
-    """The reach by which held-out transmitters are predicted best.
+    """The reach with the best score on held-out transmitters.
 
     Args:
-        reach: with the transmitters that trained.
-        lengths: to choose from, metres.
+        reach: reach with the training transmitters.
+        lengths: candidates, metres.
         tx_pos_m: held-out transmitters that each receiver observed, [m, 3] in metres.
         score: ``score(receiver, weight)``: scores of a receiver's held-out transmitters with weights [m].
-        higher_is_better: whether the score is an accuracy.
+        higher_is_better: direction of the score.
 
     Returns:
-        The reach, metres, of the best mean, the first of equal ones; and its median score. Where nothing is held out,
-        the reach as it is and NaN.
+        The first reach with the best mean, metres, and its median score. Without held-out transmitters, the given reach
+        and NaN.
     """
-    held = [r for r, own in enumerate(tx_pos_m) if len(own)]
+    held = [r for r, tx in enumerate(tx_pos_m) if len(tx)]
     best: tuple[float, float, float] = (-np.inf, reach.length_m, np.nan)
     for length in lengths if held else []:
-        one = replace(reach, length_m=length)
-        scores = np.concatenate([np.ravel(score(r, one.weight(tx_pos_m[r], r))) for r in held])
-        # Means differ less from draw to draw than medians, which tables state.
+        tried = replace(reach, length_m=length)
+        scores = np.concatenate([np.ravel(score(r, tried.weight(tx_pos_m[r], r))) for r in held])
+        # Means have less variance than medians, which tables state.
         mean = float(np.nanmean(scores)) * (1 if higher_is_better else -1)
         if mean > best[0]:
             best = mean, length, float(np.nanmedian(scores))

@@ -1,4 +1,4 @@
-"""What happens at which step: rows, learning rates, rounds of density control. All of it known before the first."""
+"""Schedule of a fit, known before its first step: rows, learning rates, rounds of density control."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from .loop_config import AdamConfig, LoopConfig
 
 @dataclass(frozen=True)
 class Schedule:
-    """The plan of a fit.
+    """Schedule of a fit.
 
     Attributes:
         rows: rows of each step's batch, [steps, batch].
-        receiver: the receiver of each step, [steps].
-        factor: share of the learning rates at each step, [steps].
+        receiver: receiver of each step, [steps].
+        factor: factor of the learning rates at each step, [steps].
         decay: decay of the running mean of the parameters at each step, [steps].
-        density: steps after which density control takes a round.
-        joined: first step at which the validation rows may be trained on; ``steps`` if never.
-        first_stage: steps of a first stage, in which nothing is chosen: paths of a scene are trained alone.
+        density: steps after which a round of density control follows.
+        joined: first step that may train on the validation rows; ``steps`` if never.
+        first_stage: steps of a first stage without a choice of state, in which the paths of a scene are trained alone.
     """
 
     rows: IntArray
@@ -37,13 +37,13 @@ class Schedule:
     first_stage: int = 0
 
     def after(self, best: int) -> tuple[Schedule, int]:
-        """The plan that goes on from the best of the steps before the validation rows join.
+        """The schedule that goes on from the best state before the validation rows join.
 
         Args:
-            best: that step.
+            best: step of that state.
 
         Returns:
-            Learning rates that fall as before in as much fewer steps as led there, and the first of these steps.
+            Schedule whose learning rates fall in fewer steps, in proportion to ``best``, and the first of these steps.
         """
         last = len(self.rows) - self.joined
         left = min(last, max(1, round(last * best / self.joined))) if last else 0
@@ -62,18 +62,17 @@ def plan(
     density: frozenset[int] = frozenset(),
     first_stage: int = 0,
 ) -> Schedule:
-    """The plan of a fit, a function of settings, rows and seed alone: a resumed run goes on with the same.
+    """The schedule of a fit, a function of settings, rows and seed only: a resumed run gets the same.
 
-    Each epoch visits every row at every receiver that observed it once, in random order; a batch belongs to one
-    receiver and is no larger than the rows of any. Where the batch does not divide the rows, each epoch leaves out
-    others at random.
+    Each epoch visits every row once at every receiver that observed it, in random order; a batch belongs to one
+    receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch.
 
     Args:
         config: settings.
         train: rows (conditions) of each receiver that train while validation rows are held out.
-        everything: those with the validation rows.
-        rng: draws the order of rows.
-        density: steps after which density control takes a round.
+        everything: rows of each receiver with the validation rows.
+        rng: generator of the order of rows.
+        density: steps after which a round of density control follows.
         first_stage: steps of a first stage: learning rates fall in it, and then anew.
 
     Raises:
@@ -100,7 +99,7 @@ def plan(
 
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
-    """Share of the learning rates at each of some steps: a linear warm-up, and half a cosine."""
+    """Factor of the learning rates: a linear warm-up, and half a cosine."""
     t, final = np.arange(steps), optimiser.final
     flat = round(optimiser.cosine_start * steps)
     cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
@@ -108,7 +107,7 @@ def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
 
 
 def density_rounds(config: DensityConfig, steps: int, first_stage: int = 0) -> frozenset[int]:
-    """Steps after which density control takes a round, of a fit of so many, the first of them without Gaussians."""
+    """Steps after which a round of density control follows; in the first stage there are no Gaussians."""
     left = steps - first_stage
     first, last = int(config.start * left), int(config.stop * left)
     rounds = range(config.every, left, config.every) if config.every else ()
@@ -118,12 +117,12 @@ def density_rounds(config: DensityConfig, steps: int, first_stage: int = 0) -> f
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
-    counts = [len(own) // batch for own in rows]
+    counts = [len(known) // batch for known in rows]
     epochs = -(-steps // sum(counts))
     batches, owners = [], []
     for _ in range(epochs):
         chosen = np.concatenate(
-            [rng.permutation(own)[: n * batch].reshape(n, batch) for own, n in zip(rows, counts, strict=True)]
+            [rng.permutation(known)[: n * batch].reshape(n, batch) for known, n in zip(rows, counts, strict=True)]
         )
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])

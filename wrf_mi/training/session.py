@@ -1,39 +1,43 @@
-"""Where a fit keeps its work, what it reports to, and what stops it."""
+"""Session of a fit: its folder, its progress callback and its stop condition."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from .loop import Progress
 
-OnProgress = Callable[[str, float, "Progress | None"], None]
-"""Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time where steps are taken."""
+
+class OnProgress(Protocol):
+    """Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time of optimiser steps."""
+
+    def __call__(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
+        """Report progress."""
 
 
-def quiet(stage: str, share: float, progress: Progress | None = None) -> None:
-    """A progress callback that shows nothing."""
+def quiet(stage: str, share: float, progress: Progress | None = None, /) -> None:
+    """Progress callback that shows nothing."""
 
 
 class Interrupted(Exception):
-    """A fit was stopped; what was fitted is stored."""
+    """A fit was stopped; its state is stored."""
 
     exit_status = 130
 
 
 @dataclass(frozen=True)
 class FitSession:
-    """Where a fit keeps its work and what it reports to.
+    """Folder, progress callback and stop condition of a fit.
 
     Attributes:
-        folder: for files of this fit; that of one fold where there are several. ``checkpoint.npz`` in it is removed
-            when the fitted model is stored. None: nothing is kept.
+        folder: folder for files of this fit (of one fold where there are several). ``checkpoint.npz`` in it is removed
+            when the fitted model is stored. None: no files are written.
         run: the run folder, for files that all folds share.
         on_progress: progress callback.
-        stop: asked whether to stop, wherever nothing would be lost.
+        stop: stop condition, called wherever nothing would be lost.
     """
 
     folder: Path | None = None
@@ -50,13 +54,13 @@ class FitSession:
         """Report progress of a stage, named after its fold."""
         self.on_progress(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
 
-    def report(self, stage: str, share: float) -> None:
-        """Report progress of what is made in one go.
+    def report(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
+        """Report progress of a fit without checkpoints.
 
         Raises:
-            Interrupted: it is to stop.
+            Interrupted: the stop condition holds.
         """
-        self.tell(stage, share)
+        self.tell(stage, share, progress)
         if self.stop():
             raise self.interrupted(f"in {stage}")
 

@@ -1,4 +1,4 @@
-"""The state of a fit between two steps: parameters, Adam's moments, running mean; to and from NumPy arrays."""
+"""State of a fit between two steps: parameters, Adam's moments, running mean; to and from NumPy arrays."""
 
 from __future__ import annotations
 
@@ -26,18 +26,16 @@ class FitState:
 
     Attributes:
         adam: Dr.Jit's optimiser, which owns the current parameters.
-        mean: running mean of the parameters, which is what is evaluated.
+        mean: running mean of the parameters, used for evaluation.
         step: steps taken.
         view_gradient_norm: sum since the last round of density control of each Gaussian's directional gradient, [n].
         view_gradient_steps: steps in that sum.
-        reach_m: how far from training transmitters the Gaussians are trusted, metres (`wrf_mi.training.reach`);
-            infinite: everywhere.
-        searched_m: where each receiver was when paths were searched last, [n_rx, 3], metres; empty without a scene.
-        chosen: step from which the fit went on, see `wrf_mi.training.config.TrainConfig.patience`; 0: from the last
-            one.
-        best: the state that scored best on validation rows (see `arrays`); None: none is kept.
-        best_score: its score, the higher the better; also once the fit went on from it.
-        waited: scores since then.
+        reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
+        searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
+        chosen: step from which the fit went on (`LoopConfig.patience`); 0: none was chosen.
+        best: arrays of the state with the best validation score, or None.
+        best_score: its score, the higher the better; kept once the fit went on from it.
+        waited: number of scores since then.
     """
 
     def __init__(self, params: Mapping[str, NDArray[np.float32]], momentum: float = 0.9) -> None:
@@ -48,14 +46,14 @@ class FitState:
         self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0
-        self._clear_urge()
+        self._reset_view_gradient()
 
     @property
     def gaussians(self) -> int:
         """Number of Gaussians; 0 where paths are trained alone."""
         return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
 
-    def _clear_urge(self) -> None:
+    def _reset_view_gradient(self) -> None:
         self.view_gradient_norm, self.view_gradient_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
         dr.make_opaque(self.view_gradient_norm)
 
@@ -81,53 +79,52 @@ class FitState:
             self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
 
     def change_density(self, change: DensityChange) -> None:
-        """Replace the set of Gaussians; what is fresh starts without momentum, what is new without a past mean."""
+        """Replace the set of Gaussians; fresh Gaussians start without momentum, new values without a past mean."""
         first, second, count = self.moments()
         before, mean = self.params(), self.mean_params()
         for name, values in change.parameters.items():
             fresh = np.broadcast_to(change.fresh, values.shape)
             first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
             second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
-            # A clone's original has a new opacity: the old one's mean beside the clone would count it twice.
+            # The original of a clone has a new opacity, for which the old mean does not hold.
             new = fresh | (values != before[name][:, change.source])
             mean[name] = np.where(new, values, mean[name][:, change.source]).astype(np.float32)
             self.adam[name] = to_tensor(values)
         self.mean = {name: to_tensor(values) for name, values in mean.items()}
         self._set_moments(first, second, count)
-        self._clear_urge()
+        self._reset_view_gradient()
 
     def forget_moments(self) -> None:
-        """Let Adam start anew from the parameters as they are."""
+        """Restart Adam from the current parameters."""
         nothing = {name: np.zeros_like(values) for name, values in self.params().items()}
         self._set_moments(nothing, nothing, 0)
 
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
-        """Set one parameter and forget its momentum (opacity reset)."""
-        _, _, count = self.moments()
+        """Set one parameter and reset its momentum (opacity reset)."""
+        first, second, count = self.moments()
         self.adam[name] = to_tensor(values)
-        self.adam.reset(name)
-        value, promoted, rate, (_, m, v, _) = self.adam.state[name]
-        self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), m, v, None))
+        nothing = {name: np.zeros_like(values)}
+        self._set_moments(first | nothing, second | nothing, count)
 
     def keep_best(self, score: float) -> None:
-        """Remember this moment if its score is the best so far."""
+        """Keep the state if its score is the best so far."""
         self.waited += 1
         if score > self.best_score:
             self.best, self.best_score, self.waited = self._now(), score, 0
 
     def go_back(self) -> FitState:
-        """The moment that was kept, with nothing kept in it but its score."""
+        """The best state, with its score."""
         if self.best is None:
             return self
         return FitState.from_arrays(self.best | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
 
     def arrays(self) -> Arrays:
-        """All of it, for a checkpoint."""
+        """All arrays, for a checkpoint."""
         kept = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
         return self._now() | kept | {f"best/{name}": values for name, values in (self.best or {}).items()}
 
     def _now(self) -> Arrays:
-        """All of it but what is kept."""
+        """All arrays without the best state."""
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
@@ -143,7 +140,7 @@ class FitState:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
-        """The state that `arrays` described, with Adam's decay of the first moment."""
+        """State from the arrays of a checkpoint, with Adam's decay of the first moment."""
 
         def group(prefix: str) -> Arrays:
             return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}

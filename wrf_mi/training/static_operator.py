@@ -1,9 +1,8 @@
-"""Prediction by operator: a trained field whose Gaussians stand still, as the receivers of a run see it.
+"""Prediction by operator: a trained field with static geometry at the receivers of a run.
 
     operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
 
-The file is a store, not a source: its key is a digest of all that the weights depend on. Another receiver, image size
-or geometry, a field that was trained on, another version of this package: the key differs and they are built anew.
+The file is a cache: its key is a digest of everything that the weights depend on, including the package's version.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from .step import Field, device_pose
 FORMAT = 1
 """Version of the file."""
 MOST_BYTES = 1 << 30
-"""Of one receiver's weights; larger fields are evaluated directly."""
+"""Largest size of one receiver's weights; larger fields are evaluated directly."""
 
 
 def stands_still(field: Any) -> bool:
@@ -43,13 +42,7 @@ def stands_still(field: Any) -> bool:
 
 
 class RecordedSignals:
-    """Signals of any field that stands still, by its own Dr.Jit function; see
-    `wrf_mi.gaussians.static_signals.Signals`.
-
-    Args:
-        field: the model.
-        params: its parameters.
-    """
+    """Signals of a field with static geometry, by its Dr.Jit function (`wrf_mi.gaussians.static_signals.Signals`)."""
 
     factors: ComplexArray | None = None
 
@@ -73,16 +66,7 @@ class RecordedSignals:
 
 
 class StaticOperator:
-    """A field that stands still, ready to predict by operator.
-
-    Args:
-        field: the model.
-        params: its parameters as NumPy arrays.
-        receivers: poses.
-        height: rows of a spectrum.
-        width: columns.
-        folder: where operators are stored; None: kept in memory alone.
-    """
+    """A field with static geometry at receivers, evaluated by operators that ``folder`` caches (None: memory only)."""
 
     def __init__(
         self,
@@ -109,7 +93,7 @@ class StaticOperator:
         return self._ready[receiver].magnitude(self._signals.coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
 
     def key(self, receiver: int) -> str:
-        """Digest of all that the weights at a receiver depend on."""
+        """Digest of everything that the weights at a receiver depend on."""
         pose = self._receivers[receiver]
         constants = (FORMAT, __version__, *self._size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M)
         digest = hashlib.sha256(repr((constants, self._field)).encode())
@@ -123,7 +107,7 @@ class StaticOperator:
         return digest.hexdigest()
 
     def weights(self, receiver: int) -> csr_array:
-        """Weights [pixels, n] at a receiver: stored ones if they still hold, else built and stored.
+        """Weights [pixels, n] at a receiver: stored ones if they are valid, else built and stored.
 
         Raises:
             MemoryError: they would take more than `MOST_BYTES`.
@@ -145,7 +129,7 @@ class StaticOperator:
 
 
 def write_weights(path: Path, key: str, weights: csr_array) -> None:
-    """Store weights; a folder that cannot be written is no harm."""
+    """Store weights if the folder can be written."""
     parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
     try:
         write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts)
@@ -154,16 +138,14 @@ def write_weights(path: Path, key: str, weights: csr_array) -> None:
 
 
 def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:
-    """Stored weights of ``shape``; None if there are none, or damaged ones, or those of another key."""
+    """Stored weights of ``shape``; None if there are none, or if they are damaged or have another key."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
                 return None
-            data, indices, indptr = (stored[name] for name in ("data", "indices", "indptr"))
-    except Exception:  # numpy and zipfile raise a dozen kinds on damaged files
+            weights = csr_array(tuple(stored[name] for name in ("data", "indices", "indptr")), shape=shape)
+        # SciPy's product checks nothing: an index out of range would end the process.
+        weights.check_format(full_check=True)
+    except Exception:  # numpy, zipfile and scipy raise a dozen kinds on damaged files
         return None
-    fits = len(indptr) == shape[0] + 1 and len(data) == len(indices) == indptr[-1] and indptr[0] == 0
-    # SciPy's product checks nothing: what points outside would end the process.
-    if not fits or (np.diff(indptr) < 0).any() or (len(indices) and not 0 <= indices.min() <= indices.max() < shape[1]):
-        return None
-    return csr_array((data, indices, indptr), shape=shape)
+    return weights

@@ -1,7 +1,7 @@
 """One optimiser step and one prediction, as functions that `dr.freeze` can record.
 
-Everything that changes from step to step comes in as an argument and is opaque, so that Dr.Jit replays the
-recorded kernels; a captured array or a changing Python number would be traced anew each time.
+Arguments that change from step to step are opaque, so that Dr.Jit replays the recorded kernels; a captured array or a
+changing Python number would be traced anew each time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 
 CENTRES = "position"
-"""Parameter [3, n] of every field; where it is missing there are no Gaussians."""
+"""Parameter [3, n] of every field with Gaussians."""
 
 
 def device_pose(receiver: Receiver) -> Pose:
@@ -47,29 +47,20 @@ def device_pose(receiver: Receiver) -> Pose:
 
 
 def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane, skip: Skip = NOTHING) -> Any:
-    """The pixel receiver's spectrum |R| per direction, [batch * height * width], row-major.
-
-    Args:
-        field: the model.
-        params: its parameters.
-        tx_pos: transmitter positions [3, batch], metres.
-        pose: of the receiver.
-        plane: its perception plane.
-        skip: what is not evaluated.
-    """
+    """Spectrum |R| of the pixel receiver, [batch * height * width], row-major, of transmitters [3, batch] in metres."""
     re, im = splat(field.gaussians(params, tx_pos), pose, plane, skip)
     return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
 
 
 @dataclass
 class TrainingData:
-    """Conditions and observations on the device, see `wrf_mi.training.targets.Targets`.
+    """Conditions and observations on the device (`wrf_mi.training.targets.Targets`).
 
     Attributes:
-        condition: of all rows, tensor [3, c] in metres or [features, c].
-        truth: observations of all receivers and conditions, one after the other.
-        scale: one over each receiver's unit, [n_rx].
-        weight: factors of the observations' differences in the loss, in the order of ``truth``; None: 1 throughout.
+        condition: conditions of all rows, tensor [3, c] in metres or [features, c].
+        truth: observations of all receivers and conditions, flat.
+        scale: inverse unit of each receiver, [n_rx].
+        weight: factors of the observations' differences in the loss, in the order of ``truth``; None: 1.
     """
 
     condition: Any
@@ -84,26 +75,26 @@ class TrainingData:
         flat = self.condition.array
         tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
         slot = dr.arange(index_type, batch * values)
-        one = dr.gather(index_type, rows, slot // values) + receiver * n
-        return tx, dr.gather(type(self.truth), self.truth, one * values + slot % values)
+        row = dr.gather(index_type, rows, slot // values) + receiver * n
+        return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values)
 
     def factor(self, rows: Any, receiver: Any, values: int) -> Any:
-        """What differences are multiplied by in the loss: of one value, or [batch * values] with ``weight``."""
+        """Factor of differences in the loss: one value, or [batch * values] with ``weight``."""
         scale = dr.gather(type(self.truth), self.scale, receiver)
         if self.weight is None:
             return scale
         slot = dr.arange(type(rows), dr.width(rows) * values)
-        one = dr.gather(type(rows), rows, slot // values) + receiver * self.condition.shape[1]
-        return scale * dr.gather(type(self.truth), self.weight, one)
+        row = dr.gather(type(rows), rows, slot // values) + receiver * self.condition.shape[1]
+        return scale * dr.gather(type(self.truth), self.weight, row)
 
 
 @dataclass
 class StepReport:
-    """What a step tells: arrays of one value, but ``view_gradient_norm`` [n].
+    """Result of a step.
 
     Attributes:
-        loss: of the batch before the step.
-        view_gradient_norm: length of the gradient by each Gaussian's direction from the receiver.
+        loss: loss of the batch before the step, one value.
+        view_gradient_norm: norm of the gradient by each Gaussian's direction from the receiver, [n].
     """
 
     loss: Any
@@ -118,20 +109,19 @@ def make_step(
     state: Callable[[], Any] | None = None,
     evaluation: Evaluation | None = None,
 ) -> Callable[..., Any]:
-    """An optimiser step, recorded where the report can be.
+    """An optimiser step, recorded where the report can be recorded.
 
     Args:
-        report: what a receiver reports of the graph, see `wrf_mi.graph.Graph.report`.
+        report: report of a receiver (`wrf_mi.graph.Graph.report`).
         rates: learning rate of each parameter.
         loss_of: loss of a batch.
-        shape: of one observation.
-        state: arrays that the report reads beside its arguments; None: none.
-        evaluation: of the report's Gaussians; None: one that Dr.Jit can record.
+        shape: shape of one observation.
+        state: returns arrays that the report reads beside its arguments; None: no arrays.
+        evaluation: evaluation of the report's Gaussians; None: one that Dr.Jit can record.
 
     Returns:
-        ``step(adam, mean, data, rows, slots, receiver, pose, plane, factor, decay, number, trouble) -> (mean, trouble,
-        StepReport)``. It takes one step of ``adam`` in place, that of this number from 1, and returns the new running
-        mean of the parameters. After trouble nothing changes any more.
+        Function that takes step ``number`` (from 1) of ``adam`` in place and returns the new running mean of the
+        parameters, the report of values that are not finite, after which nothing changes any more, and a `StepReport`.
     """
     values = math.prod(shape)
 
@@ -162,15 +152,15 @@ def make_step(
             pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
             distance = dr.sqrt(sum(c * c for c in offset))
             view_gradient_norm = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
-        told = StepReport(dr.detach(loss), view_gradient_norm)
-        dr.eval(adam, mean, trouble, told)
-        return mean, trouble, told
+        result = StepReport(dr.detach(loss), view_gradient_norm)
+        dr.eval(adam, mean, trouble, result)
+        return mean, trouble, result
 
     if evaluation is None or evaluation.recordable:
         return Recorded(step, state)
 
     def unrecorded(*arguments: Any) -> tuple[Params, NonFiniteReport, StepReport]:
-        # A recording takes its arguments as opaque: a row that is a constant of kernels would compile them anew.
+        # As in a recording: a row that is a constant would compile the kernels anew.
         dr.make_opaque(arguments)
         result = step(*arguments)
         evaluation.release()
@@ -191,34 +181,22 @@ def evaluated(
 ) -> Any:
     """A report of conditions [3 or features, m], evaluated without gradients.
 
-    Args:
-        report: see `wrf_mi.graph.Graph.report`.
-        params: its parameters.
-        condition: positions, metres, or features.
-        receiver: its number.
-        pose: of the receiver.
-        plane: its directions.
-        slots: rows of the traced side [m]; None: the first m.
-        weight: of the Gaussians' signal [m]; None: 1.
+    ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m] scales the Gaussians' signal.
     """
     with dr.suspend_grad():
         rows = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
-        own = None if weight is None else to_float(weight)
+        weights = None if weight is None else to_float(weight)
         tx = to_tensor(np.ascontiguousarray(condition))
-        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, own))
+        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights))
         dr.eval(found)
     return found
 
 
 class CompiledPredictor:
-    """A prediction ``predict(params, tx_pos, pose, plane) -> greys``, without gradients.
+    """A prediction ``predict(params, tx_pos, pose, plane) -> greys`` of a field, without gradients.
 
-    It is recorded, but for fields of so many Gaussians that networks see them in parts (`gaussians_in_parts`): there,
-    recording saves nothing, and lists of tiles, which a recorded function cannot count, have room for all.
-
-    Args:
-        field: the model.
-        skip: what is not evaluated.
+    It is recorded, except for fields whose number of Gaussians needs chunks (`gaussians_in_parts`): recording saves
+    nothing there, and lists of tiles, which a recorded function cannot count, have room for all.
     """
 
     def __init__(self, field: Field, skip: Skip = NOTHING) -> None:
@@ -241,5 +219,5 @@ class CompiledPredictor:
 
     @property
     def n_recordings(self) -> int:
-        """How often it was recorded."""
+        """Number of recordings."""
         return self._recorded.n_recordings

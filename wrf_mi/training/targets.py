@@ -1,7 +1,6 @@
-"""What a fit compares reports with: observations as flat numbers, and what the field is told of each.
+"""Observations as flat numbers, and the conditions of a field.
 
-A *condition* is what a field sees in the transmitter's place: a row's position, or with an uplink the uplink channel of
-one antenna of a row.
+A *condition* is the input of a field: a row's transmitter position, or the uplink channel of one antenna of a row.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ class Targets:
     Attributes:
         condition: positions [3, c] in metres or features [features, c].
         truth: float32 [n_rx, c, *shape of a report], NaN where nothing was received.
-        unit: of each receiver, by which differences are divided in the loss, [n_rx].
-        per_row: conditions of a row; they stand one after the other.
-        weight: factor of each observation's difference in the loss [n_rx, c]; None: 1 throughout.
+        unit: unit of each receiver's differences in the loss, [n_rx].
+        per_row: number of consecutive conditions of a row.
+        weight: factor of each observation's difference in the loss [n_rx, c]; None: 1.
     """
 
     condition: FloatArray
@@ -53,17 +52,17 @@ class Targets:
 def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
     """Conditions and observations of a record; units are measured on training rows.
 
-    An uplink is the condition where there is one, but beside paths of a scene, which are traced from positions.
+    An uplink is the condition where there is one, except beside paths of a scene, which are traced from positions.
 
     Raises:
-        InputError: a position that is not known, or an uplink without a signal or of other antennas.
+        InputError: an unknown position, or an uplink without a signal or with a different number of antennas.
     """
     task, seen = task_of(record), np.asarray(record.observation)
     if record.uplink is None or with_scene:
         if not np.isfinite(record.tx_pos_m[rows]).all():
             row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
             raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
-        units = np.array([task.unit(own[rows]) for own in seen])
+        units = np.array([task.unit(values[rows]) for values in seen])
         weight = _weights(record, rows)
         return Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
     outputs = outputs_of(record)
@@ -75,10 +74,9 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
 
 
 def _weights(record: Record, rows: IntArray) -> FloatArray | None:
-    """One over the noise's standard deviation, with a mean of 1 over what training rows received; 1 in other rows.
+    """Inverse standard deviation of the noise, with a mean of 1 over the training rows' observations; 1 in other rows.
 
-    Divided by it differences are standardised residuals: an absolute error is then weighted by 1 / std, the weight of
-    least variance for medians, and a squared one by 1 / variance, that for means.
+    Differences become standardised residuals: an absolute error is weighted by 1 / std, a squared one by 1 / variance.
     """
     precision = record.precision(rows)
     if precision is None:
@@ -102,17 +100,10 @@ def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
-    """What a record's observations are made of, as settings have it.
-
-    Args:
-        record: of any task.
-        config: settings.
-        targets: of the record.
-        rows: training rows, whose channels tell the basis.
-        with_scene: whether paths of a scene are trained.
+    """Form of a record's observations by the settings; its basis is computed from the training ``rows``.
 
     Raises:
-        InputError: a receiver model of another task.
+        InputError: a receiver model of another task, or antennas of unknown positions beside a scene.
     """
     task = task_of(record)
     default = task.receiver_with_scene if with_scene else task.receiver
@@ -132,36 +123,30 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
-    """Principal components [components, outputs] of the training rows' channels, their mean not taken off.
+    """Principal components [components, outputs] of the training rows' channels, without subtraction of the mean.
 
-    Receivers count alike, however far away or seldom heard, since scores are relative.
+    Receivers have equal weight, as scores are relative.
     """
     power: NDArray[np.complex128] | float = 0.0
     for receiver in range(len(targets.truth)):
         pairs = targets.truth[receiver, targets.received(receiver, rows)].astype(float)
-        own = (pairs[..., 0] + 1j * pairs[..., 1]).reshape(len(pairs), -1)
-        power = power + own.conj().T @ own / (np.square(np.abs(own)).sum() or 1.0)
+        channels = (pairs[..., 0] + 1j * pairs[..., 1]).reshape(len(pairs), -1)
+        power = power + channels.conj().T @ channels / (np.square(np.abs(channels)).sum() or 1.0)
     _, vectors = np.linalg.eigh(power)
-    # Rows v^H so that a channel's coefficients are h v and the channel is their sum with v^H.
+    # Rows v^H: a channel h has coefficients h v and is their sum with v^H.
     return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
 
 
 def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool = False) -> Schedule:
-    """The plan of a fit: each receiver learns from what it observed.
-
-    Args:
-        config: settings.
-        targets: of the record.
-        split: rows that train and rows that choose.
-        joint: whether Gaussians are trained beside paths of a scene.
+    """The schedule of a fit, in which each receiver learns from its observations; ``joint``: beside paths of a scene.
 
     Raises:
-        InputError: see `wrf_mi.training.schedule.plan`, or no step is left for the Gaussians.
+        InputError: as `wrf_mi.training.schedule.plan`, or no step is left for the Gaussians.
     """
     everything = [targets.received(r, split.all_train) for r in range(len(targets.truth))]
     train = [targets.received(r, split.train) for r in range(len(targets.truth))]
-    # A receiver whose few rows all are to choose by learns from these.
-    train = [own if len(own) else every for own, every in zip(train, everything, strict=True)]
+    # A receiver without training rows learns from its validation rows.
+    train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
     first = round(config.traced.alone * config.steps) if joint else 0
     if joint and config.patience and 0 < config.holdout_steps_fraction <= config.traced.alone:
         end = config.holdout_steps_fraction

@@ -40,7 +40,7 @@ from .targets import form_of, plan_rows, targets_of
 logger = logging.getLogger(__name__)
 
 CHUNK_SIZE = 64
-"""Observations of a receiver by which its level starts."""
+"""Observations of a receiver from which its starting level is estimated."""
 
 
 def peak_memory_mb() -> float:
@@ -50,7 +50,7 @@ def peak_memory_mb() -> float:
 
 
 def check_rows(split: Split, record: Record, source: str) -> None:
-    """Refuse a split with rows that the record has not; ``source`` says where the split comes from.
+    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message.
 
     Raises:
         InputError: such a row.
@@ -65,20 +65,20 @@ class Trainer(TrainingLoop):
     """Fits one field to the training rows of one split.
 
     Args:
-        record: of any task that a receiver model reports.
-        split: which rows train and which choose.
+        record: measurements of any task that a receiver model reports.
+        split: rows for training and for the choice of settings.
         config: settings.
-        field: a model of your own in place of the one that ``config.model`` names.
-        initial: starting values in place of those that ``config.initial`` describes.
-        state: of a fit that was stopped, to go on from.
-        loss: in place of the task's: ``loss(prediction, truth, batch, *shape)`` of flat Dr.Jit arrays in the
-            receiver's unit, NaN in the truth where nothing was received.
-        scene: from `wrf_mi.tracing.open_scene`, at the record's carrier: its paths are trained together with the
+        field: field that replaces the one of ``config.model``.
+        initial: starting values that replace those of ``config.initial``.
+        state: state of a stopped fit, to resume from.
+        loss: ``loss(prediction, truth, batch, *shape)`` of flat Dr.Jit arrays in the receiver's unit, NaN in the truth
+            where nothing was received; None: the task's loss.
+        scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier, whose paths are trained together with the
             Gaussians. None: Gaussians alone.
 
     Raises:
-        InputError: settings or data that cannot be trained on.
-        BackendError: a deterministic fit in a process that computes on a GPU already.
+        InputError: unsuitable settings or data.
+        BackendError: a deterministic fit in a process that already computes on a GPU.
     """
 
     config: TrainConfig
@@ -118,7 +118,7 @@ class Trainer(TrainingLoop):
         )
         self._shape = self.targets.truth.shape[2:]
         self._loss = loss or partial(self.task.loss, ssim_weight=config.loss.ssim_weight)
-        # Gaussians that correct something are chosen on rows away from those that train, too.
+        # Gaussians that correct paths are chosen also on rows far from the training rows.
         self._chooses_reach = self.graph.corrects and config.patience > 0 and config.holdout_steps_fraction > 0
         self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
         unjudged = self._chooses_reach and self._choosing is split
@@ -144,7 +144,7 @@ class Trainer(TrainingLoop):
             self.graph.check_polarization(record.tx_pos_m[known])
             state = FitState(self._start(initial))
             if unjudged:
-                logger.warning("%d training rows do not tell how far Gaussians hold: none are used", len(split.train))
+                logger.warning("%d training rows do not suffice to choose a reach: no Gaussians", len(split.train))
                 state.reach_m = 0.0
         self.state = state
         if state.chosen:
@@ -164,12 +164,14 @@ class Trainer(TrainingLoop):
         return self.graph.field
 
     def record_functions(self) -> None:
-        """Forget recorded kernels: the number of Gaussians stands in them as a constant."""
+        """Discard recorded kernels: the number of Gaussians is a constant in them."""
         self._steps: dict[Any, Callable[..., Any]] = {}
         self._predictor: Predictor | None = None
 
     def _restore_paths(self) -> None:
-        """Go back to the paths of the state: a receiver that training moves is searched from where it was then."""
+        """Restore the paths of the state: a receiver that training moves is searched from its position at the last
+        search.
+        """
         sides = [side for side in self._sides if side is not None]
         if sides and not len(self.state.searched_m):
             self.state.searched_m = np.stack([side.searched_at_m for side in sides])
@@ -178,13 +180,13 @@ class Trainer(TrainingLoop):
                 side.search(searched_m)
 
     def _start(self, initial: InitialGaussians | None) -> dict[str, NDArray[np.float32]]:
-        """Starting values: Gaussians, gains and levels with which each side reports what was observed, on average."""
-        rng, own = np.random.default_rng([self.config.seed, 0]), self.config.initial
+        """Starting values: Gaussians, and gains and levels that match the observations on average."""
+        rng = np.random.default_rng([self.config.seed, 0])
         values: dict[str, NDArray[np.float32]] = {}
         if self.graph.field is not None:
             seen = replace(self.record, receivers=self.graph.receivers)
-            drawn = initial or initial_gaussians(own, seen, self.split.train, rng, self.graph.sphere)
-            values = self.graph.field.init(drawn, rng)
+            start = initial or initial_gaussians(self.config.initial, seen, self.split.train, rng, self.graph.sphere)
+            values = self.graph.field.init(start, rng)
         values |= self.graph.parameters(self._sides)
         for r, side in enumerate(self._sides):
             if side is not None and side.gain_name in values:
@@ -194,18 +196,18 @@ class Trainer(TrainingLoop):
         return values
 
     def _level(self, values: Mapping[str, NDArray[np.float32]], receiver: int) -> float:
-        """Level at which Gaussians alone report what a receiver observed, or far below what its paths bring."""
+        """Level at which Gaussians match a receiver's observations, or far below its paths' power."""
         params = {name: to_tensor(value) for name, value in values.items()}
         if (side := self._sides[receiver]) is not None:
             return self.graph.power_level(side, params) + float(np.log(SHARE))
         rows = self.targets.received(receiver, self._known)[:CHUNK_SIZE]
-        alone, own = self.graph.report(receiver, None), self.targets.condition[:, rows]
-        found = evaluated(alone, params, own, receiver, self._poses[receiver], self._plane).numpy().astype(float)
+        report, condition = self.graph.report(receiver, None), self.targets.condition[:, rows]
+        found = evaluated(report, params, condition, receiver, self._poses[receiver], self._plane).numpy()
         observed = self.targets.truth[receiver, rows].astype(float)
-        return self.graph.models[receiver].missing_gain(found.reshape(observed.shape), observed)
+        return self.graph.models[receiver].missing_gain(found.astype(float).reshape(observed.shape), observed)
 
     def _step_of(self, receiver: int) -> Callable[..., Any]:
-        """The recorded step of a receiver; without paths one serves all, else it is anew after a search for paths."""
+        """Recorded step of a receiver; without paths one serves all, else each search for paths needs another."""
         side = self._sides[receiver]
         state = self.state
         if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
@@ -218,45 +220,38 @@ class Trainer(TrainingLoop):
         if key not in self._steps:
             self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
             report = self.graph.report(receiver, side, learned)
-            own = None if key is None else partial(self.graph.arrays, receiver, side)
-            if own is not None:
-                # What is made from NumPy's memory at first use must be there before a recording.
+            read = None if key is None else partial(self.graph.arrays, receiver, side)
+            if read is not None:
+                # Arrays that are made from NumPy's memory at first use must exist before a recording.
                 params = {name: self.state.adam[name] for name in self.state.adam}
                 first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
                 evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
-            ends = self._loss, self._shape, own, self.graph.evaluation
-            self._steps[key] = make_step(report, self._rates(), *ends)
+            rest = self._loss, self._shape, read, self.graph.evaluation
+            self._steps[key] = make_step(report, self._rates(), *rest)
         return self._steps[key]
 
     def _rates(self) -> dict[str, float]:
-        o = self.config.optimiser
-        own = {
-            "position": o.position,
-            "log_scale": o.scale,
-            "rotation": o.rotation,
-            "opacity": o.opacity,
-            "signal": o.signal,
-            "image": 0.0,
-            LEVEL: o.level,
-        }
-        traced = self.graph.traced
+        o, traced = self.config.optimiser, self.graph.traced
+        rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
+        rates |= {"log_scale": o.scale, "image": 0.0, LEVEL: o.level}
         return {
-            name: traced.rate(name) if name.startswith(TRACED_NAMES) else own.get(name, o.network)
+            name: traced.rate(name) if name.startswith(TRACED_NAMES) else rates.get(name, o.network)
             for name in self.state.adam
         }
 
     def predictor(self) -> Predictor:
-        """Predictions with the running mean of the parameters as it is now."""
+        """Predictions with the current running mean of the parameters."""
         if self._predictor is None:
-            params, own = self.state.mean_params(), self.graph
-            self._predictor = Predictor(own.field, params, own.receivers, *own.form.size, self.config.skip, graph=own)
+            params, graph = self.state.mean_params(), self.graph
+            size = graph.form.size
+            self._predictor = Predictor(graph.field, params, graph.receivers, *size, self.config.skip, graph=graph)
         else:
             self._predictor.update(self.state.mean)
         self._predictor.reach = self.reach()
         return self._predictor
 
     def reach(self) -> Reach | None:
-        """Where the Gaussians are trusted, by the rows that train now; None: they correct nothing."""
+        """Reach around the rows that train now; None: the Gaussians are used everywhere."""
         if not self.graph.corrects:
             return None
         joined = self.state.chosen and self.schedule.joined < self.config.steps
@@ -265,18 +260,18 @@ class Trainer(TrainingLoop):
         return Reach(tuple(known), self.state.reach_m)
 
     def _corrected_score(self) -> float:
-        """Median score where Gaussians correct something; with the best reach until one is chosen."""
+        """Median score of Gaussians that correct paths; the best reach is used until one is chosen."""
         predict, record, reach = self.predictor(), self.record, self.reach()
         chosen = self._choosing if self._chooses_reach and not self.state.chosen else self.split
         rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
         assert reach is not None
 
         def score(r: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
-            ends = self._sides[r], np.searchsorted(self._known, rows[r]), weight
-            found = predict.of_side(record.tx_pos_m[rows[r]], r, *ends)
+            slots = np.searchsorted(self._known, rows[r])
+            found = predict.of_side(record.tx_pos_m[rows[r]], r, self._sides[r], slots, weight)
             return self.task.training_score(found, record.observation[r, rows[r]])
 
-        held = [record.tx_pos_m[own] for own in rows]
+        held = [record.tx_pos_m[chosen_rows] for chosen_rows in rows]
         lengths = reach.lengths(held) if chosen is not self.split else [reach.length_m]
         self.state.reach_m, median = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
         return median
@@ -286,7 +281,7 @@ class Trainer(TrainingLoop):
         if self.graph.corrects:
             return self._corrected_score()
         rows, record = self.split.validation, self.record
-        if len(rows) == 0:
+        if not len(rows):
             return float("nan")
         predict = self.predictor()
         scores = [
@@ -296,16 +291,16 @@ class Trainer(TrainingLoop):
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
     def choose(self, score: float) -> bool:
-        """See `TrainingLoop`."""
+        """Early stopping (`TrainingLoop`)."""
         chosen = super().choose(score)
         if chosen:
             self._restore_paths()
         if chosen and self.state.reach_m == 0 and self.graph.scene is None:
-            self.state.step = self.config.steps  # nothing is predicted better than zero: there is nothing to train
+            self.state.step = self.config.steps  # zero is the best prediction
         return chosen
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
-        """See `TrainingLoop`."""
+        """One optimiser step (`TrainingLoop`)."""
         state, schedule, t = self.state, self.schedule, self.state.step
         receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
         if 0 < t == schedule.first_stage:
@@ -330,13 +325,13 @@ class Trainer(TrainingLoop):
         return report.loss, trouble
 
     def adapt(self) -> None:
-        """A round of density control."""
+        """One round of density control."""
         d, state = self.config.density, self.state
         names = self.field.per_gaussian
         params = {name: values for name, values in state.params().items() if name in names}
         receivers = np.stack([r.position_m for r in self.record.receivers])
         distance = np.linalg.norm(params["position"].T[:, None].astype(float) - receivers, axis=2).min(axis=1)
-        # Its own generator for each round: a resumed run draws what an uninterrupted one would.
+        # A generator for each round: a resumed run draws the same numbers.
         rng = np.random.default_rng([self.config.seed, 2, state.step])
         change = adapt(
             params,

@@ -17,15 +17,17 @@ here:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import numpy as np
 from drjit import nn
+from pydantic import Field
 
 from ...backend.device import to_float, to_tensor
+from ...core.settings import Count, Positive
 from ...core.types import IntArray
-from ...training.loop_config import COUNT, POSITIVE, AdamConfig, at_least
+from ...training.loop_config import AdamConfig
 from .conv import Convolution, Grid, InstanceNorm, coarser, finer, resized
 from .coordinates import feature_count
 from .layers import GAIN, Linear, Module, columns, relu, sigmoid
@@ -60,19 +62,13 @@ class DcganSettings(NetworkSettings):
     batch: int = 8
     validate_every: int = 188
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    adversary_rate: float = 2e-4
-    noise: int = 8
-    hidden: int = 64
-    channels: int = 32
+    adversary_rate: Positive = 2e-4
+    noise: Count = 8
+    hidden: Count = 64
+    channels: Annotated[int, Field(ge=2**LEVELS, description=f"{2**LEVELS} or more")] = 32
     octaves: int = 4
-    scale_m: float = 1.0
+    scale_m: Positive = 1.0
     l1: float = 100.0
-
-    ranges = NetworkSettings.ranges | {
-        **dict.fromkeys(("noise", "hidden"), COUNT),
-        **dict.fromkeys(("scale_m", "adversary_rate"), POSITIVE),
-        "channels": at_least(2**LEVELS),
-    }
 
 
 def coarse_grid(shape: tuple[int, int], batch: int) -> Grid:

@@ -19,10 +19,11 @@ from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
 from ...core import InputError, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
+from ...core.settings import Count
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
 from ...tasks.conditions import known_uplink, normalised_uplink, outputs_of, placed_receivers
-from ...training.loop_config import COUNT, POSITIVE, AdamConfig, at_least
+from ...training.loop_config import AdamConfig
 from ..method import Inputs
 from .coordinates import Coordinates, feature_count
 from .layers import columns
@@ -61,20 +62,14 @@ class Nerf2Settings(NetworkSettings):
     validate_every: int = 500
     optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
     networks: Networks = dataclasses.field(default_factory=Networks)
-    rays: int = 256
-    sphere_rays: int = 64
-    sphere_batch: int = 128
-    samples: int = 4
+    rays: Count = 256
+    sphere_rays: Count = 64
+    sphere_batch: Count = 128
+    samples: Count = 4
     near_m: float = 0.0
     far_m: float = 0.0
     tx_octaves: int = 4
     shared: bool = True
-
-    ranges = NetworkSettings.ranges | {
-        **dict.fromkeys(("rays", "sphere_rays", "sphere_batch", "samples", "networks.layers"), COUNT),
-        "networks.width": at_least(2),
-        "networks.scale_m": POSITIVE,
-    }
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""

@@ -22,13 +22,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 from scipy.constants import speed_of_light
 
+from ...core.settings import Count, Positive
 from .coordinates import feature_count, with_encoding
 from .layers import Linear, Mlp, Module, relu, sigmoid
 
@@ -49,12 +51,12 @@ class Networks:
         scale_m: unit of encoded points and transmitters, metres (`wrf_mi.gaussians.encoding`).
     """
 
-    layers: int = 8
-    width: int = 128
+    layers: Count = 8
+    width: Annotated[int, Field(ge=2, description="2 or more")] = 128
     skip: int = 5
     point_octaves: int = 3
     view_octaves: int = 3
-    scale_m: float = 1.0
+    scale_m: Positive = 1.0
 
 
 class Nerf2Network(Module):

@@ -17,11 +17,12 @@ import numpy as np
 from drjit.opt import Adam
 
 from ...backend.recorded import Recorded
+from ...core import InputError
 from ...core.types import IntArray
 from ...training.adam import NonFiniteReport, Params, guarded_step, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.loop import Progress, TrainingLoop
-from ...training.loop_config import POSITIVE, AdamConfig, LoopConfig
+from ...training.loop_config import AdamConfig, LoopConfig
 from ...training.schedule import plan
 from ...training.session import FitSession
 from ...training.state import FitState
@@ -46,7 +47,16 @@ class NetworkSettings(LoopConfig):
     holdout_steps_fraction: float = HOLD_OUT
     patience: int = 8
     optimiser: AdamConfig = field(default_factory=network_adam)
-    ranges = LoopConfig.ranges | {"optimiser.network": POSITIVE}
+
+    def __post_init__(self) -> None:
+        """Refuse values that no fit can use.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        super().__post_init__()
+        if not self.optimiser.network:
+            raise InputError("setting optimiser.network: 0.0 is out of range, choose more than 0")
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
+from ...core.settings import Count, Positive, Share
 from ...core.types import IntArray
-from ...training.loop_config import COUNT, POSITIVE, SHARE
 from .coordinates import feature_count
 from .layers import Linear, Mlp, Module, columns, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
@@ -51,21 +51,15 @@ class VaeSettings(NetworkSettings):
     steps: int = 3750
     batch: int = 16
     validate_every: int = 375
-    latent: int = 16
-    width: int = 256
-    last: int = 64
-    pool: int = 6
+    latent: Count = 16
+    width: Count = 256
+    last: Count = 64
+    pool: Count = 6
     octaves: int = 4
-    scale_m: float = 1.0
-    noise: float = 0.1
+    scale_m: Positive = 1.0
+    noise: Positive = 0.1
     beta: float = 3e-2
-    prior_share: float = 0.8
-
-    ranges = NetworkSettings.ranges | {
-        **dict.fromkeys(("latent", "width", "last", "pool"), COUNT),
-        **dict.fromkeys(("scale_m", "noise"), POSITIVE),
-        "prior_share": SHARE,
-    }
+    prior_share: Share = 0.8
 
 
 def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from ...core import InputError, Record, Split
-from ...training.loop_config import COUNT, POSITIVE, checked
-from ..method import OnProgress
+from ...core.settings import Count, Positive, check
+from ...training.session import OnProgress
 from .csi_bands import Bands, bands_of, known_rows, relative_error
 from .uplink_paths import find_paths
 from .uplink_waves import waves_of
@@ -23,9 +23,6 @@ from .uplink_waves import waves_of
 Kind = Literal["auto", "spherical", "plane", "free"]
 BOTH_GAPS = (1, 2)
 """Spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown."""
-
-
-PATH_RANGES = {"max_paths": COUNT, "choice_rows": COUNT, "max_distance_m": POSITIVE, "spacing_hz": POSITIVE}
 
 
 @dataclass(frozen=True)
@@ -43,18 +40,16 @@ class PathSettings:
     """
 
     wavefront: Kind = "auto"
-    max_paths: int = 40
-    max_distance_m: float = 100.0
+    max_paths: Count = 40
+    max_distance_m: Positive = 100.0
     between: int = 1
     final: int = 15
-    spacing_hz: float = 312.5e3
-    choice_rows: int = 16
-
-    ranges = PATH_RANGES
+    spacing_hz: Positive = 312.5e3
+    choice_rows: Count = 16
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        checked(self, self.ranges)
+        check(self)
 
 
 def choose(

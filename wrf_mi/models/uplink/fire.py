@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...core import Record, Split
+from ...core.settings import Count, Positive
 from ...core.types import IntArray
-from ...training.loop_config import COUNT, POSITIVE
 from ...training.session import FitSession
 from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
 from ..networks.layers import Linear, Mlp, Module, columns
@@ -62,16 +62,11 @@ class FireSettings(NetworkSettings):
     batch: int = 256
     validate_every: int = 500
     sample: Sample = "auto"
-    row_batch: int = 64
-    latent: int = 32
-    width: int = 256
+    row_batch: Count = 64
+    latent: Count = 32
+    width: Count = 256
     beta: float = 1e-4
-    spacing_hz: float = 312.5e3
-
-    ranges = NetworkSettings.ranges | {
-        **dict.fromkeys(("latent", "width", "row_batch"), COUNT),
-        "spacing_hz": POSITIVE,
-    }
+    spacing_hz: Positive = 312.5e3
 
 
 def samples_of(h: NDArray[Any], sample: str) -> NDArray[np.complex128]:

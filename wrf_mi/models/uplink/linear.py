@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Record, Split
 from ...core.types import IntArray
-from ...training.session import FitSession
-from ..method import Inputs, Method, OnProgress
+from ...training.session import FitSession, OnProgress
+from ..method import Inputs, Method
 from .csi_bands import known_rows, relative_error, uplink_of
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from ...core import Record, Split
 from ...core.angles import FloatArray
-from ...training.loop_config import COUNT, AdamConfig, at_least
+from ...core.settings import Count
+from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
 from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
 from ..networks.training import NetworkSettings, network_adam
@@ -52,18 +53,16 @@ class OptMLSettings(PathSettings, NetworkSettings):
     validate_every: int = 300
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     simulation: Simulation = field(default_factory=Simulation)
-    width: int = 48
-    rounds: int = 5
-    at_once: int = 10
+    width: Count = 48
+    rounds: Count = 5
+    at_once: Count = 10
     threshold: float = 0.15
     between: int = 3
     final: int = 5
 
-    ranges = NetworkSettings.ranges | {
-        **PathSettings.ranges,
-        **dict.fromkeys(("rounds", "at_once", "width", "simulation.paths"), COUNT),
-        "simulation.channels": at_least(2),  # to learn from and to validate
-    }
+    def __post_init__(self) -> None:
+        """Refuse settings out of range."""
+        NetworkSettings.__post_init__(self)
 
 
 class OptML:

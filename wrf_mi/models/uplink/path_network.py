@@ -8,15 +8,17 @@ fully connected over distances. It learns from simulated channels of few paths f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ...backend.device import on_device, to_tensor, to_uint
 from ...core.angles import FloatArray
+from ...core.settings import Count
 from ...core.types import IntArray
 from ...training.loop_config import LoopConfig
 from ...training.session import FitSession
@@ -46,8 +48,8 @@ class Simulation:
         noise_db: least and greatest ratio of signal to noise, dB.
     """
 
-    channels: int = 3000
-    paths: int = 12
+    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  # to learn from and to validate
+    paths: Count = 12
     decay_db: float = 25.0
     noise_db: tuple[float, float] = (5.0, 30.0)
 
