@@ -19,6 +19,7 @@ from wrf_mi.runs.timing import Call
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.session import quiet
 from wrf_mi.training.step import device_pose
 
 from .traced import random_field, scene_of
@@ -77,6 +78,6 @@ def physics(transmitters: int) -> Call:
     receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
     known = record(1, receivers=receivers, frequencies_hz=np.array([FREQUENCY_HZ]))
     kind, scene = kind_of(known, True), open_scene("laboratory", FREQUENCY_HZ)
-    model = kind.fit(known, np.zeros(0, np.int64), scene, kind.settings(), 0, lambda what, share: None)
+    model = kind.fit(known, np.zeros(0, np.int64), scene, kind.settings(), 0, quiet)
     tx_pos_m = transmitter_path(transmitters)
     return lambda: model.predict(tx_pos_m, 0).mean

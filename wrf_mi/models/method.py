@@ -15,7 +15,6 @@ from ..core.angles import FloatArray
 from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..training.session import FitSession
-from ..training.session import OnProgress as OnProgress
 
 Settings = TypeVar("Settings")
 PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")

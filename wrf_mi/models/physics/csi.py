@@ -25,8 +25,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
+from ...training.session import OnProgress, quiet
 from ..interpolation.kriging_equations import simple_weights
-from ..method import OnProgress
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Complex, Model
@@ -196,7 +196,7 @@ def fit_csi(
     scene: Any | None,
     settings: CsiSettings = DEFAULTS,
     seed: int = 0,
-    on_progress: OnProgress = lambda stage, share: None,
+    on_progress: OnProgress = quiet,
 ) -> CsiPhysics:
     """Fit a CSI physics model.
 

@@ -36,7 +36,7 @@ from ...receivers.lags import Lags
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
-from ..method import OnProgress
+from ...training.session import OnProgress, quiet
 from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
@@ -253,7 +253,7 @@ def fit_measured_spectrum(
     rows: IntArray,
     settings: MeasuredSpectrumSettings = MeasuredSpectrumSettings(),
     seed: int = 0,
-    on_progress: OnProgress = lambda stage, share: None,
+    on_progress: OnProgress = quiet,
 ) -> MeasuredSpectrumPhysics:
     """Fit the physics model to training rows.
 

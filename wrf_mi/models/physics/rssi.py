@@ -21,7 +21,7 @@ from ...core import InputError, Receiver, Record, receiver_arrays, stored_receiv
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
-from ..method import OnProgress
+from ...training.session import OnProgress, quiet
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
 from .rssi_map import PowerMap, trace_map
 from .rssi_terms import Hyperparameters, Measured, Poses, Stops, stops_of
@@ -208,7 +208,7 @@ def fit_rssi(
     scene: Any | None,
     settings: RssiSettings = RssiSettings(),
     seed: int = 0,
-    on_progress: OnProgress = lambda stage, share: None,
+    on_progress: OnProgress = quiet,
 ) -> RssiPhysics:
     """Fit an RSSI physics model.
 

@@ -15,7 +15,7 @@ from ...core import InputError, Prediction, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.receivers import receiver_index
 from ...core.types import IntArray
-from ..method import OnProgress
+from ...training.session import OnProgress
 
 Arrays = dict[str, NDArray[Any]]
 

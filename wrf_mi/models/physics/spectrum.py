@@ -27,7 +27,7 @@ from ...core import Antenna, InputError, Record, receiver_arrays, stored_receive
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
-from ..method import OnProgress
+from ...training.session import OnProgress, quiet
 from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_loss import Spectrometer
@@ -153,7 +153,7 @@ def fit_spectrum(
     scene: Any | None,
     settings: SpectrumSettings = DEFAULTS,
     seed: int = 0,
-    on_progress: OnProgress = lambda stage, share: None,
+    on_progress: OnProgress = quiet,
 ) -> SpectrumPhysics:
     """Fit the physics model to spectra.
 
@@ -178,7 +178,9 @@ def fit_spectrum(
     facts: dict[str, Any] = {}
     for index, receiver in enumerate(record.receivers):
 
-        def report(stage: str, share: float, index: int = index, name: str = receiver.name) -> None:
+        def report(
+            stage: str, share: float, _: object = None, /, *, index: int = index, name: str = receiver.name
+        ) -> None:
             on_progress(f"{name}: {stage}", (index + share) / len(record.receivers))
 
         instrument = Spectrometer(receiver, float(record.frequencies_hz[0]), height, width, record.tx_antenna)
