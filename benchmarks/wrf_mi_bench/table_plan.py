@@ -64,7 +64,7 @@ SPECTRUM: Mapping[str, Entry] = {
     "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
     "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
     "kriging": Entry("kriging", _model("kriging")),
-    "idw": Entry("blend", _model("idw")),
+    "idw": Entry("IDW", _model("idw")),
 }
 ROOM = _set("steps=18000")
 """Schedule for transmitters anywhere in a room: SSIM 0.770 on validation rows, 0.754 after a third of the steps."""
@@ -95,7 +95,7 @@ RSSI: Mapping[str, Entry] = {
     ),
     "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
     "kriging": Entry("kriging, knows the heading", _model("kriging")),
-    "idw": Entry("blend", _model("idw")),
+    "idw": Entry("IDW", _model("idw")),
     "mri": Entry("MRI", _model("mri"), published="8.3"),
 }
 POSITION: Mapping[str, Entry] = {
@@ -105,7 +105,7 @@ POSITION: Mapping[str, Entry] = {
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
-    "idw": Entry("blend", _model("idw")),
+    "idw": Entry("IDW", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="23.91, p10 20.85, p90 25.52"),
