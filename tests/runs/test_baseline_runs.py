@@ -286,7 +286,7 @@ def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.Capt
     (damaged / "model.npz").unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")
-    refused(["train", "--resume", damaged], "split.npz: not a split file", capsys)
+    refused(["train", "--resume", damaged], "split.npz: not readable", capsys)
     assert (damaged / "config.yaml").exists()  # a run that was there is never taken away
     (damaged / "split.npz").write_bytes(split)
     config = damaged / "config.yaml"
