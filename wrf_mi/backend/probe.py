@@ -12,7 +12,7 @@ import sys
 import tempfile
 from dataclasses import dataclass, fields
 from hashlib import sha256
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from .cache import file_key, recall, remember
@@ -79,7 +79,12 @@ def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
 
 def _environment(name: str) -> list[str]:
     """Packages, script, machine and devices; several machines may share a home folder."""
-    versions = [f"{package} {version(package)}" for package in ("drjit", "mitsuba")]
+    versions = []
+    for package in ("drjit", "mitsuba"):
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:  # built without metadata, or not installed, which `wrf-mi doctor` reports
+            versions.append(f"{package} ?")
     devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if name == "cuda" else ""
     return [*versions, sha256(_SCRIPT.read_bytes()).hexdigest()[:12], platform.node(), devices]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .options import DATASET, Arguments, add_command, add_n_train, add_scheduler, add_tracing
-from .train import RAY_TRACING, run_training
+from .train import RAY_TRACING, run_training, training_arguments
 
 
 def add_parser(commands: Any) -> None:
@@ -30,5 +30,6 @@ def trace_command(a: Arguments) -> int:
     """Predict by ray tracing alone."""
     from ..parallel import open_scheduler
 
+    training_arguments(a)  # refused before workers start
     with open_scheduler(a.scheduler) as scheduler:
         return run_training(a, scheduler=scheduler if a.scheduler else None)

@@ -166,7 +166,9 @@ class AntennaOptions:
         if not self:
             return record
         stated = [(*field.name.split("_"), getattr(self, field.name)) for field in fields(self)]
-        rx, tx = ({key: value for end, key, value in stated if end == which and value} for which in ("rx", "tx"))
+        rx, tx = (
+            {key: value for end, key, value in stated if end == which and value is not None} for which in ("rx", "tx")
+        )
         receivers = tuple(replace(receiver, antenna=replace(receiver.antenna, **rx)) for receiver in record.receivers)
         return replace(record, receivers=receivers, tx_antenna=replace(record.tx_antenna, **tx))
 

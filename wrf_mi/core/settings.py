@@ -59,14 +59,19 @@ def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Refuse numbers of settings that are not finite or out of their range, nested ones included.
+    """Refuse numbers of settings that are not finite or out of their range, and unknown words; nested ones included.
 
     Raises:
         InputError: naming the setting, its value and the range.
     """
     kind: Any = type(settings)
+    hints = typing.get_type_hints(kind)
     for name, (adapter, words) in _ranges(kind).items():
         value = getattr(settings, name)
+        words_known = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is typing.Literal else ()
+        if words_known and value not in words_known:
+            known = ", ".join(map(str, words_known))
+            raise InputError(f"setting {prefix}{name}: {value!r}; choose from {known}")
         if dataclasses.is_dataclass(value):
             check(value, f"{prefix}{name}.")
         elif isinstance(value, int | float):
@@ -105,11 +110,17 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     return kind(**arguments)
 
 
+def _number(value: Any) -> Any:
+    """A number that YAML 1.1 reads as text, such as 1e-3; all else as it is."""
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
+    return value
+
+
 def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
     """A value of the type ``hint``."""
-    if isinstance(value, str) and float in (hint, *typing.get_args(hint)):
-        with suppress(ValueError):
-            value = float(value)  # YAML 1.1 reads 1e-3 as text
+    if float in (hint, *typing.get_args(hint)):
+        value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
         # JSON has lists in place of tuples; else nothing is converted.
         return _adapter(hint).validate_json(json.dumps(value, default=str), strict=True)

@@ -76,7 +76,9 @@ def csi(paths: Paths, frequencies_hz: ArrayLike) -> ComplexArray:
     Returns:
         Shape [n_rx, n_tx, k], 0 where no path arrives.
     """
-    channel = _spherical_waves(paths, paths.arrival, paths.length_m, np.zeros((paths.n_rx, 1, 3)), frequencies_hz)
+    # At the origin only lengths count: one axis for all, exact whatever the precision of the directions.
+    along = np.broadcast_to([0.0, 0.0, 1.0], paths.arrival.shape)
+    channel = _spherical_waves(paths, along, paths.length_m, np.zeros((paths.n_rx, 1, 3)), frequencies_hz)
     return channel.reshape(paths.n_rx, paths.n_tx, -1)
 
 

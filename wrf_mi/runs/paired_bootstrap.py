@@ -95,7 +95,7 @@ def paired_difference(
 
     def interval(statistic: Callable[..., Any]) -> tuple[float, float, float]:
         def difference(drawn: NDArray[np.intp], axis: int = -1) -> FloatArray:
-            x, y = (np.moveaxis(v[:, drawn], 0, -2).reshape(*drawn.shape[:-1], -1) for v in (a, b))
+            x, y = (np.moveaxis(v[:, drawn.astype(np.intp)], 0, -2).reshape(*drawn.shape[:-1], -1) for v in (a, b))
             return np.asarray(statistic(x, axis=-1) - statistic(y, axis=-1))
 
         # SciPy asks for two rows; a single one twice has the same statistics.

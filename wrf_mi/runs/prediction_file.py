@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,11 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, stored_arrays, text_lines
+from ..core.files import one_line, text_lines, write_atomically
 from ..models.method import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
-from .results import write_csv
 
 NPZ, CSV = ".npz", ".csv"
 HEADING = "heading_rad"
@@ -91,7 +91,8 @@ def _from_csv(path: Path) -> Inputs:
 
 def _from_npz(path: Path) -> Inputs:
     try:
-        arrays = stored_arrays(path)
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in (POSITIONS, HEADING, FREQUENCY, UPLINK) if name in stored}
         uplink = arrays.get(UPLINK)
         if uplink is not None:
             arrays.setdefault(POSITIONS, np.full((len(uplink), 3), np.nan))
@@ -141,15 +142,19 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
     """
     if out.suffix.lower() == NPZ:
         return write_predictions(out, arrays)
-    columns, rows = dict(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True)), range(len(arrays["tx_pos"]))
+    # A list, as receivers may have equal names.
+    columns: list[tuple[str, Any]] = list(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True))
     for name, values in ((HEADING, tx_heading_rad), (FREQUENCY, arrays.get(FREQUENCY))):
         if values is not None:
-            columns[name] = np.asarray(values, float)
+            columns.append((name, np.asarray(values, float)))
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in arrays:
-            columns |= {f"{name}_{suffix}": v for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)}
+            columns += [(f"{name}_{suffix}", v) for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)]
     # str gives the shortest number that reads back as the same number.
-    text = ({name: "" if np.isnan(values[k]) else str(values[k]) for name, values in columns.items()} for k in rows)
-    write_csv(out, text, list(columns))
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([name for name, _ in columns])
+    writer.writerows(["" if np.isnan(x) else str(x) for x in row] for row in zip(*(v for _, v in columns), strict=True))
+    write_atomically(out, text.getvalue())
     single = len(arrays["receiver_name"]) == 1
     return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}

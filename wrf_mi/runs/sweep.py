@@ -33,7 +33,7 @@ from .folder import CONFIG, METRICS, package_versions
 from .results import write_csv
 
 OPTIONS = (
-    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset"),
+    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset", "receiver"),
     *("paths", "depth", "reflections", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )

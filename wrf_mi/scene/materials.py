@@ -80,7 +80,7 @@ def read_materials(path: str | Path) -> Materials:
     file = Path(path)
     file = file / FILE if file.is_dir() else file
     content = read_yaml(file)
-    if not content or not set(content) <= {"rules", "surfaces", "thickness_m"}:
+    if content is None or not set(content) <= {"rules", "surfaces", "thickness_m"}:
         raise InputError(f"{file}: give the keys rules, surfaces and thickness_m, no others")
     parts = {key: content.get(key) or {} for key in ("rules", "surfaces", "thickness_m")}
     for key, part in parts.items():

@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
 PREFIX = "traced-csi-"  # of the names of the data sets
 MEASURED = "floor"  # folder beside the channels with the measured scene, the input of models
+CHUNK_SIZE = 100  # users that are traced together
 FORMAT = 2  # version of the files, to be raised when they change for equal parameters
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.437e9, 312.5e3, 26
@@ -179,8 +180,8 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     specular = TraceOptions(max_depth=walk.depth, max_reflections=walk.reflections, rays=walk.rays, **shared)
     rough = TraceOptions(scattering=True, max_depth=walk.scattered_depth, rays=walk.scattered_rays, **shared)
     frequencies = np.concatenate([UPLINK_HZ, DOWNLINK_HZ])
-    text = f"tracing {name}" if progress else None
-    channel = trace_channels(scene, receiver, positions, frequencies, (specular, rough), progress=text)
+    how: dict[str, Any] = {"chunk_size": CHUNK_SIZE, "progress": f"tracing {name}" if progress else None}
+    channel = trace_channels(scene, receiver, positions, frequencies, (specular, rough), **how)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(

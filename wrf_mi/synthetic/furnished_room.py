@@ -90,7 +90,7 @@ DEFAULT = TracedRoom()
 OPAQUE = "itu_metal"
 """Material of the edges that diffract. Sionna RT treats every sheet as opaque at its edges, and so overestimates the
 diffraction of thin boards, through which most of the wave passes."""
-CHUNK_SIZE = 100  # transmitters that are traced together
+CHUNK_SIZE = 200  # transmitters that are traced together
 
 
 def traced_room(
@@ -149,6 +149,7 @@ def trace_channels(
     frequencies_hz: FloatArray,
     options: Sequence[TraceOptions],
     opaque: Sequence[str] = (),
+    chunk_size: int = CHUNK_SIZE,
     progress: str | None = None,
 ) -> NDArray[np.complex128]:
     """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over searches for paths.
@@ -161,8 +162,8 @@ def trace_channels(
     for material in scene.radio_materials.values():
         material.scattering_coefficient = options[0].scattering_coefficient
     with Progress(console=Console(stderr=True), transient=True, disable=progress is None) as bar:
-        for start in bar.track(range(0, len(positions), CHUNK_SIZE), description=progress or ""):
-            part = positions[start : start + CHUNK_SIZE]
+        for start in bar.track(range(0, len(positions), chunk_size), description=progress or ""):
+            part = positions[start : start + chunk_size]
             ends = [Receiver(str(row), position, np.array(UPRIGHT)) for row, position in enumerate(part)]
             for search in options:
                 # The array searches, so that all positions see the same patches of rough wall and the same edges.
@@ -174,7 +175,7 @@ def trace_channels(
                     names = np.array([paths.object_names.index(name) for name in opaque if name in paths.object_names])
                     kept = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
                 part_channel = array_channels(paths.select(kept), receiver, receiver.array_m, frequencies_hz)
-                channel[start : start + CHUNK_SIZE] += part_channel
+                channel[start : start + chunk_size] += part_channel
     return channel
 
 
@@ -189,7 +190,7 @@ def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
     rough = TraceOptions(scattering=True, max_depth=room.scattered_depth, rays=room.scattered_rays, **shared)
     opaque = [name for name, (material, _) in furnished_parts().items() if material == OPAQUE]
     text = "tracing the furnished room" if progress else None
-    signals = trace_channels(scene, receiver, positions, frequency_hz, (exact, rough), opaque, text)[..., 0]
+    signals = trace_channels(scene, receiver, positions, frequency_hz, (exact, rough), opaque, progress=text)[..., 0]
     spectra = [minmax_scale(bartlett_spectrum(signal, array_m, FREQUENCY_HZ, 90, 360)) for signal in signals]
     rows = np.arange(len(positions))
     return Record(

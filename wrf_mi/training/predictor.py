@@ -127,7 +127,7 @@ class Predictor:
         if (tx_heading_rad is not None) != self.uses_heading:
             text = "needs headings; give heading_rad"
             if not self.uses_heading:
-                text = "does not know how the transmitter is turned; leave heading_rad away"
+                text = "does not know how the transmitter is turned; omit heading_rad"
             raise InputError(f"transmitter: the model {text}")
         if tx_heading_rad is None:
             return None

@@ -112,7 +112,7 @@ def make_step(
     """An optimiser step, recorded where the report can be recorded.
 
     Args:
-        report: report of a receiver (`wrf_mi.graph.Graph.report`).
+        report: report of a receiver (`wrf_mi.graph.graph.Graph.report`).
         rates: learning rate of each parameter.
         loss_of: loss of a batch.
         shape: shape of one observation.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -303,3 +304,9 @@ def test_a_single_row_is_refused(name, walk):
 def test_uplink_of_zeros_gives_a_downlink_of_zeros(walk):
     fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
     assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()
+
+
+@pytest.mark.parametrize("settings", [lambda: R2F2Settings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
+def test_unknown_words_are_refused_by_the_settings_themselves(settings: Callable[[], object]) -> None:
+    with pytest.raises(InputError, match="choose from"):
+        settings()
