@@ -86,7 +86,7 @@ def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[st
     np.savez(model, **{name: value for name, value in arrays.items() if name != key})
     refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "model.npz: format 99, this version reads 2; use the version that wrote it", capsys)
+    refused(asked, "model.npz: format 99, this version reads 3; use the version that wrote it", capsys)
 
 
 IN_TURN = """

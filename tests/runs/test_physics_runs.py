@@ -61,7 +61,7 @@ def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
     known = {"model": "physics", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
-    known |= {"format": 2, "task": "spectrum", "material": None, "deterministic": False}
+    known |= {"format": 3, "task": "spectrum", "material": None, "deterministic": False}
     assert known.items() <= config.items()
     assert (config["settings"]["directions"], config["settings"]["lengths"]) == (20, 2)
     record, arrays = load(waves), stored(run)

@@ -265,7 +265,7 @@ def test_damaged_models_are_refused(finished: Path, tmp_path: Path) -> None:
     with np.load(path) as held:
         arrays = dict(held)
     np.savez(path, **(arrays | {"run/format": np.asarray(99)}))
-    with pytest.raises(InputError, match="format 99, this version reads 2"):
+    with pytest.raises(InputError, match="format 99, this version reads 3"):
         predictor(run)
     path.unlink()
     with pytest.raises(InputError, match=r"model\.npz: missing"):
@@ -275,7 +275,7 @@ def test_damaged_models_are_refused(finished: Path, tmp_path: Path) -> None:
 def test_damaged_configurations_are_refused(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path / "run")
     path = run / "config.yaml"
-    for content in ("settings: [1", "just text", "", "format: 2\ndataset: x\n"):
+    for content in ("settings: [1", "just text", "", "format: 3\ndataset: x\n"):
         path.write_text(content)
         with pytest.raises(InputError, match=r"config\.yaml: not readable") as caught:
             resume(run)
