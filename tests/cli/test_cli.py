@@ -336,7 +336,7 @@ def test_demo_on_real_data(
     assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert f"pictures: {tmp_path / 'run' / 'compare' / 'index.html'}" in err
     page = (tmp_path / "run" / "compare" / "index.html").read_text()
-    for row in ("wrf-gs+", "ray-tracing", "blend of 4 nearest", "blend of 100 nearest"):
+    for row in ("wrf-gs+", "ray-tracing", "IDW of 4 nearest", "IDW of 100 nearest"):
         assert row in page
     assert json.loads((tmp_path / "run" / "traced" / "metrics.json").read_text())["task"] == "rssi"
 

@@ -80,7 +80,7 @@ def test_command_trains_as_the_function_does(
     status, table, err = call(["train", flat_folder, "--model", "mri", "--out", out], capsys)
     assert status == 0, err
     lines = table.splitlines()
-    assert [line.split()[0] for line in lines] == ["absolute", "mri", "blend", "split", "results:"]
+    assert [line.split()[0] for line in lines] == ["absolute", "mri", "IDW", "split", "results:"]
     assert err.splitlines() == ["mri: receivers"]
     np.testing.assert_array_equal(stored(out)["prediction"], stored(run)["prediction"])
     chosen = ["--set", "shared=true", "--n-train", "0.5", "--seed", 4, "--split", "random"]

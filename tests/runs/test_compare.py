@@ -171,7 +171,7 @@ def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     scores, references, label = calls[-1]
     assert label == "SSIM"
     assert list(scores) == ["a", "b", "c"]
-    assert list(references) == ["blend of 4 nearest, official", "blend of 4 nearest, official of c"]
+    assert list(references) == ["IDW of 4 nearest, official", "IDW of 4 nearest, official of c"]
 
 
 def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):

@@ -90,7 +90,7 @@ def test_command_trains_as_the_function_does(
     status, table, err = call(["train", waves, "--model", "physics", "--out", out, *SET], capsys)
     assert status == 0, err
     lines = table.splitlines()
-    assert [line.split()[0] for line in lines[:3]] == ["SSIM", "physics", "blend"]
+    assert [line.split()[0] for line in lines[:3]] == ["SSIM", "physics", "IDW"]
     assert lines[3].endswith("of the test values lie inside the predicted 90 % intervals")
     assert lines[-1] == f"results: {out}"
     assert "one: element signals of spectra" in err.splitlines()

@@ -95,7 +95,7 @@ class Task(ABC):
     @property
     def references(self) -> dict[str, str]:
         """Words for each possible reference by its key; the first that a run has is its headline."""
-        idw = {self.reference: f"blend of {self.neighbours} nearest"}
+        idw = {self.reference: f"IDW of {self.neighbours} nearest"}
         return {UPLINK: self.from_uplink} | idw if self.from_uplink else idw
 
     def headline(self, stored: Container[str]) -> str | None:
