@@ -89,7 +89,7 @@ def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, s
         pose = device_pose(receiver)
         for row in rows:
             gaussians = field.gaussians(tensors, to_tensor(record.tx_pos_m[row][:, None]))
-            total += removal(gaussians, pose, plane).numpy().astype(float)
+            total += removal(gaussians, pose, plane)
     return total / (len(rows) * len(record.receivers) * plane.pixels)
 
 
