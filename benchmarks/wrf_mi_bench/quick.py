@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from wrf_mi.backend import init
 from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
@@ -32,7 +34,7 @@ from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thr
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.step import CompiledPredictor, device_pose
+from wrf_mi.training.step import device_pose, grey
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, machine
@@ -98,7 +100,7 @@ def _batch() -> tuple[Call, Call]:
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     pose, plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
     positions = transmitter_path(count)[rng.permutation(count)]
-    together, alone = CompiledPredictor(trainer.field), CompiledPredictor(trainer.field)
+    together, alone = (Recorded(partial(grey, trainer.field)) for _ in range(2))
     dr.eval(params)
 
     def ours() -> Any:

@@ -22,7 +22,7 @@ from wrf_mi.gaussians.chunks import gaussians_in_parts
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.operator import weight_strips
 from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
-from wrf_mi.training import step
+from wrf_mi.training import predictor
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
@@ -120,8 +120,9 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.M
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
     recorded = Predictor(field, params, RECEIVERS, *SIZE)
     expected = recorded(tx)
-    monkeypatch.setattr(step, "CHUNK_SIZE", 1)
+    monkeypatch.setattr(predictor, "CHUNK_SIZE", 1)
     monkeypatch.setattr(tiles, "RESERVED", 0)
     parts = Predictor(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
-    assert parts._predict.n_recordings == 0 < recorded._predict.n_recordings
+    assert not parts._reports
+    assert recorded._reports[None].n_recordings > 0

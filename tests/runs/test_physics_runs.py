@@ -370,8 +370,8 @@ def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.Capt
 
 
 BAD_HEADINGS = {
-    "nan.csv": ("x,y,z,heading_rad\n0,0,0,nan\n", "heading_rad must be one finite number"),
-    "short.csv": ("x,y,z,heading_rad\n0,0,0\n", "row 1: '0,0,0' is not 4 numbers"),
+    "nan.csv": ("x,y,z,heading_rad\n0,0,0,nan\n", "row 1: heading_rad is 'nan'; give a finite number"),
+    "short.csv": ("x,y,z,heading_rad\n0,0,0\n", "row 1: 3 fields, but the header has 4"),
 }
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -26,6 +26,7 @@ from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
+from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component
 from ..gaussians.skip import NOTHING, Skip
@@ -193,14 +194,17 @@ class Graph:
         """Whether training moves receivers."""
         return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
-    def gaussians(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Gaussians:
-        """Gaussians of a batch in the receiver's unit, one signal each.
+    def gaussians(
+        self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None, chunked: bool = False
+    ) -> Gaussians:
+        """Gaussians of a batch in the receiver's unit, one signal each; ``chunked`` as in `report`.
 
         Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
         error of a mesh scales with its paths, near and far.
         """
         assert self.field is not None
-        gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
+        made = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
+        gaussians = by_component(made(params, batch.condition), self.form.components)
         if LEVEL not in params and batch.weight is None:
             return gaussians
         kind: Any = type(gaussians.signal[0])
@@ -218,7 +222,14 @@ class Graph:
             unit = dr.gather(kind, unit, dr.arange(mi.UInt32, count * each) // each)
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
-    def report(self, number: int, side: TracedField | None, learned: bool = True, skip: Skip = NOTHING) -> Report:
+    def report(
+        self,
+        number: int,
+        side: TracedField | None,
+        learned: bool = True,
+        skip: Skip = NOTHING,
+        chunked: bool = False,
+    ) -> Report:
         """Reports of a receiver as a function of parameters, for transmitters of a traced side.
 
         Args:
@@ -226,6 +237,7 @@ class Graph:
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
             skip: parts of the Gaussians that are not evaluated.
+            chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
         """
         model, receiver = self.models[number], self.receivers[number]
 
@@ -234,7 +246,7 @@ class Graph:
             if self.field is None or not learned:
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if self.moves_receivers else batch.pose
-            gaussians = self.gaussians(params, batch, paths)
+            gaussians = self.gaussians(params, batch, paths, chunked)
             return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
 
         return report

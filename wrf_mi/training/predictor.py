@@ -20,6 +20,7 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..gaussians.chunks import CHUNK_SIZE
 from ..gaussians.parameters import Gaussians
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import perception_plane
@@ -28,7 +29,7 @@ from ..graph.receivers import PIXEL, Form
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
 from .static_operator import StaticOperator, stands_still
-from .step import CompiledPredictor, Params, device_pose, evaluated
+from .step import Params, device_pose, evaluated
 
 if TYPE_CHECKING:
     from ..tracing.traced_field import TracedField
@@ -78,7 +79,8 @@ class Predictor:
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
         self._by_operator, self._store = operator and self._pixels and stands_still(field), store
-        self._reports: dict[int, Recorded] = {}
+        self._reports: dict[int | None, Recorded] = {}
+        self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
@@ -87,7 +89,6 @@ class Predictor:
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
             # A recording is valid for one number of Gaussians.
-            self._predict = None if self._field is None else CompiledPredictor(self._field, self._skip)
             self._count, self._reports = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
@@ -179,8 +180,17 @@ class Predictor:
         return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """Report for conditions [3 or features, at most `TOGETHER`], recorded, flat."""
-        if receiver not in self._reports:
+        """Report for conditions [3 or features, at most `TOGETHER`], flat.
+
+        It is recorded, except for so many Gaussians that networks run in chunks: recording saves nothing there, and
+        lists of tiles, which a recorded function cannot count, have room for all.
+        """
+        pose, count = self._poses[receiver], condition.shape[1]
+        if self._count * self._together > CHUNK_SIZE:
+            report = self.graph.report(receiver, None, skip=self._skip, chunked=True)
+            return evaluated(report, self._params, condition, receiver, pose, self._plane, weight=weight)
+        key = None if self._pixels else receiver  # one recording serves the pixels of all receivers
+        if key not in self._reports:
             report = self.graph.report(receiver, None, skip=self._skip)
 
             def predicted(params: Params, batch: Batch) -> Any:
@@ -188,17 +198,19 @@ class Predictor:
                     return report(params, batch)
 
             # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(report, self._params, condition[:, :1], receiver, self._poses[receiver], self._plane)
-            self._reports[receiver] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
+            evaluated(report, self._params, condition[:, :1], receiver, pose, self._plane)
+            self._reports[key] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
         # The batch size is a constant of the recorded kernels: copies fill the last batch.
-        count = condition.shape[1]
-        filled = np.minimum(np.arange(TOGETHER), count - 1)
-        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
+        filled = np.minimum(np.arange(self._together), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, self._together)
         dr.make_opaque(slots)
         weights = None if weight is None else to_float(weight[filled])
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, weights)
-        found = self._reports[receiver](self._params, batch)
-        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
+        found = self._reports[key](
+            self._params, Batch(tx, slots, dr.opaque(mi.UInt32, receiver), pose, self._plane, weights)
+        )
+        if count == self._together:
+            return found
+        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // self._together)))
 
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Reports for positions [m, 3] or features [m, features], complex numbers as such."""
@@ -227,7 +239,7 @@ class Predictor:
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
         out = np.empty((count, *shape), np.float32)
-        together = TOGETHER if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
+        together = self._together if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
         for start in range(0, count, together):
             part = slice(start, min(start + together, count))
             out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
@@ -277,15 +289,7 @@ class Predictor:
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
-        if not self._pixels:
-            given = np.asarray(tx_pos_m, float)
-            turned = self._headings(tx_heading_rad, len(given))
-            self.graph.check(given)
-            return self._reported(given, index, turned)
-        height, width = self._plane.height, self._plane.width
-        out = np.empty((len(positions), height, width), np.float32)
-        assert self._predict is not None, "a field of pixels"
-        for image, position in zip(out, positions, strict=True):
-            tx = to_tensor(position[:, None])
-            image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)
-        return out
+        given = np.asarray(tx_pos_m, float)
+        turned = self._headings(tx_heading_rad, len(given))
+        self.graph.check(given)
+        return self._reported(given, index, turned)
