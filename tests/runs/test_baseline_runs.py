@@ -246,7 +246,6 @@ def test_bad_calls_are_refused(
         (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
         ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
         ([*train, "--n-train", 0], "n_train 0; choose 1 to 24"),
-        ([*train, "--split", "nowhere"], "split 'nowhere'"),
         ([*train, "--set", "steps=3"], "unknown setting steps"),
         ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
         (
