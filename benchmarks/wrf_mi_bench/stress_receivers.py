@@ -24,8 +24,7 @@ from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.graph.evaluations import hemisphere_pair, learned_field
-from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
+from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers import array_response, bartlett_spectrum, csi, element_signals, minmax_scale
 from wrf_mi.tracing.traced_field import TracedPaths
@@ -35,7 +34,6 @@ from .stress_fields import (
     SIZE,
     ComplexArray,
     Family,
-    Field,
     cases,
     gradient_row,
     on_device,
@@ -70,8 +68,7 @@ def of_fields(random: int, of_each: int, families: Iterable[str] = FAMILIES) -> 
             truth, clear = reference(field, blending, SIZE, sphere=True)
             seen = (truth * clear).reshape(-1)
             gaussians = on_device(field, blending, mi.Float)[0]
-            errors = _by_model(gaussians, clear, seen) | _by_operator(gaussians, clear, seen, field)
-            for what, error in errors.items():
+            for what, error in _by_model(gaussians, clear, seen).items():
                 worst.setdefault(what, Worst()).add(error, name)
     return [one.row(f"receiver: {what}, {number} cases", IMAGE) for what, one in worst.items()]
 
@@ -100,26 +97,6 @@ def _by_model(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray
     return errors | {
         "RSSI": abs(float(10 ** (found["RSSI"][0] / 20)) - amplitude) / max(waves, amplitude),
         "CSI": float(np.abs(found["CSI"] - channel).max()) / waves,
-    }
-
-
-def _by_operator(gaussians: Gaussians, clear: NDArray[np.bool_], seen: ComplexArray, field: Field) -> dict[str, float]:
-    """Errors of the operators."""
-    plane, half = perception_plane(*SIZE, mi.Float), seen.size // 2
-    directions, weight = hemisphere_pair(*SIZE), np.tile(solid_angles(*SIZE), 2) * clear.reshape(-1)
-    ports = array_response(ELEMENTS_M, directions[:half], CARRIER_HZ).T * weight[:half]
-    operator = ArrayOperator(port_matrix(gaussians, pose(mi.Float), plane, ports), ELEMENTS_M, CARRIER_HZ, *SIZE)
-    h = ports @ seen[:half]
-    spectrum = bartlett_spectrum(h, ELEMENTS_M, CARRIER_HZ, *SIZE)
-    signal = field.signal[None]
-    sectors = SectorOperator(port_matrix(gaussians, pose(mi.Float), plane, weight[None], sphere=True))
-    waves, wave = float((weight * np.abs(seen)).sum()) or 1.0, (weight * seen).sum()
-    amplitude = np.sqrt(np.abs(wave) ** 2 + LEAST_POWER)
-    return {
-        "element signals by the operator": relative(operator.signals(signal)[0] - h, h),
-        "Bartlett spectrum by the operator": relative(operator.spectrum(signal)[0] - spectrum, spectrum),
-        "RSSI by the operator": abs(float(10 ** (sectors.power_db(signal)[0] / 20)) - amplitude)
-        / max(waves, amplitude),
     }
 
 

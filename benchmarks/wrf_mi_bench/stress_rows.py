@@ -40,7 +40,7 @@ STAGES = (
     ("images of random and hard fields", r"image,"),
     ("derivatives of images, float32 against float64", r"derivatives, "),
     ("derivatives of all models in float64, against differences", r"derivatives of (wrf|factorised)"),
-    ("receivers: spectra, RSSI, CSI, operators", r"receiver: (?!derivatives)"),
+    ("receivers: spectra, RSSI, CSI", r"receiver: (?!derivatives)"),
     ("derivatives of receivers", r"receiver: derivatives"),
     ("losses", r"loss: (?!.*differences)"),
     ("phase of paths to 10 km, rad", r"phase"),
