@@ -28,7 +28,7 @@ from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
 from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
-from .stress_traced import phases, traced_gradients
+from .stress_traced import phases
 
 PICTURE = Path("docs/images/numerics.png")
 """Picture of the error curves, written only in a checkout of the project."""
@@ -157,7 +157,6 @@ def main() -> dict[str, Any]:
         of_paths(25),
         *losses(10),
         *phases(),
-        *traced_gradients(),
         *joint(),
         *plugin_images(50, 5),
         *plugin_gradients(2),
@@ -178,7 +177,6 @@ QUICK: Sequence[Callable[[], list[Row]]] = (
     lambda: [of_paths(1)],
     lambda: losses(1),
     lambda: phases(5),
-    lambda: traced_gradients(2),
     lambda: joint(1, (COPLANAR, CANCELLING), ("RSSI",)),
     lambda: plugin_images(2, 1, 0),
     lambda: plugin_gradients(1, HARDEST[:1]),

@@ -39,9 +39,11 @@ from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
 from .stress_oracle import OraclePaths, TracedOracle, Values, slopes
 from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
-from .stress_traced import ROOM, box_sheets
+from .stress_traced import box_sheets
 
 HZ = 920e6
+ROOM = (6.0, 5.0, 3.0)
+"""Size of the room in metres."""
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
 ELEMENTS_M = planar_array(3, 3, 0.16)

@@ -44,7 +44,6 @@ STAGES = (
     ("derivatives of receivers", r"receiver: derivatives"),
     ("losses", r"loss: (?!.*differences)"),
     ("phase of paths to 10 km, rad", r"phase"),
-    ("derivatives of the tracer, against differences", r"derivatives of (Sionna|the traced)"),
     ("paths and Gaussians together", r"joint: (?!derivatives)"),
     ("derivatives of paths and Gaussians together, against float64", r"joint: derivatives"),
     ("Mitsuba plugins: images", r"plugin: image"),

@@ -16,7 +16,7 @@ from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
 from wrf_mi_bench.stress_receivers import derivatives, of_fields, of_paths
 from wrf_mi_bench.stress_rows import held, worst_of
-from wrf_mi_bench.stress_traced import phases, traced_gradients
+from wrf_mi_bench.stress_traced import phases
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
@@ -82,11 +82,6 @@ def test_fits_end_finite_or_name_the_group_that_is_not() -> None:
 def test_receivers_keep_their_bounds() -> None:
     hard = ("random", "needles, 1e6 to 1", "signals of 1e-15 to 1e15", "none")
     for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), of_paths(1)]:
-        assert held(row), row
-
-
-def test_derivatives_of_traced_fields_keep_their_bounds() -> None:
-    for row in traced_gradients(1):
         assert held(row), row
 
 
