@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from wrf_mi_bench import plan as bench_plan
-from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
+from wrf_mi_bench.bench import (
+    CASES,
+    CHECKS,
+    BenchFailed,
+    bench,
+    case_folder,
+    check_table,
+    own_table,
+    read_results,
+    table,
+)
 from wrf_mi_bench.check import main
 from wrf_mi_bench.pareto import fronts, read_points
 from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
+from wrf_mi.parallel import Scheduler, open_scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
@@ -87,6 +99,32 @@ def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: 
     assert json.loads((tmp_path / "out.json").read_text()) == figures
     line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
     assert line == "| mesh: walls | **0.9** | 0.8 |"
+
+
+@pytest.fixture(scope="module")
+def two() -> Iterator[Scheduler]:
+    with open_scheduler("local:2") as workers:
+        yield workers
+
+
+def test_bench_on_workers_writes_figures_and_reports_failures(
+    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A check that was measured before, and a run that cannot go on."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    folder = case_folder(runs, "flat-plan")
+    folder.mkdir(parents=True)
+    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
+    (folder / "check.json").write_text(json.dumps({"figures": figures}))
+    rows = bench(["flat-plan"], out, runs, two)
+    assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
+    assert rows[0]["figures"] == figures
+    assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
+    assert "cases that share a machine" in capsys.readouterr().err
+    case_folder(runs, "demo").mkdir()
+    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
+    with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
+        bench(["flat-plan", "demo"], out, runs, two)
 
 
 def test_documents_show_the_stored_results() -> None:
