@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -14,49 +13,27 @@ from numpy.typing import NDArray
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.backend.recorded import Recorded
-from wrf_mi.core import Receiver
 from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
-from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
 from wrf_mi.gaussians.operator import PixelOperator
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.static_signals import FactorisedSignals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.timing import Call, bootstrap, interleaved, memory_mb, ratio
+from wrf_mi.synthetic.laboratory import RECEIVER
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
 from .comparison import line
 from .stress_rows import relative
+from .workloads import HEIGHT, WIDTH, parameters
 
-GAUSSIANS, HEIGHT, WIDTH, BATCH = 10_000, 90, 360, 64
+GAUSSIANS, BATCH = 10_000, 64
 SIZE_DEG = 3.0
 """Angular standard deviation of each Gaussian: 115 weights a pixel."""
 SMALL = 270
 """Gaussians of the default fit."""
 REPEATS = 15
-RECEIVER = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-
-
-def random_field(
-    field: Any, count: int = GAUSSIANS, size_deg: float = SIZE_DEG, seed: int = 0
-) -> dict[str, NDArray[np.float32]]:
-    """Parameters of a field of ``count`` Gaussians of random shapes and rotations around the receiver."""
-    rng = np.random.default_rng(seed)
-    params = field.init(random_gaussians([RECEIVER], count, rng, size_deg=size_deg), rng)
-    params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
-    params["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
-    return dict(params)
-
-
-def processor_ms(call: Call, repeats: int = REPEATS) -> float:
-    """Median processor time of a call, which depends little on other processes."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        times.append(1e3 * (time.process_time() - start))
-    return float(np.median(times))
 
 
 class Direct:
@@ -121,7 +98,7 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
         "factorised, 270 Gaussians": (Factorised(), SMALL, 7.0),
     }
     for name, (field, count, size) in cases.items():
-        params = random_field(field, count, size)
+        params = parameters(field, count, size)
         direct = Direct(field, params)
         calls: dict[str, Call] = {
             "network": partial(direct.parts, tx[0]),
@@ -140,7 +117,7 @@ def main() -> dict[str, Any]:
     """Times, memory and differences, with rows for the table."""
     rng = np.random.default_rng(0)
     field = Factorised()
-    params = random_field(field)
+    params = parameters(field, GAUSSIANS, SIZE_DEG)
     direct = Direct(field, params)
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     gaussians = direct.gaussians(direct.parts(tx[0]))
@@ -162,21 +139,25 @@ def main() -> dict[str, Any]:
         calls[f"pixels, {count}"] = partial(spectra, tx[:many]), many
         stated = partial(pixels.magnitude, given[:many], SQUARED_MAGNITUDE_EPS)
         calls[f"pixels, signals of {GAUSSIANS:,} given, {count}"] = stated, many
-    raw = interleaved({name: call for name, (call, _) in calls.items()}, REPEATS, most_s=120)
+    alone = {name: call for name, (call, _) in calls.items()}
+    raw, processor = interleaved(alone, REPEATS, most_s=120), interleaved(alone, REPEATS, most_s=60, processor=True)
     each = {name: raw[name] / many for name, (_, many) in calls.items()}
     times = {name: bootstrap(ms) for name, ms in each.items()}
     rows = [
-        line(name, f"{times[name]} ms; processors {processor_ms(call) / many:.3g} ms")
-        for name, (call, many) in calls.items()
+        line(name, f"{times[name]} ms; processors {np.median(processor[name]) / many:.3g} ms")
+        for name, (_, many) in calls.items()
     ]
     for what, name in (("pixels", "pixels, one transmitter"), (f"pixels, {BATCH}", f"pixels, each of {BATCH}")):
-        rows.append(line(f"times faster than direct: {what}", str(ratio(raw["direct, pixels"], each[name]))))
+        rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [
         line("building: pixels", f"{built} ms, {built_mb:.0f} MB beside its result"),
         line("size: pixels", f"{pixels.nbytes / 1e6:.2g} MB"),
         line("size: pixels, composed", f"{images.table.nbytes / 1e6:.2g} MB"),
     ]
-    for name, kind, values in (("alpha", field, params), ("product", WrfGs(), random_field(WrfGs()))):
+    for name, kind, values in (
+        ("alpha", field, params),
+        ("product", WrfGs(), parameters(WrfGs(), GAUSSIANS, SIZE_DEG)),
+    ):
         error = difference(kind, values, tx[0])
         rows.append(line(f"relative L2 difference from direct, {name} blending", f"pixels {error:.1e}", "1e-4"))
     for name, shares in of_networks(rng).items():
