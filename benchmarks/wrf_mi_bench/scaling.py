@@ -17,7 +17,7 @@ from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.gaussians import FIELDS, InitialGaussians, random_gaussians
+from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.chunks import gaussians_in_parts
 from wrf_mi.receivers import bartlett_spectrum, element_signals
 from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
@@ -29,7 +29,7 @@ from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line
-from .workloads import HEIGHT, WIDTH, field, integrator, physics, size_deg, splatting, tracer
+from .workloads import HEIGHT, WIDTH, field, integrator, parameters, physics, size_deg, splatting, tracer
 
 logger = logging.getLogger(__name__)
 
@@ -79,14 +79,10 @@ def _directions(make: Callable[..., Call], count: int, directions: int) -> Call:
     return make(count, HEIGHT * finer, WIDTH * finer)
 
 
-def _start(count: int) -> InitialGaussians:
-    return random_gaussians([RECEIVER], count, np.random.default_rng(0), size_deg=size_deg(count))
-
-
 def _networks(count: int) -> Call:
     """Geometry and signals of WRF-GS+ for one transmitter."""
     field = FIELDS["wrf-gs+"]()
-    params = {k: to_tensor(v) for k, v in field.init(_start(count), np.random.default_rng(0)).items()}
+    params = {name: to_tensor(values) for name, values in parameters(field, count, size_deg(count)).items()}
     tx = to_tensor(transmitter_path(1).T)
     return lambda: vars(gaussians_in_parts(field, params, tx))
 
@@ -94,7 +90,7 @@ def _networks(count: int) -> Call:
 def _field(transmitters: int) -> Call:
     tx = transmitter_path(transmitters)
     field = make_field(TrainConfig().resolved(tx))
-    predictor = Predictor(field, field.init(_start(SMALL), np.random.default_rng(0)), [RECEIVER], HEIGHT, WIDTH)
+    predictor = Predictor(field, parameters(field, SMALL, size_deg(SMALL)), [RECEIVER], HEIGHT, WIDTH)
     return lambda: predictor(tx)
 
 

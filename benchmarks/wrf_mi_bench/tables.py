@@ -36,7 +36,7 @@ from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, machine, run_command, threads
 from .comparison import data_folder
-from .physics_csi import SCANNED, scanned_scene
+from .scene import SCANNED, scanned_scene
 from .table_pages import read_rows, write_tables
 from .table_plan import NAMED, Part, Row, available, plan
 
@@ -104,7 +104,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         print(f"tables: {row.name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
     else:
         # Ray tracing takes seconds and cannot be resumed.
-        resumes = row.method != "ray-tracing"
+        resumes = not row.method.startswith("ray-tracing")
         if folder.exists() and not (resumes and (folder / CONFIG).exists()):
             shutil.rmtree(folder)  # stopped before its configuration was written
         wall = run_command(row.arguments(scene), folder, resumes=resumes)

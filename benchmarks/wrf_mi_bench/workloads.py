@@ -7,10 +7,12 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import Record
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.models.physics.selection import kind_of
@@ -57,6 +59,15 @@ def integrator(gaussians: Any, receiver: Any) -> Call:
 def field(count: int, size: float | None = None, opacity: float = 0.4) -> Any:
     """Random Gaussians and their receiver."""
     return random_field(0, "alpha", count, size_deg(count) if size is None else size, opacity=opacity)
+
+
+def parameters(model: Any, count: int, size: float, seed: int = 0) -> dict[str, NDArray[np.float32]]:
+    """Initial parameters of a field, with Gaussians of random shapes and rotations around `RECEIVER`."""
+    rng = np.random.default_rng(seed)
+    params = model.init(random_gaussians([RECEIVER], count, rng, size_deg=size), rng)
+    params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
+    params["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
+    return dict(params)
 
 
 def tracer(options: TraceOptions) -> RayTracer:

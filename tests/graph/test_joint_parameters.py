@@ -20,7 +20,7 @@ from wrf_mi.graph.combine import PowerReceiver
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.material_parameters import physical
-from wrf_mi.tracing.materials import BELOW_1_GHZ, with_materials
+from wrf_mi.tracing.materials import BELOW_1_GHZ
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig, calibration_config, default_config
@@ -197,18 +197,6 @@ def test_documented_training_runs(capsys: pytest.CaptureFixture[str]) -> None:
     permittivity, error = (float(line) for line in capsys.readouterr().out.split())
     assert 1 < permittivity < 10
     assert 0 < error < 1
-
-
-def test_materials_are_replaced_for_a_block_only(tmp_path: Path) -> None:
-    scene = room(tmp_path, WALLS)
-    concrete = scene.radio_materials["itu_concrete"]
-    before, callback = float(np.ravel(concrete.relative_permittivity)[0]), concrete.frequency_update_callback
-    with with_materials(scene, {"itu_concrete": (7.0, 0.2)}):
-        assert float(np.ravel(concrete.relative_permittivity)[0]) == 7
-    assert float(np.ravel(concrete.relative_permittivity)[0]) == before
-    assert concrete.frequency_update_callback is callback
-    with pytest.raises(InputError, match="no radio material 'itu_ice'"), with_materials(scene, {"itu_ice": (3, 0)}):
-        pass
 
 
 def test_resumed_fit_keeps_its_paths(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The linear map from signals to pixels, array elements and sectors: equal to blending on hard fields, and linear."""
+"""The linear map from signals to pixels: equal to blending on hard fields, and linear."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
-from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import (
     Gaussians,
     oracle,
@@ -23,20 +21,12 @@ from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights, weight_strips
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import ArrayReceiver, PowerReceiver
-from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.graph.operator import ArrayOperator, SectorOperator, sector_of
-from wrf_mi.receivers import bartlett_spectrum, minmax_scale
+from wrf_mi.receivers import minmax_scale
 
 SINGLE = 1e-5
 """Relative L2 error in float32: the weights are the same numbers, a sum of some hundred terms in another order."""
-ARRAY = 1e-4
-"""What is asked of spectra of an array: sums over thousands of directions that nearly cancel at its elements, in single
-precision on the other side."""
 DOUBLE = 1e-12
 """The same arithmetic in another order."""
-DECIBEL = 1e-3
-"""Of a power whose amplitude is good to 1e-4."""
 
 Float64 = dr.float64_array_t(mi.Float)
 RECEIVER = Receiver(
@@ -157,12 +147,9 @@ def test_no_gaussians(product: bool) -> None:
     )
     parts = ([none() for _ in range(k)] for k in (3, 3, 4, 2))
     empty = Gaussians(*parts, **blending, batch=1)
-    pose, plane = pose_of(mi.Float), perception_plane(23, 61, mi.Float)
-    operator = PixelOperator.of(empty, pose, plane)
+    operator = PixelOperator.of(empty, pose_of(mi.Float), perception_plane(23, 61, mi.Float))
     assert operator.weights.shape == (23 * 61, 0)
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()
-    array = ArrayOperator.of(empty, pose, plane, planar_array(2, 2, 0.16), 920e6)
-    assert not array.spectrum(np.zeros((1, 0), np.complex64)).any()
 
 
 def test_batches_and_factors() -> None:
@@ -183,64 +170,6 @@ def test_batches_and_factors() -> None:
     a, b = signals[:1], signals[1:2]
     mixed = operator.field(2 * a - 3j * b)
     assert error(mixed, 2 * operator.field(a) - 3j * operator.field(b)) < SINGLE
-
-
-@pytest.mark.parametrize("scale", [False, True])
-@pytest.mark.parametrize("product", [True, False])
-def test_array_operator_matches_quadrature_and_bartlett(product: bool, scale: bool) -> None:
-    gaussians, signal = hard(product, mi.Float)
-    elements, pose, plane = planar_array(4, 4, 0.16), pose_of(mi.Float), perception_plane(90, 360, mi.Float)
-    operator = ArrayOperator.of(gaussians, pose, plane, elements, 920e6)
-    model = ArrayReceiver(90, 360, elements, 920e6, instrument_scale=scale)
-    direct = model(None, splat(gaussians, pose, plane)).numpy().reshape(90, 360)
-    assert error(operator.spectrum(signal[None], scale)[0], direct) < ARRAY
-    factors = np.stack([signal, signal.conj(), 1j * signal], axis=1)
-    c = np.array([[0.5, 0, -0.5j], [1, 2, 3j]])
-    assert error(operator.composed(factors).spectrum(c), operator.spectrum(c @ factors.T)) < SINGLE
-
-
-@pytest.mark.parametrize("arrangement", ["even", "off its origin", "with a middle", "not mirrored"])
-def test_spectrum_of_element_signals(arrangement: str) -> None:
-    """With the identity for a matrix, the spectrum is the processor's of its input."""
-    elements = {
-        "even": planar_array(2, 4, 0.16),
-        "off its origin": planar_array(2, 4, 0.16) + np.array([0.3, -0.2, 0.1]),
-        "with a middle": planar_array(3, 3, 0.16),
-        "not mirrored": planar_array(3, 2, 0.16)[:-1],
-    }[arrangement]
-    rng = np.random.default_rng(4)
-    h = rng.standard_normal((5, len(elements))) + 1j * rng.standard_normal((5, len(elements)))
-    operator = ArrayOperator(np.eye(len(elements)), elements, 920e6, 20, 31)
-    expected = bartlett_spectrum(h, elements, 920e6, 20, 31)
-    assert error(operator.spectrum(h), expected) < SINGLE
-    assert error(operator.spectrum(h[:1]), expected[:1]) < SINGLE
-
-
-@pytest.mark.parametrize("product", [True, False])
-def test_sectors(product: bool) -> None:
-    gaussians, signal = hard(product, mi.Float)
-    pose, plane = pose_of(mi.Float), perception_plane(30, 90, mi.Float)
-    sphere = learned_field(gaussians, pose, plane, sphere=True)
-    one = SectorOperator.of(gaussians, pose, plane)
-    expected = PowerReceiver(30, 90, (920e6,))(None, sphere).numpy()
-    np.testing.assert_allclose(one.power_db(signal[None]), expected, atol=DECIBEL)
-    # Powers of sectors by hand: the lower hemisphere's directions are mirrored in y and z.
-    upper = pixel_directions(30, 90).reshape(-1, 3)
-    directions = np.concatenate([upper, upper * [1, -1, -1]])
-    elevation = np.abs(np.arcsin(np.clip(directions[:, 2], -1, 1)))
-    weight = np.cos(elevation) * (np.pi / 60) * (2 * np.pi / 90) * np.where(elevation < 1e-9, 0.5, 1)
-
-    def pattern(unit: FloatArray) -> FloatArray:
-        return np.sqrt(np.maximum(unit[..., 2], 0))
-
-    field = complex_of(sphere) * weight * pattern(directions)
-    inside = sector_of(directions, 6, 4)
-    assert set(inside) == set(range(24))
-    power = sum(abs(field[inside == s].sum()) ** 2 for s in range(24))
-    many = SectorOperator.of(gaussians, pose, plane, 6, 4, pattern)
-    np.testing.assert_allclose(many.power_db(signal[None]), 10 * np.log10(power), atol=DECIBEL)
-    both = many.composed(np.stack([signal, 1j * signal], axis=1)).power_db(np.array([[1, 0], [0, 2]]))
-    np.testing.assert_allclose(both, 10 * np.log10(power * np.array([1, 4])), atol=DECIBEL)
 
 
 def test_operator_refuses_excess_memory_and_several_transmitters() -> None:
