@@ -17,7 +17,7 @@ from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
 from wrf_mi.gaussians.operator import PixelOperator
 from wrf_mi.gaussians.render import splat
-from wrf_mi.gaussians.static_signals import FactorisedSignals
+from wrf_mi.gaussians.static_signals import static_signals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.timing import Call, bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.synthetic.laboratory import RECEIVER
@@ -126,13 +126,13 @@ def main() -> dict[str, Any]:
         return PixelOperator.of(gaussians, direct.pose, direct.plane)
 
     built, built_mb, pixels = bootstrap(interleaved({"": build}, 5)[""]), memory_mb(build), build()
-    signals = FactorisedSignals(field, params)
-    assert signals.factors is not None
-    images = pixels.composed(signals.factors)
-    given = (signals.coefficients(tx) @ signals.factors.T).astype(np.complex64)
+    factors, coefficients = static_signals(field, params)
+    assert factors is not None
+    images = pixels.composed(factors)
+    given = (coefficients(tx) @ factors.T).astype(np.complex64)
 
     def spectra(tx_pos_m: NDArray[Any]) -> NDArray[Any]:
-        return images.magnitude(signals.coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
+        return images.magnitude(coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
 
     calls: dict[str, tuple[Call, int]] = {"direct, pixels": (partial(direct.pixels, tx[0]), 1)}
     for count, many in (("one transmitter", 1), (f"each of {BATCH}", BATCH)):
