@@ -17,10 +17,10 @@ from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.training.step import device_pose
 
 Float64: Any = dr.float64_array_t(mi.Float)
 ROUNDING = 1e-9
@@ -44,8 +44,7 @@ def gaussians_of(field: Field, blending: str) -> Gaussians:
 def render(field: Field, blending: str, receiver: Receiver = RECEIVER) -> np.ndarray:
     """In float64, [height, width]."""
     gaussians = gaussians_of(field, blending)
-    pose = Pose([Float64(x) for x in receiver.position_m], [[Float64(x) for x in row] for row in receiver.to_world])
-    re, im = splat(gaussians, pose, perception_plane(*SIZE, Float64))
+    re, im = splat(gaussians, device_pose(receiver, Float64), perception_plane(*SIZE, Float64))
     return (re.numpy() + 1j * im.numpy()).reshape(SIZE)
 
 
@@ -78,15 +77,6 @@ def test_rotation_of_the_receiver_about_its_normal_shifts_azimuths(field: Field,
     own = Rotation.from_quat(RECEIVER.orientation_xyzw) * spin
     shifted = render(field, blending, replace(RECEIVER, orientation_xyzw=own.as_quat()))
     alike(np.roll(render(field, blending), -columns, axis=1), shifted)
-
-
-@FEW
-@given(FIELDS, st.sampled_from(BLENDINGS), st.randoms(use_true_random=False))
-def test_splat_is_invariant_to_the_order_of_gaussians(field: Field, blending: str, random: Any) -> None:
-    order = list(range(len(field["signal"])))
-    random.shuffle(order)
-    mixed = {name: values[order] for name, values in field.items()}
-    alike(render(field, blending), render(mixed, blending))
 
 
 @FEW

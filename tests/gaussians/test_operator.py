@@ -17,10 +17,10 @@ from wrf_mi.gaussians import (
     Gaussians,
     oracle,
 )
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.training.step import device_pose
 
 SINGLE = 1e-5
 """Relative L2 error in float32: the weights are the same numbers, a sum of some hundred terms in another order."""
@@ -32,13 +32,6 @@ RECEIVER = Receiver(
     "gateway1", np.array([5.0, 0.26, 0.0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
 SIZES = [(90, 360), (23, 61)]
-
-
-def pose_of(float_type: Any) -> Pose:
-    return Pose(
-        [float_type(float(x)) for x in RECEIVER.position_m],
-        [[float_type(float(x)) for x in row] for row in RECEIVER.to_world],
-    )
 
 
 def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Gaussians, np.ndarray]:
@@ -82,7 +75,7 @@ def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, in
     floats = mi.Float if single else Float64
     gaussians, signal = hard(product, floats)
     plane = perception_plane(*size, floats)
-    operator = PixelOperator.of(gaussians, pose_of(floats), plane)
+    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, floats), plane)
     assert (
         operator.weights.dtype
         == {
@@ -92,7 +85,7 @@ def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, in
             (False, False): np.float64,
         }[single, product]
     )
-    direct = complex_of(splat(gaussians, pose_of(floats), plane))
+    direct = complex_of(splat(gaussians, device_pose(RECEIVER, floats), plane))
     assert error(operator.field(signal[None])[0], direct) < (SINGLE if single else DOUBLE)
     spectrum = operator.magnitude(np.stack([signal, 2 * signal]))
     assert error(spectrum[1].ravel(), 2 * np.abs(direct)) < (SINGLE if single else DOUBLE)
@@ -101,7 +94,7 @@ def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, in
 @pytest.mark.parametrize("product", [True, False])
 def test_weights_match_the_oracle(product: bool) -> None:
     gaussians, signal = hard(product, Float64)
-    weights = pixel_weights(gaussians, pose_of(Float64), perception_plane(45, 120, Float64))
+    weights = pixel_weights(gaussians, device_pose(RECEIVER, Float64), perception_plane(45, 120, Float64))
 
     def columns(parts: Any) -> np.ndarray:
         return np.stack([p.numpy() for p in parts], axis=1)
@@ -119,8 +112,8 @@ def test_weights_match_the_oracle(product: bool) -> None:
 def test_any_field_and_size(seed: int, product: bool, height: int, width: int) -> None:
     gaussians, signal = hard(product, Float64, n=12, seed=seed)
     plane = perception_plane(height, width, Float64)
-    weights = pixel_weights(gaussians, pose_of(Float64), plane)
-    direct = complex_of(splat(gaussians, pose_of(Float64), plane))
+    weights = pixel_weights(gaussians, device_pose(RECEIVER, Float64), plane)
+    direct = complex_of(splat(gaussians, device_pose(RECEIVER, Float64), plane))
     np.testing.assert_allclose(weights @ signal, direct, atol=1e-12 * np.abs(signal).sum())
 
 
@@ -129,7 +122,7 @@ def test_operator_without_visible_gaussians_is_zero() -> None:
     gaussians, signal = hard(False, mi.Float)
     below = RECEIVER.position_m - 90 * RECEIVER.to_world[:, 2]
     gaussians.position = [mi.Float([float(c)] * 40) for c in below]
-    operator = PixelOperator.of(gaussians, pose_of(mi.Float), perception_plane(23, 61, mi.Float))
+    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     assert operator.weights.nnz == 0
     assert not operator.magnitude(signal[None]).any()
 
@@ -146,7 +139,7 @@ def test_no_gaussians(product: bool) -> None:
     )
     parts = ([none() for _ in range(k)] for k in (3, 3, 4, 2))
     empty = Gaussians(*parts, **blending, batch=1)
-    operator = PixelOperator.of(empty, pose_of(mi.Float), perception_plane(23, 61, mi.Float))
+    operator = PixelOperator.of(empty, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     assert operator.weights.shape == (23 * 61, 0)
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()
 
@@ -154,7 +147,7 @@ def test_no_gaussians(product: bool) -> None:
 def test_batches_and_factors() -> None:
     """More transmitters than a block, one by one and together, through factors and without; all linear."""
     gaussians, _ = hard(True, mi.Float)
-    operator = PixelOperator.of(gaussians, pose_of(mi.Float), perception_plane(23, 61, mi.Float))
+    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     rng = np.random.default_rng(1)
     factors, c = (
         (rng.standard_normal(s) + 1j * rng.standard_normal(s)).astype(np.complex64)
@@ -174,7 +167,7 @@ def test_operator_refuses_excess_memory_and_several_transmitters() -> None:
     gaussians, _ = hard(False, mi.Float)
     plane = perception_plane(23, 61, mi.Float)
     with pytest.raises(MemoryError, match="weights of 40 Gaussians take more than 0 MB"):
-        pixel_weights(gaussians, pose_of(mi.Float), plane, 1000)
+        pixel_weights(gaussians, device_pose(RECEIVER, mi.Float), plane, 1000)
     gaussians.batch = 2
     with pytest.raises(ValueError, match="for 2 transmitters; give those of one"):
-        pixel_weights(gaussians, pose_of(mi.Float), plane)
+        pixel_weights(gaussians, device_pose(RECEIVER, mi.Float), plane)

@@ -96,20 +96,17 @@ class Predictor:
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
-        return self._gaussians.gaussians(self._params, to_tensor(columns)).spread()
-
-    @property
-    def _gaussians(self) -> Field:
         if self._field is None:
             raise ValueError("paths alone: there are no Gaussians")
-        return self._field
+        return self._field.gaussians(self._params, to_tensor(columns)).spread()
 
     def static_geometry(self) -> StaticOperator:
         """The field as operators; rebuilt when parameters change."""
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
+            assert self._field is not None, "an operator needs Gaussians"
             size = self._plane.height, self._plane.width
-            self._still = StaticOperator(self._gaussians, params, self.receivers, *size, self._store)
+            self._still = StaticOperator(self._field, params, self.receivers, *size, self._store)
         return self._still
 
     @property
@@ -137,15 +134,6 @@ class Predictor:
             raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
         return heading
 
-    def _traced(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
-    ) -> Any:
-        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
-        side = self.graph.trace(tx_pos_m, receiver, heading_rad)
-        if side is not None:
-            side.refresh(self._params)
-        return self._evaluated(tx_pos_m, receiver, side, None, weight)
-
     def _evaluated(
         self,
         tx_pos_m: FloatArray,
@@ -154,6 +142,7 @@ class Predictor:
         slots: IntArray | None,
         weight: NDArray[Any] | None,
     ) -> Any:
+        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         learned = side is None or weight is None or bool(np.any(weight))
         report, pose = self.graph.report(receiver, side, learned, self._skip), self._poses[receiver]
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
@@ -229,7 +218,10 @@ class Predictor:
             weights = None if weight is None else weight[part]
             if self._recordable:
                 return self._learned(given[part].T, receiver, weights)
-            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], weights)
+            side = self.graph.trace(given[part], receiver, None if heading_rad is None else heading_rad[part])
+            if side is not None:
+                side.refresh(self._params)
+            return self._evaluated(given[part], receiver, side, None, weights)
 
         return self._in_parts(len(given), receiver, evaluate)
 

@@ -36,11 +36,11 @@ CENTRES = "position"
 """Parameter [3, n] of every field with Gaussians."""
 
 
-def device_pose(receiver: Receiver) -> Pose:
-    """A receiver's pose as opaque device arrays."""
+def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
+    """A receiver's pose as opaque device arrays of ``float_type``, by default ``mi.Float``."""
 
     def number(x: float) -> Any:
-        return dr.opaque(mi.Float, float(x))
+        return dr.opaque(float_type or mi.Float, float(x))
 
     return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
 
