@@ -38,7 +38,7 @@ def make_run(
         truth=truth,
         tx_pos=np.zeros((len(rows), 3)),
         reference_idw4=blend.astype(np.float32),
-        **({} if receivers is None else {"receiver_name": [f"gateway{r}" for r in range(receivers)]}),
+        receiver_name=[f"gateway{r}" for r in range(receivers or 1)],
     )
     metrics = {
         "task": "spectrum",

@@ -227,14 +227,6 @@ def test_number_of_rays_is_searched_once_for_a_run(
     assert len(calls) == 1
 
 
-def test_every_block_is_held_out_in_turn(flat_folder: Path, room: Path, tmp_path: Path) -> None:
-    out = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked").folder
-    read = read_run(out)
-    assert sorted(read.row) == list(range(len(load(flat_folder))))
-    assert len(list(out.glob("fold*/split.npz"))) == 5
-    assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
-
-
 def test_command_traces_predicts_and_compares(
     flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

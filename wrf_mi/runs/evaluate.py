@@ -89,7 +89,8 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     truth, broken = scorable(record.scored[:, rows])
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    found = [_prediction(predict(rows, receiver)) for receiver in range(len(truth))]
+    given = [predict(rows, receiver) for receiver in range(len(truth))]
+    found = [one if isinstance(one, Prediction) else Prediction(one) for one in given]
     arrays = {
         "row": rows,
         "prediction": np.stack([prediction.mean for prediction in found]).astype(truth.dtype),
@@ -107,10 +108,6 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "ms_per_sample": _milliseconds_per_sample(single or predict, rows),
     }
     return metrics, arrays
-
-
-def _prediction(found: NDArray[Any] | Prediction) -> Prediction:
-    return found if isinstance(found, Prediction) else Prediction(found)
 
 
 def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
-from .static_operator import StaticOperator, stands_still
+from .static_operator import StaticOperator
 from .step import Params, device_pose, evaluated
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Predictor:
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
-        self._by_operator, self._store = operator and self._pixels and stands_still(field), store
+        self._by_operator, self._store = operator and self._pixels and getattr(field, "static_geometry", False), store
         self._reports: dict[int | None, Recorded] = {}
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None

@@ -35,11 +35,6 @@ MOST_BYTES = 1 << 30
 """Largest size of one receiver's weights; larger fields are evaluated directly."""
 
 
-def stands_still(field: Any) -> bool:
-    """Whether geometry and attenuation of a field are the same for all transmitters."""
-    return bool(getattr(field, "static_geometry", False))
-
-
 class StaticOperator:
     """A field with static geometry at receivers, evaluated by operators that ``folder`` caches (None: memory only)."""
 
