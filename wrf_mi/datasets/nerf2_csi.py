@@ -104,7 +104,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         truth = _read_channels(folder / TRUTH)[None]
         if truth.shape[1:] != (n, antennas, half):
             text = f"shape {list(truth.shape[1:])}, expected {[n, antennas, half]}"
-            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}")
+            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}; correct it")
     return Record(
         name=name or folder.resolve().name,
         task="csi",
