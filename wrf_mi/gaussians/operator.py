@@ -247,13 +247,12 @@ class _Operator(ABC):
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
 
-    def magnitude(self, signals: ArrayLike, dark: float = 0.0, scale: bool = False) -> NDArray[Any]:
+    def magnitude(self, signals: ArrayLike, dark: float = 0.0) -> NDArray[Any]:
         """Spectra sqrt(|R|^2 + dark), [batch, height, width].
 
         Args:
             signals: complex numbers [batch, K].
             dark: constant added to squares.
-            scale: each spectrum to its own minimum and maximum, as `wrf_mi.receivers.minmax_scale`.
         """
         rows = np.asarray(signals)
         single = self.kind == np.complex64
@@ -264,11 +263,6 @@ class _Operator(ABC):
             if dark:
                 to += to.dtype.type(dark)
             np.sqrt(to, out=to)
-            if scale:
-                low = to.min(axis=1, keepdims=True)
-                span = to.max(axis=1, keepdims=True) - low
-                to -= low
-                to *= np.divide(1, span, out=np.zeros_like(span), where=span > 0)
 
         in_blocks(block, rows, out)
         return out.reshape(len(rows), self.height, self.width)
@@ -290,14 +284,12 @@ class Images(_Operator):
         self.table: NDArray[Any] = np.concatenate([values.real, values.imag])
         self.kind, self.height, self.width = np.result_type(self.table.dtype, np.complex64), height, width
 
-    def rows(self, coefficients: NDArray[Any]) -> NDArray[Any]:
-        """Rows whose product with ``table`` are the real parts of R, then the imaginary ones, [2 * batch, ...]."""
-        re, im = coefficients.real, coefficients.imag
-        return np.block([[re, -im], [im, re]])
-
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
-        rows = self.rows(np.asarray(signals, self.kind))
+        coefficients = np.asarray(signals, self.kind)
+        re, im = coefficients.real, coefficients.imag
+        # Their products with the table are the real parts of R, then the imaginary ones.
+        rows = np.block([[re, -im], [im, re]])
         # For one transmitter two products with a vector: OpenBLAS takes 1.7 times as long for a matrix of two rows.
         both: NDArray[Any] = np.stack([row @ self.table for row in rows]) if len(rows) == 2 else rows @ self.table
         np.multiply(both, both, out=both)
