@@ -29,7 +29,6 @@ from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.folder import versions
 from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
@@ -37,7 +36,7 @@ from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.step import device_pose, grey
 from wrf_mi.training.trainer import Trainer
 
-from .bench import BenchFailed, machine
+from .bench import BenchFailed, provenance
 from .stock import StockRenderer, rgb_variant
 from .workloads import HEIGHT, WIDTH, field, integrator, physics, record, splatting, tracer
 
@@ -194,9 +193,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
         "title": "interleaved pairs",
         "command": f"wrf-mi bench --quick --backend {init().name} --store",
         "wall_seconds": time.perf_counter() - start,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine(),
-        "versions": versions(),
+        **provenance(),
         "figures": {"ratios": found},
     }
     if stored is None:

@@ -34,7 +34,7 @@ from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.pose import receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
-from .stress_oracle import OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
+from .stress_oracle import ComplexArray, OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
 from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst
 from .stress_traced import box_sheets
 
@@ -169,10 +169,7 @@ class _Joint:
             self._cancel()
 
     def _cancel(self) -> None:
-        model, name = MODELS["RSSI"], self._traced.gain_name
-        learned = self._learned(model, self._values, DOUBLE)
-        there = model.signals(None, learned)[1]
-        wave = complex(there[0].numpy()[0], there[1].numpy()[0])
+        name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
         here = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
         factor = -wave / here * (1 + LEFT)
         gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
@@ -182,11 +179,8 @@ class _Joint:
         """Values and derivatives of the receiver models."""
         value, slope = Worst(), GradientWorst()
         references = {kind: _Reference(self, MODELS[kind]) for kind in models}
-        weights = {
-            kind: np.random.default_rng(3).normal(size=len(self._traced) * int(np.prod(MODELS[kind].shape)))
-            for kind in references
-        }
-        weights = {kind: weight.astype(np.float32) for kind, weight in weights.items()}
+        counts = {kind: len(self._traced) * int(np.prod(MODELS[kind].shape)) for kind in references}
+        weights = {kind: np.random.default_rng(3).normal(size=n).astype(np.float32) for kind, n in counts.items()}
 
         def functionals(values: Values) -> FloatArray:
             paths = self._oracle(values)
@@ -211,10 +205,15 @@ class _Joint:
             return values - self._case.receiver.position_m[:, None] if name == "field.position" else values
         return np.full(self._values[name].shape, _natural(name))
 
-    def _learned(self, model: Any, values: Values, kind: Any) -> Any:
-        return self._learned_of(model, {name: _tensor(value, kind) for name, value in values.items()}, kind)
+    def learned(self, model: Any) -> ComplexArray:
+        """Learned signals [n, directions or ports] in float64."""
+        re, im = self._learned(model, self._params(DOUBLE), DOUBLE)
+        return ORACLE.learned(model, (re.numpy() + 1j * im.numpy()).reshape(len(self._traced), -1))
 
-    def _learned_of(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
+    def _params(self, kind: Any) -> dict[str, Any]:
+        return {name: _tensor(value, kind) for name, value in self._values.items()}
+
+    def _learned(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
         weights = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
         gaussians = self._field.gaussians(weights, _tensor(self._case.tx_pos_m.T, kind))
         pose = receiver_pose(self._case.receiver, params, kind)
@@ -224,10 +223,10 @@ class _Joint:
         self, model: Any, weight: Any, kind: Any, learned_alone: bool = False
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Report, and derivatives of its weighted sum, by both sides or with constant paths."""
-        params = {name: _tensor(value, kind) for name, value in self._values.items()}
+        params = self._params(kind)
         dr.enable_grad(params)
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
-        report = model(paths, self._learned_of(model, params, kind))
+        report = model(paths, self._learned(model, params, kind))
         dr.backward(dr.sum(report * on_device(weight, kind)))
         found = dr.detach(report).numpy().astype(float)
         return found, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
@@ -237,9 +236,7 @@ class _Reference:
     """Report in NumPy as a function of the paths, with the learned side of Dr.Jit's float64."""
 
     def __init__(self, joint: _Joint, model: Any) -> None:
-        self._model = model
-        re, im = joint._learned(model, joint._values, DOUBLE)
-        self._there = ORACLE.learned(model, (re.numpy() + 1j * im.numpy()).reshape(len(joint._case.tx_pos_m), -1))
+        self._model, self._there = model, joint.learned(model)
 
     def report(self, paths: OraclePaths) -> FloatArray:
         """Flat report."""

@@ -61,9 +61,9 @@ def field(count: int, size: float | None = None, opacity: float = 0.4) -> Any:
     return random_field(0, "alpha", count, size_deg(count) if size is None else size, opacity=opacity)
 
 
-def parameters(model: Any, count: int, size: float, seed: int = 0) -> dict[str, NDArray[np.float32]]:
+def parameters(model: Any, count: int, size: float) -> dict[str, NDArray[np.float32]]:
     """Initial parameters of a field, with Gaussians of random shapes and rotations around `RECEIVER`."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     params = model.init(random_gaussians([RECEIVER], count, rng, size_deg=size), rng)
     params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
     params["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
