@@ -22,7 +22,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.models.interpolation.idw import InverseDistance
 from wrf_mi.models.interpolation.kriging import Kriging
-from wrf_mi.models.physics.selection import kind_of
+from wrf_mi.models.physics.spectrum_model import SpectrumSettings
 from wrf_mi.runs.api import Run, train
 from wrf_mi.runs.fit_key import fit_key, fit_once, scene_files
 from wrf_mi.runs.folder import FITTED
@@ -148,8 +148,7 @@ def _stock(given: MethodInput, gaussians: int) -> FittedMethod:
 
 
 def _physics(given: MethodInput) -> FittedMethod:
-    settings = kind_of(given.record, True).settings()
-    key = fit_key(given.record, given.split, scene_files(given.scene), settings, given.seed)
+    key = fit_key(given.record, given.split, scene_files(given.scene), SpectrumSettings(), given.seed)
     folder = given.folder / f"physics-{key}"
     asked: dict[str, Any] = {"scene": given.scene, "n_train": given.rows, "seed": given.seed}
     fit_once(folder, lambda: train(given.record, folder, "physics", **asked))

@@ -143,7 +143,7 @@ def test_uplink_of_zeros_at_an_antenna_gives_a_downlink_of_zeros() -> None:
 def test_penalties_out_of_range_and_rows_without_energy_are_refused() -> None:
     record, _ = linear_record()
     for penalty in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(InputError, match="choose a positive number, or null"):
+        with pytest.raises(InputError, match="choose more than 0"):
             LinearSettings(penalty=penalty)
     with pytest.raises(InputError, match="made: no training row's downlink has any energy"):
         fit(replace(record, observation=np.zeros_like(record.observation)), split_of())

@@ -27,11 +27,12 @@ from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
 from ..interpolation.kriging_equations import simple_weights
+from ..model import Arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Complex, Model
 from .csi_visibility import Visibility
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
 
 DEFAULTS = CsiSettings()
 NEIGHBOURS = 32
@@ -238,7 +239,7 @@ def fit_csi(
     return CsiPhysics(record.receivers, fit.model, fit.visibility, fields, sharpness, fit.covariance, fit.facts)
 
 
-KIND = PhysicsKind(CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
+MODEL = physics_model("csi", CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
 
 
 def _measured(record: Record, rows: IntArray) -> Rows:

@@ -9,12 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy.special import expit
 
 from ...core import InputError
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from .csi_paths import CandidatePaths, candidate_paths
 from .csi_repair import Complex, Explained, Model, refit
@@ -38,7 +41,7 @@ SHARPNESS = (1.0, 2.0, 4.0, 16.0)
 
 
 @dataclass(frozen=True)
-class CsiSettings:
+class CsiSettings(CheckedSettings):
     """Settings of the fit of a CSI physics model.
 
     Attributes:
@@ -56,29 +59,22 @@ class CsiSettings:
     """
 
     reflections: int = 2
-    rays: int = 1 << 18
-    reflection: float = 1.0
+    rays: Count = 1 << 18
+    reflection: Finite = 1.0
     reflection_sd: float = 0.05
-    shift_sd_m: float = 0.004
-    outline_sd_m: float = 0.02
-    ridge: float = 1.0
+    shift_sd_m: Positive = 0.004
+    outline_sd_m: Positive = 0.02
+    ridge: Positive = 1.0
     repair_rounds: int = 8
     visibility_rounds: int = 6
-    folds: int = 5
+    folds: Annotated[int, Field(ge=2, description="2 or more")] = 5
     fit_gain: bool = False
 
     def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        whole = {"reflections": 0, "rays": 1, "repair_rounds": 0, "visibility_rounds": 0, "folds": 2}
-        for name, least in whole.items():
-            if getattr(self, name) < least:
-                raise InputError(f"{name} {getattr(self, name)}: give {least} or more")
-        for name in ("shift_sd_m", "outline_sd_m", "ridge"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} {getattr(self, name)}: give a positive number")
-        if self.reflection == 0 or self.reflection_sd < 0:
-            text = f"reflection {self.reflection}, reflection_sd {self.reflection_sd}"
-            raise InputError(f"{text}: give a reflection other than 0 and a standard deviation of 0 or more")
+        """Refuse settings out of range (`InputError`)."""
+        super().__post_init__()
+        if self.reflection == 0:
+            raise InputError("setting reflection: 0 is out of range, choose another number")
 
 
 @dataclass(frozen=True)

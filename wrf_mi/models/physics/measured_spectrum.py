@@ -20,16 +20,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from scipy.special import i0e, i1e
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray, pixel_directions
+from ...core.settings import CheckedSettings, Count, Positive
 from ...core.types import IntArray
 from ...receivers.array import array_response
 from ...receivers.lags import Lags
@@ -37,8 +39,9 @@ from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress, quiet
+from ..model import Arrays
 from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
@@ -62,7 +65,7 @@ Image = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
-class MeasuredSpectrumSettings:
+class MeasuredSpectrumSettings(CheckedSettings):
     """Settings of the physics model for spectra without a mesh.
 
     Attributes:
@@ -74,22 +77,18 @@ class MeasuredSpectrumSettings:
         starts: starts of the phase retrieval of one spectrum, at most.
     """
 
-    cone_deg: float = 80.0
-    directions: int = 120
-    longest: float = 4.6
-    shortest: float = 0.25
-    lengths: int = 4
-    starts: int = 60
+    cone_deg: Annotated[float, Field(gt=0, le=180, description="more than 0 and at most 180")] = 80.0
+    directions: Count = 120
+    longest: Positive = 4.6
+    shortest: Positive = 0.25
+    lengths: Count = 4
+    starts: Count = 60
 
     def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name in ("directions", "lengths", "starts"):
-            if getattr(self, name) < 1:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose 1 or more")
-        if not 0 < self.cone_deg <= 180:
-            raise InputError(f"setting cone_deg: {self.cone_deg}; choose more than 0 and at most 180")
-        if not 0 < self.shortest <= self.longest < np.inf:
-            raise InputError(f"setting shortest: {self.shortest}; choose more than 0 and at most longest")
+        """Refuse settings out of range (`InputError`)."""
+        super().__post_init__()
+        if self.shortest > self.longest:
+            raise InputError(f"setting shortest: {self.shortest} is out of range, choose at most longest")
 
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -303,7 +302,8 @@ def fit_measured_spectrum(
     return MeasuredSpectrumPhysics(record.receivers, tuple(sides), frequency_hz, (height, width))
 
 
-KIND = PhysicsKind(
+MODEL = physics_model(
+    "spectrum",
     MeasuredSpectrumSettings,
     lambda record, rows, scene, *how: fit_measured_spectrum(record, rows, *how),
     MeasuredSpectrumPhysics.from_arrays,

@@ -19,26 +19,25 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
+from ..model import Arrays
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
 from .rssi_map import PowerMap, trace_map
 from .rssi_terms import Hyperparameters, Measured, Poses, Stops, stops_of
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
 
 HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""
 ROBUST_ROUNDS = 2
 WIDER = 2.0
 """Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
-POSITIVE = {"shadow_db", "shadow_m", "body_m", "noise_db", "spacing_m", "offset_sd_db", "receiver_sd_db", "stop_rows"}
-SIGNED = {"transmit_dbm", "lever_m", "skew_db"}
-"""Settings that must be positive, and that may be negative."""
 
 
 @dataclass(frozen=True)
-class RssiSettings:
+class RssiSettings(CheckedSettings):
     """Settings of the fit of an RSSI physics model.
 
     Attributes:
@@ -69,39 +68,31 @@ class RssiSettings:
         max_reflections: reflections of a traced path.
     """
 
-    transmit_dbm: float = 0.0
-    offset_sd_db: float = 10.0
-    receiver_sd_db: float = 4.0
+    transmit_dbm: Finite = 0.0
+    offset_sd_db: Positive = 10.0
+    receiver_sd_db: Positive = 4.0
     exponent_sd: float = 1.0
     traced_sd: float = 0.5
     body_pattern_db: float = 1.0
     receiver_pattern_db: float = 2.0
-    shadow_db: float = 4.5
-    shadow_m: float = 2.0
+    shadow_db: Positive = 4.5
+    shadow_m: Positive = 2.0
     body_db: float = 1.5
-    body_m: float = 1.5
+    body_m: Positive = 1.5
     concentration: float = 1.0
     drift_db: float = 2.8
-    noise_db: float = 2.8
-    lever_m: float = 0.0
-    skew_db: float = 0.4
+    noise_db: Positive = 2.8
+    lever_m: Finite = 0.0
+    skew_db: Finite = 0.4
     search_rows: int = 500
     search_rounds: int = 1
     stop_m: float = 0.1
     stop_rad: float = 0.2
-    stop_rows: int = 20
-    spacing_m: float = 0.25
+    stop_rows: Count = 20
+    spacing_m: Positive = 0.25
     smooth_m: float = 0.3
     max_depth: int = 6
     max_reflections: int = 2
-
-    def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name, value in asdict(self).items():
-            if not np.isfinite(value) or (name in POSITIVE and value <= 0):
-                raise InputError(f"{name} {value}: give a positive number")
-            if name not in SIGNED and value < 0:
-                raise InputError(f"{name} {value}: give 0 or more")
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -274,4 +265,4 @@ def fit_rssi(
     return RssiPhysics(record.receivers, field, shift, widen, facts)
 
 
-KIND = PhysicsKind(RssiSettings, fit_rssi, RssiPhysics.from_arrays)
+MODEL = physics_model("rssi", RssiSettings, fit_rssi, RssiPhysics.from_arrays)

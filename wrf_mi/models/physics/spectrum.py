@@ -28,7 +28,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from ..model import Arrays
+from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_loss import Spectrometer
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin
@@ -198,7 +199,7 @@ def fit_spectrum(
     return SpectrumPhysics(tuple(models), facts)
 
 
-KIND = PhysicsKind(SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
+MODEL = physics_model("spectrum", SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
 
 
 def _fitted(

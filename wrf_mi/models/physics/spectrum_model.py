@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Inside, Positive
 from ...core.types import IntArray
 from ...tracing.walls import plane_centres
 from .spectrum_fit import (
@@ -37,7 +37,7 @@ DEVIATIONS = (0.1, 0.2, 0.4)
 
 
 @dataclass(frozen=True)
-class SpectrumSettings:
+class SpectrumSettings(CheckedSettings):
     """Settings of the physics model for spectra.
 
     Attributes:
@@ -60,26 +60,15 @@ class SpectrumSettings:
     passed: int = 1
     rays: int = 1 << 16
     chains: int = 4000
-    offset_sd_m: float = 0.03
+    offset_sd_m: Positive = 0.03
     surfaces: int = 16
-    surface_gain: float = 30.0
+    surface_gain: Positive = 30.0
     rounds: int = 2
     amplitudes: bool = True
-    scale_m: float = 1.0
+    scale_m: Positive = 1.0
     rest: bool = True
     steps: int = 15
-    validation: float = 0.15
-
-    def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name in ("reflections", "passed", "surfaces", "rounds", "steps", "chains", "rays"):
-            if getattr(self, name) < 0:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose 0 or more")
-        for name in ("offset_sd_m", "scale_m", "surface_gain"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose more than 0")
-        if not 0 < self.validation < 1:
-            raise InputError(f"setting validation: {self.validation}; choose more than 0 and less than 1")
+    validation: Inside = 0.15
 
     def chaining(self, seed: int) -> Chaining:
         """Search for chains of planes."""

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ...core import InputError, Record, Split
-from ...core.settings import Count, Positive, check
+from ...core.settings import CheckedSettings, Count, Positive
 from ...training.session import OnProgress
 from .csi_bands import Bands, bands_of, known_rows, relative_error
 from .uplink_paths import find_paths
@@ -26,7 +26,7 @@ BOTH_GAPS = (1, 2)
 
 
 @dataclass(frozen=True)
-class PathSettings:
+class PathSettings(CheckedSettings):
     """Settings of the search for paths.
 
     Attributes:
@@ -46,10 +46,6 @@ class PathSettings:
     final: int = 15
     spacing_hz: Positive = 312.5e3
     choice_rows: Count = 16
-
-    def __post_init__(self) -> None:
-        """Refuse settings out of range."""
-        check(self)
 
 
 def choose(

@@ -16,12 +16,14 @@ Source: Kay, "Fundamentals of statistical signal processing: estimation theory" 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ...core import InputError, Record, Split
+from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..method import Inputs, Method
@@ -36,19 +38,14 @@ CHUNK_SIZE = 256
 
 
 @dataclass(frozen=True)
-class LinearSettings:
+class LinearSettings(CheckedSettings):
     """Settings of the linear map.
 
     Attributes:
         penalty: in units of the mean energy of an uplink coefficient; None: chosen on validation rows.
     """
 
-    penalty: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse a penalty out of range."""
-        if self.penalty is not None and not 0 < self.penalty < np.inf:
-            raise InputError(f"linear: penalty {self.penalty}; choose a positive number, or null to have it chosen")
+    penalty: Annotated[float | None, Field(gt=0, description="more than 0")] = None
 
 
 @dataclass(frozen=True)

@@ -60,10 +60,6 @@ class OptMLSettings(PathSettings, NetworkSettings):
     between: int = 3
     final: int = 5
 
-    def __post_init__(self) -> None:
-        """Refuse settings out of range."""
-        NetworkSettings.__post_init__(self)
-
 
 class OptML:
     """A fitted network with the bands and the array that it was fitted for."""
