@@ -23,7 +23,7 @@ from wrf_mi.models.uplink.fire import FireSettings
 from wrf_mi.models.uplink.linear import LinearSettings
 from wrf_mi.models.uplink.optml import OptMLSettings
 from wrf_mi.models.uplink.path_network import Simulation
-from wrf_mi.models.uplink.r2f2 import R2F2Settings
+from wrf_mi.models.uplink.r2f2 import PathSettings
 from wrf_mi.models.uplink.uplink_paths import find_paths
 from wrf_mi.models.uplink.uplink_waves import waves_of
 from wrf_mi.tasks.scores import cea_db
@@ -42,7 +42,7 @@ FIELDS = {"nerf2": nerf2.METHOD}
 SMALL = {
     "linear": LinearSettings(),
     "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
-    "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
+    "r2f2": PathSettings(max_paths=3, choice_rows=2),
     "optml": OptMLSettings(
         steps=5,
         batch=4,
@@ -123,7 +123,7 @@ def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
     h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.METHOD.fit(record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, FitSession())
+    fitted = r2f2.METHOD.fit(record, split_of(10), PathSettings(max_paths=5, choice_rows=2), 0, FitSession())
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
     cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0), h[:, :, HALF:])
     assert cea.min() > EXACT_DB
@@ -134,7 +134,7 @@ def test_r2f2_without_elements_is_exact_where_delays_are_apart():
     delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
-    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, FitSession())
+    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), PathSettings(), 0, FitSession())
     record = record_of(h)
     cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0), h[:, :, HALF:])
     assert fitted.kind == "free"
@@ -146,7 +146,7 @@ def test_r2f2_finds_the_gap_between_unknown_bands():
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
     record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
-    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, FitSession())
+    fitted = r2f2.METHOD.fit(record, split_of(6), PathSettings(), 0, FitSession())
     assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
 
 
@@ -306,7 +306,7 @@ def test_uplink_of_zeros_gives_a_downlink_of_zeros(walk):
     assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()
 
 
-@pytest.mark.parametrize("settings", [lambda: R2F2Settings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
+@pytest.mark.parametrize("settings", [lambda: PathSettings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
 def test_unknown_words_are_refused_by_the_settings_themselves(settings: Callable[[], object]) -> None:
     with pytest.raises(InputError, match="choose from"):
         settings()

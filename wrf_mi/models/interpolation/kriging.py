@@ -8,7 +8,7 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -66,12 +66,12 @@ def log_distance(receiver_m: ArrayLike) -> Trend:
 
 
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
-"""Attributes of `KrigedMean` that are stored as they are."""
+"""Attributes of `Kriged` that are stored as they are."""
 
 
 @dataclass(frozen=True)
-class KrigedMean:
-    """Predictions of a fitted kriging: a trend, and weights of the training rows' correlations.
+class Kriged:
+    """A fitted kriging: a trend, and weights of the training rows' correlations.
 
     Attributes:
         kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
@@ -82,6 +82,9 @@ class KrigedMean:
         weights: weights of the rows for each component [n, q].
         like: empty array of the shape and type of observations, [0, ...].
         trend: columns of the trend.
+        noise: variance of the noise as a share of the field's.
+        variance: variance of the field for each component [q]; None, as ``system``, in a stored model.
+        system: covariance of the rows, factored.
     """
 
     kernel: str
@@ -92,13 +95,18 @@ class KrigedMean:
     weights: NDArray[np.inexact]
     like: NDArray[np.inexact]
     trend: Trend
+    noise: float = 0.0
+    variance: FloatArray | None = None
+    system: KrigingSystem | None = None
 
-    def correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
-        """Correlations [m, n] of positions [m, 3] with the rows.
+    @property
+    def chosen(self) -> dict[str, float]:
+        """Length in metres, noise as a share of the variance, and the heading's length where there is one."""
+        names = ("length_m", "heading_length")
+        return dict(zip(names, map(float, self.lengths), strict=False)) | {"noise": float(self.noise)}
 
-        Raises:
-            InputError: headings that the fit did not have, or the other way round.
-        """
+    def _correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
+        """Correlations [m, n] of positions [m, 3] with the rows."""
         if (tx_heading_rad is None) != (self.circle is None):
             had = "no headings" if self.circle is None else "headings"
             raise InputError(f"kriging: fitted with {had}; predict with the same")
@@ -107,11 +115,33 @@ class KrigedMean:
         return correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Observations [m, ...], see `Kriging.predict`."""
+        """Interpolate: [m, ...], in the observations' unit and type.
+
+        Args:
+            tx_pos: shape [m, 3], metres.
+            tx_heading_rad: shape [m], if and only if the fit had headings.
+
+        Raises:
+            InputError: headings that the fit did not have, or the other way round.
+        """
         positions = np.atleast_2d(np.asarray(tx_pos, float))
-        cross = self.correlations(positions, tx_heading_rad)
+        cross = self._correlations(positions, tx_heading_rad)
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
+
+    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
+        """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
+
+        The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
+        """
+        assert self.system is not None
+        assert self.variance is not None
+        mean = self.predict(tx_pos, tx_heading_rad)
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        columns = self.trend(positions)[:, : self.system.trend.shape[1]]
+        share = self.system.variance(1.0, self._correlations(positions, tx_heading_rad), columns) + self.noise
+        std = np.sqrt(share)[:, None] * np.sqrt(self.variance)
+        return Prediction(mean, std.reshape(mean.shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
@@ -120,11 +150,12 @@ class KrigedMean:
         return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedMean:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> Kriged:
         """The predictions that `arrays` described."""
         circle = arrays["circle"] if len(arrays["circle"]) else None
-        trend, kept = _trend(str(arrays["trend"]), receiver), {name: arrays[name] for name in KEPT}
-        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **kept)
+        trend = _trend(str(arrays["trend"]), receiver)
+        kept: dict[str, Any] = {name: arrays[name] for name in KEPT}
+        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=trend, **kept)
 
 
 class Kriging:
@@ -169,7 +200,7 @@ class Kriging:
         self.kernel, self.trend, self.trend_fit = kernel, trend, trend_fit
         self.likelihood_rows, self.seed = likelihood_rows, seed
 
-    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
+    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriged:
         """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
 
         Args:
@@ -193,51 +224,19 @@ class Kriging:
             # The field is the residual of the least-squares trend, which is taken as known from here on.
             ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
             field, columns = y - columns @ ordinary, columns[:, :0]
-        self._lengths, self.chosen_noise = self._choose(field, columns)
+        lengths, noise = self._choose(field, columns)
         try:
-            self._system = self._factored(slice(None), columns, self._lengths, self.chosen_noise)
+            system = self._factored(slice(None), columns, lengths, noise)
         except LinAlgError:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
-        beta = self._system.coefficients(field)
-        weights = self._system.weights(field, beta)
+        beta = system.coefficients(field)
+        weights = system.weights(field, beta)
         coefficients = beta if ordinary is None else ordinary
-        rows = self._lengths, self._positions, self._circle
-        self.mean = KrigedMean(self.kernel, *rows, coefficients, weights, like, self.trend)
         quadratic = (field.conj() * weights).real.sum(axis=0)
         # The trend's degrees of freedom make the residual too small by their share.
-        self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
-        return self
-
-    @property
-    def chosen(self) -> dict[str, float]:
-        """Length in metres, noise as a share of the variance, and the heading's length where there is one."""
-        names = ("length_m", "heading_length")
-        return dict(zip(names, map(float, self._lengths), strict=False)) | {"noise": float(self.chosen_noise)}
-
-    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Interpolate: [m, ...], in the observations' unit and type.
-
-        Args:
-            tx_pos: shape [m, 3], metres.
-            tx_heading_rad: shape [m], if and only if the fit had headings.
-
-        Raises:
-            InputError: headings that the fit did not have, or the other way round.
-        """
-        return self.mean.predict(tx_pos, tx_heading_rad)
-
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
-        """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
-
-        The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
-        """
-        mean = self.predict(tx_pos, tx_heading_rad)
-        positions = np.atleast_2d(np.asarray(tx_pos, float))
-        cross = self.mean.correlations(positions, tx_heading_rad)
-        columns = self.trend(positions)[:, : self._system.trend.shape[1]]
-        share = self._system.variance(1.0, cross, columns) + self.chosen_noise
-        std = np.sqrt(share)[:, None] * np.sqrt(self._variance)
-        return Prediction(mean, std.reshape(mean.shape))
+        variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
+        rows = lengths, self._positions, self._circle
+        return Kriged(self.kernel, *rows, coefficients, weights, like, self.trend, noise, variance, system)
 
     def _factored(
         self, rows: slice | NDArray[np.intp], columns: FloatArray, lengths: FloatArray, noise: float
@@ -338,9 +337,10 @@ def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitS
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     given = s.length_m, s.noise, s.heading_length, s.kernel
 
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> KrigedMean:
+    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> Kriged:
         model = Kriging(*given, _trend(name, receiver), how, s.likelihood_rows, seed)
-        return model.fit(tx_pos, observed, heading).mean
+        # The factored covariance of all receivers would fill the memory.
+        return replace(model.fit(tx_pos, observed, heading), system=None)
 
     return single
 
@@ -350,7 +350,7 @@ METHOD = method_by_receiver(
     None,
     KrigingSettings,
     _fitter,
-    lambda receiver, arrays: KrigedMean.from_arrays(arrays, receiver),
+    lambda receiver, arrays: Kriged.from_arrays(arrays, receiver),
     "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
     lambda record, settings: settings.heading and task_of(record).in_decibel,
 )

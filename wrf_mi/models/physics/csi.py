@@ -199,15 +199,10 @@ def fit_csi(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> CsiPhysics:
-    """Fit a CSI physics model.
+    """Fit a CSI physics model to ``rows`` of a record; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: complex channels.
-        rows: training rows; none: the image method on the scene as given.
-        scene: from `wrf_mi.tracing.open_scene`, or None: the line of sight and a diffuse field.
-        settings: settings of the fit.
-        seed: seed of rays, folds and grids of cells.
-        on_progress: progress callback: stage and fraction done.
+    Without rows it is the image method on the scene as given, without a scene the line of sight and a diffuse field.
+    ``seed`` is that of rays, folds and grids of cells.
 
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.

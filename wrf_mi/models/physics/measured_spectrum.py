@@ -254,14 +254,9 @@ def fit_measured_spectrum(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> MeasuredSpectrumPhysics:
-    """Fit the physics model to training rows.
+    """Fit the physics model to ``rows`` of spectra; arguments as ``fit`` of `physics_model`, without a scene.
 
-    Args:
-        record: spectra, with array and carrier frequency.
-        rows: training rows [n].
-        settings: settings of the fit.
-        seed: seed of starts and of the held-out rows.
-        on_progress: progress callback: stage and fraction done.
+    ``seed`` is that of starts and of the held-out rows.
 
     Raises:
         InputError: no spectra, no array, or too few rows.

@@ -201,15 +201,10 @@ def fit_rssi(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> RssiPhysics:
-    """Fit an RSSI physics model.
+    """Fit an RSSI physics model to ``rows`` of a record; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: signal strengths; rows should be in the order of time, see `wrf_mi.models.physics.rssi_fit.folds`.
-        rows: training rows; none: the scene alone.
-        scene: from `wrf_mi.tracing.open_scene`, or None: free space is expected.
-        settings: settings of the fit.
-        seed: unused: nothing is drawn.
-        on_progress: progress callback: stage and fraction done.
+    Rows should be in the order of time (`wrf_mi.models.physics.rssi_fit.folds`); without rows the scene alone predicts,
+    without a scene free space is expected. Nothing is drawn, so ``seed`` is unused.
 
     Raises:
         InputError: a record of another task or without its frequency, or neither rows nor a scene.

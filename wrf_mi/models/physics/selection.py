@@ -131,7 +131,9 @@ def physics_model(
     Args:
         task: task of the data.
         settings: dataclass of its settings.
-        fit: ``fit(record, rows, scene, settings, seed, on_progress)``; ``scene`` as opened by Sionna RT, or None.
+        fit: ``fit(record, rows, scene, settings, seed, on_progress)``: a record of the task with frequencies, numbers
+            of its training rows, ``sionna.rt.Scene`` at the carrier or None, settings, seed, progress callback (stage
+            and fraction done).
         load: ``load(arrays)``, from `PhysicsModel.arrays`.
         uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
     """

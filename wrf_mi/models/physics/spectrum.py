@@ -156,16 +156,11 @@ def fit_spectrum(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> SpectrumPhysics:
-    """Fit the physics model to spectra.
+    """Fit the physics model to ``rows`` of spectra; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: spectra, with array and carrier.
-        rows: training rows. Fewer than `FEW_ROWS` fit planes, materials and the mix with kriging alone; without rows,
-            or with rows at fewer than `LEAST_POSITIONS` positions, the room is traced as given.
-        scene: opened ``sionna.rt.Scene`` at the carrier, or None: free space and learned surfaces.
-        settings: settings of the fit.
-        seed: seed of validation rows and of the rays.
-        on_progress: progress callback: stage and fraction done.
+    Fewer rows than `FEW_ROWS` fit planes, materials and the mix with kriging alone; without rows, or with rows at fewer
+    than `LEAST_POSITIONS` positions, the room is traced as given. Without a scene: free space and learned surfaces.
+    ``seed`` is that of validation rows and of the rays.
 
     Raises:
         InputError: a record of another task, or without array or carrier.

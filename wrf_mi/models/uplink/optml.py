@@ -11,7 +11,7 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 - A room has more paths than a single map separates: there are ``rounds`` of maps of the uplink's residual, each
   followed by a refinement of all paths found so far. Simulated channels are therefore noisier at times, 5 to 30 dB.
 - After each round a path stays if the Bayesian information criterion would rise without it.
-- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.models.uplink.cross_band`).
+- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.models.uplink.r2f2`).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from ...core.angles import FloatArray
 from ...core.settings import Count
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
+from ..method import Method, keyed, settings_array, stored_settings, under
 from ..networks.training import NetworkSettings, network_adam
-from .cross_band import PathSettings, choose
-from .csi_bands import Bands, uplink_of
-from .path_network import PathFinder, PathMap, Simulation, fit_paths
+from .csi_bands import Bands
+from .path_network import PathMap, Simulation, fit_paths
+from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import Complex, Mask, Waves, waves_of
 
@@ -61,21 +61,17 @@ class OptMLSettings(PathSettings, NetworkSettings):
     final: int = 5
 
 
-class OptML:
+class OptML(R2F2):
     """A fitted network with the bands and the array that it was fitted for."""
 
     def __init__(self, kind: str, bands: Bands, settings: OptMLSettings, network: PathMap) -> None:
-        self.kind, self.bands, self.settings, self.network = kind, bands, settings, network
-        self._waves = waves_of(kind, bands, settings.max_distance_m)
-        self._finder = PathFinder(self._waves, network)
+        super().__init__(kind, bands, settings)
+        self.settings: OptMLSettings = settings
+        self.network = network
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
-        """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        paths = self._paths(uplink_of(inputs))
-        return self._waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz).astype(np.complex64)
-
-    def _paths(self, h: Complex) -> Paths:
-        s, waves = self.settings, self._waves
+    def paths(self, h: Complex) -> Paths:
+        """Paths of uplinks [m, antennas, f]."""
+        s, waves = self.settings, self.waves
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))
         present: Mask = np.zeros((len(h), 0), bool)
         residual = h
@@ -85,7 +81,7 @@ class OptML:
 
         for _ in range(s.rounds):
             chunks = [residual[i : i + ROWS] for i in range(0, len(h), ROWS)]
-            proposals = [self._finder.propose(chunk, s.at_once, s.threshold) for chunk in chunks]
+            proposals = [self.network.propose(chunk, s.at_once, s.threshold) for chunk in chunks]
             fresh, found = (np.concatenate(part) for part in zip(*proposals, strict=True))
             theta = waves.limit(np.concatenate([theta, fresh], axis=1))
             present = np.concatenate([present, found], axis=1)
