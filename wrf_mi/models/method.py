@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -133,6 +133,19 @@ def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[
 def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
+    named = ((one.name, getattr(value, one.name)) for one in fields(value))
+    return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
+
+
+def from_field_arrays(kind: type, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
+    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
+    names = (one.name for one in fields(kind) if f"{prefix}{one.name}" in arrays)
+    stored = {name: arrays[f"{prefix}{name}"] for name in names}
+    return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
 
 
 def settings_array(settings: Any) -> NDArray[Any]:

@@ -12,6 +12,7 @@ from made_waves import FREQUENCY_HZ, SIZE, WAVELENGTH_M, positions, wave_record,
 from scipy.spatial.distance import cdist
 
 from wrf_mi.core import InputError, Record
+from wrf_mi.models.method import field_arrays, from_field_arrays
 from wrf_mi.models.physics import anisotropic_kriging as nearby
 from wrf_mi.models.physics import measured_spectrum
 from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
@@ -23,7 +24,6 @@ from wrf_mi.models.physics.measured_spectrum import (
     fit_measured_spectrum,
     signal_weight,
 )
-from wrf_mi.models.physics.selection import field_arrays, from_field_arrays
 from wrf_mi.receivers.lags import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
 

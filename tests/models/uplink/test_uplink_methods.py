@@ -167,7 +167,7 @@ def test_search_finds_as_many_paths_as_there_are_in_noise(elements):
 def test_gradient_of_the_projected_residual_equals_finite_differences(kind, elements):
     """Variable projection: derivative of the residual's energy with the gains at their best."""
     rng = np.random.default_rng(5)
-    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), elements[:, :2], True)
+    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), True, elements[:, :2])
     waves = waves_of(kind, bands, 100.0)
     h = rng.standard_normal((2, len(elements), HALF, 2)) @ np.array([1, 1j])
     theta = np.concatenate([rng.uniform(2, 20, (2, 3, 1)), rng.uniform(-0.5, 0.5, (2, 3, 2))], axis=2)

@@ -29,8 +29,7 @@ from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from .conv import Convolution, Grid, InstanceNorm, coarser, finer, resized
-from .coordinates import feature_count
-from .layers import GAIN, Linear, Module, columns, relu, sigmoid
+from .layers import GAIN, Linear, Module, columns, feature_count, relu, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 

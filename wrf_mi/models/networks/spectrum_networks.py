@@ -16,8 +16,19 @@ from ...core import Record, Split
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, known_positions, received_rows, settings_array, stored_settings, under
-from .coordinates import Coordinates
+from ..method import (
+    Inputs,
+    Method,
+    field_arrays,
+    from_field_arrays,
+    keyed,
+    known_positions,
+    received_rows,
+    settings_array,
+    stored_settings,
+    under,
+)
+from .layers import Coordinates
 from .training import Network, train_network
 
 SPECTRUM = TASKS["spectrum"]
@@ -118,7 +129,7 @@ class FittedNetworks:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
         arrays = {"settings": settings_array(self.settings), "shape": np.asarray(self.shape)}
-        arrays |= keyed("frame/", self.coordinates.arrays())
+        arrays |= field_arrays(self.coordinates, "frame/")
         for r, generator in enumerate(self.generators):
             arrays |= keyed(f"receiver{r}/{self.kind.generator}.", generator.arrays())
         return arrays
@@ -145,4 +156,5 @@ def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record
     height, width = (int(side) for side in arrays["shape"])
     made = kind.make(settings, (height, width), np.random.default_rng(0))
     generators = [made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(record.receivers))]
-    return FittedNetworks(kind, settings, Coordinates.load(under("frame/", arrays)), generators, (height, width))
+    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+    return FittedNetworks(kind, settings, coordinates, generators, (height, width))

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from ...backend.device import to_tensor
 from ...core.settings import Count, Positive, Share
 from ...core.types import IntArray
-from .coordinates import feature_count
-from .layers import Linear, Mlp, Module, columns, sigmoid
+from .layers import Linear, Mlp, Module, columns, feature_count, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, opaque_rows
 

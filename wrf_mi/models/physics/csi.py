@@ -27,12 +27,13 @@ from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
 from ..interpolation.kriging_equations import simple_weights
+from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, images_of
 from .csi_repair import NUMBERS, Complex, Model
 from .csi_visibility import Visibility
-from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
+from .selection import PhysicsModel, physics_model
 
 DEFAULTS = CsiSettings()
 NEIGHBOURS = 32

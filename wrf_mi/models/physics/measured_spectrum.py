@@ -39,9 +39,10 @@ from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress, quiet
+from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
 from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
-from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
+from .selection import PhysicsModel, physics_model
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)

@@ -23,11 +23,12 @@ from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
+from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
 from .rssi_map import PowerMap, trace_map
 from .rssi_terms import Hyperparameters, Measured, Poses, Stops, stops_of
-from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
+from .selection import PhysicsModel, physics_model
 
 HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
@@ -87,17 +86,6 @@ class PhysicsModel(ABC):
     @abstractmethod
     def summary(self) -> dict[str, Any]:
         """Fitted parameters and choices as plain numbers and strings."""
-
-
-def field_arrays(value: Any, prefix: str) -> Arrays:
-    """Fields of a dataclass instance as arrays by ``prefix`` and name."""
-    return {f"{prefix}{one.name}": np.asarray(getattr(value, one.name)) for one in fields(value)}
-
-
-def from_field_arrays(kind: type, arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
-    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    stored = (arrays[f"{prefix}{one.name}"] for one in fields(kind))
-    return kind(*(value if value.ndim else value.item() for value in stored))
 
 
 class FittedPhysics(Fitted):

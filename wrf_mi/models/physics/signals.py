@@ -34,6 +34,7 @@ from ...core.types import IntArray
 from ...receivers.beams import mirror_order
 from ...receivers.retrieve import align_signals
 from ..interpolation.kriging_equations import KrigingSystem, left_out
+from ..method import field_arrays, from_field_arrays
 from .anisotropic_kriging import chosen_rows
 
 ComplexArray = NDArray[np.complex128]
@@ -211,15 +212,13 @@ class SignalProcess:
 
     def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
         """Arrays for `from_arrays`."""
-        stored = {f"{prefix}{name}": getattr(self, name) for name in STORED}
-        return stored | {f"{prefix}{name}": getattr(self.covariances, name) for name in ("lengths_m", "turns")}
+        return {f"{prefix}{name}": getattr(self, name) for name in STORED} | field_arrays(self.covariances, prefix)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> SignalProcess:
         """The process that `arrays` stored."""
         positions, signals, *components = (arrays[f"{prefix}{name}"] for name in STORED)
-        covariances = Covariances(arrays[f"{prefix}lengths_m"], arrays[f"{prefix}turns"])
-        return cls(positions, signals, covariances, *components)
+        return cls(positions, signals, from_field_arrays(Covariances, arrays, prefix), *components)
 
 
 def fit_signals(

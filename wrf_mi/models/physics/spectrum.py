@@ -28,8 +28,9 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
+from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
-from .selection import PhysicsModel, field_arrays, from_field_arrays, physics_model
+from .selection import PhysicsModel, physics_model
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_loss import Spectrometer
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin

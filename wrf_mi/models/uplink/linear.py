@@ -26,7 +26,7 @@ from ...core import InputError, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, Method
+from ..method import Inputs, Method, field_arrays, from_field_arrays
 from .csi_bands import known_rows, relative_error, uplink_of
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
@@ -68,7 +68,7 @@ class LinearMap:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Matrix, number of antennas and penalty."""
-        return {name: np.asarray(value) for name, value in vars(self).items()}
+        return field_arrays(self)
 
 
 @dataclass(frozen=True)
@@ -141,10 +141,13 @@ def fit(record: Record, split: Split, settings: LinearSettings, seed: int, sessi
     return LinearMap(matrix, record.observation.shape[2], penalty)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> LinearMap:
-    """The map that `LinearMap.arrays` described."""
-    return LinearMap(np.asarray(arrays["matrix"], complex), int(arrays["antennas"]), float(arrays["penalty"]))
-
-
 SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-METHOD = Method("linear", ("csi",), LinearSettings, fit, load, SOURCE, needs_uplink=True)
+METHOD = Method(
+    "linear",
+    ("csi",),
+    LinearSettings,
+    fit,
+    lambda arrays, record: from_field_arrays(LinearMap, arrays),
+    SOURCE,
+    needs_uplink=True,
+)
