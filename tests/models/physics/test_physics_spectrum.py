@@ -26,10 +26,10 @@ from wrf_mi.models.physics.spectrum_fit import (
     map_centres,
     scan_offsets,
 )
-from wrf_mi.models.physics.spectrum_loss import Grid, Spectrometer
 from wrf_mi.models.physics.spectrum_model import Fit, SpectrumModel, begin
 from wrf_mi.models.physics.spectrum_rays import Chaining
 from wrf_mi.models.physics.spectrum_search import KnownPaths, Search
+from wrf_mi.models.physics.spectrum_waves import Grid, Spectrometer
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6

@@ -3,7 +3,7 @@
 A mesh from LiDAR gives planes to millimetres or centimetres, and rough outlines. Phases need tenths of millimetres, and
 the error is mostly decided by which paths exist. So, with measured channels, three steps alternate: the probability of
 each path is inferred from a row's channel (`csi_fit`), planes are shifted and tilted until all phases fit
-(`csi_repair`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
+(`csi_paths`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
 elsewhere (`csi_visibility`). The residual is a diffuse field, useful within half a wavelength of measurements.
 
 Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field.
@@ -26,12 +26,10 @@ from ...core.types import IntArray
 from ...tasks import require
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
-from ..interpolation.kriging_equations import simple_weights
 from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
-from .csi_paths import MOUNTED_M, images_of
-from .csi_repair import NUMBERS, Complex, Model
+from .csi_paths import MOUNTED_M, NUMBERS, Complex, Model, images_of
 from .csi_visibility import Visibility
 from .selection import PhysicsModel, physics_model
 
@@ -77,9 +75,9 @@ class DiffuseField:
         between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
         matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
         across = self.share * np.sinc(self.k * distance / np.pi)
-        weight, known = simple_weights(matrix, across)
+        weight = np.linalg.solve(matrix, across[..., None])[..., 0]
         mean = np.einsum("mn,mnf->mf", weight, self.value[index])
-        return mean, self.power * np.maximum(1 - known, 1e-6)
+        return mean, self.power * np.maximum(1 - (weight * across).sum(axis=-1), 1e-6)
 
 
 def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:

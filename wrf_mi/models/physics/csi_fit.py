@@ -19,8 +19,7 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
-from .csi_paths import CandidatePaths, candidate_paths
-from .csi_repair import Complex, Explained, Model, refit
+from .csi_paths import CandidatePaths, Complex, Explained, Model, candidate_paths, refit
 from .csi_visibility import Learner, Visibility, prior_odds
 
 FLIPS = (24, 24, 14, 9)
@@ -130,24 +129,23 @@ def decode(
     log_odds: FloatArray,
     phase_sd_rad: FloatArray,
     noise: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, Complex, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
     """Posterior probabilities of p paths in measured channels [n, subcarriers].
 
     ``row`` (ascending), ``gain`` [p, subcarriers], prior ``log_odds`` and ``phase_sd_rad`` are those of each path [p];
     ``noise`` holds weights and standard deviations of a mixture of circular Gaussians.
 
     Returns:
-        Probability of each path [p]; residual of the likeliest hypothesis [n, subcarriers]; probability of each
-        component of the noise [n, components].
+        Probability of each path [p], and of each component of the noise [n, components].
     """
     count, carriers = channel.shape
     flips, (weight, sd) = _flips(), noise
     probability = 1 / (1 + np.exp(-log_odds))
-    residual, share = channel.astype(complex), np.zeros((count, len(weight)))
+    share = np.zeros((count, len(weight)))
     if not len(row):
-        log = np.log(weight) - carriers * np.log(sd * sd) - np.square(np.abs(residual)).sum(axis=1)[:, None] / (sd * sd)
+        log = np.log(weight) - carriers * np.log(sd * sd) - np.square(np.abs(channel)).sum(axis=1)[:, None] / (sd * sd)
         share = np.exp(log - log.max(axis=1, keepdims=True))
-        return probability, residual, share / share.sum(axis=1, keepdims=True)
+        return probability, share / share.sum(axis=1, keepdims=True)
     first = np.searchsorted(row, np.arange(count + 1))
     likely = log_odds > 0
     blur = np.square(np.abs(gain)).mean(axis=1) * np.square(phase_sd_rad)
@@ -174,9 +172,8 @@ def decode(
         hypothesis = joint.sum(axis=2)
         flipped = hypothesis @ flips
         probability[path[known]] = np.where(likely[path], 1 - flipped, flipped)[known]
-        residual[rows] = left[np.arange(len(rows)), hypothesis.argmax(axis=1)]
         share[rows] = joint.sum(axis=1)
-    return probability, residual, share
+    return probability, share
 
 
 def prior_sd(model: Model, settings: CsiSettings) -> FloatArray:
@@ -255,7 +252,7 @@ class Fit:
         position = rows.position_m[paths.row]
         phase = np.minimum(self.model.phase_sd(paths.chain, position, self.covariance), WIDEST_RAD)
         gain = self.model.path_gain(paths.chain, position)
-        probability, _, share = decode(rows.channel, paths.row, gain, self._odds, phase, self._noise)
+        probability, share = decode(rows.channel, paths.row, gain, self._odds, phase, self._noise)
         self._noise = (1 - FLOOR) * share.mean(axis=0) + FLOOR / len(SCALES), self._noise[1]
         unsure = np.square(np.abs(gain)).mean(axis=1) * probability * (1 - probability)
         unsure = np.bincount(paths.row, unsure, len(rows.channel))

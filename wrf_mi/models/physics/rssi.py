@@ -1,6 +1,6 @@
 """Received signal strength: expectation by mesh and physics, corrected by measurements.
 
-The expected value is the traced power, averaged over a neighbourhood (`rssi_map`), or free space without a mesh. It is
+The expected value is the traced power, averaged over a neighbourhood (`PowerMap`), or free space without a mesh. It is
 corrected by an offset of each receiver, the exponent of the distance, and patterns, whose common parts are learned from
 all receivers (`rssi_terms`); shadowing and the body's effect at a position are a Gaussian process. Hyperparameters, the
 noise of each receiver, and the calibration of predictions come from held-out stretches of the training rows
@@ -26,8 +26,7 @@ from ...training.session import OnProgress, quiet
 from ..method import field_arrays, from_field_arrays
 from ..model import Arrays
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
-from .rssi_map import PowerMap, trace_map
-from .rssi_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+from .rssi_terms import Hyperparameters, Measured, Poses, PowerMap, Stops, stops_of, trace_map
 from .selection import PhysicsModel, physics_model
 
 HEADINGS = 8

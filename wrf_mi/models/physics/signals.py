@@ -74,11 +74,7 @@ class Covariances:
 
     def __call__(self, tx_pos_m: FloatArray) -> ComplexArray:
         """All covariances between positions [n, 3] (metres), shape [count, n, n], length slowest."""
-        n = len(tx_pos_m)
-        decay = np.exp(-cdist(tx_pos_m, tx_pos_m) / self.lengths_m[:, None, None])
-        phase = np.exp(1j * (self.turns @ tx_pos_m.T))
-        product: ComplexArray = decay[:, None] * (phase[:, :, None] * phase[:, None, :].conj())
-        return product.reshape(self.count, n, n)
+        return self.mixed(tx_pos_m, tx_pos_m, np.eye(self.count))
 
     def mixed(self, a_m: FloatArray, b_m: FloatArray, weight: FloatArray) -> ComplexArray:
         """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m].

@@ -25,10 +25,9 @@ from .spectrum_fit import (
     map_centres,
     scan_offsets,
 )
-from .spectrum_gains import Waves
-from .spectrum_loss import ComplexArray, Spectrometer
 from .spectrum_rays import Chaining, ChainTable, Room, find_chains
 from .spectrum_search import KINDS, Frame, KnownPaths, Search, Sheet, frames_of
+from .spectrum_waves import ComplexArray, Spectrometer, Waves
 
 SEARCHED_ROWS = 300
 """Rows of the first fit of the constants, which are a few dozen numbers."""
@@ -194,13 +193,13 @@ class Fit:
         validation: IntArray,
         settings: SpectrumSettings,
     ) -> None:
-        self._tx, self.rows, self.validation, self._spectra = tx_pos_m, rows, validation, spectra
+        self.tx_pos_m, self.rows, self.validation, self.spectra = tx_pos_m, rows, validation, spectra
         self.instrument, self.shapes = instrument, instrument.grid.shapes(spectra)
-        self._settings = settings
+        self.settings = settings
 
     def losses(self, model: SpectrumModel, rows: IntArray, waves: Waves | None = None) -> FloatArray:
         """Loss of each of some rows."""
-        signals = model.signals(waves or model.waves(self._tx[rows]))
+        signals = model.signals(waves or model.waves(self.tx_pos_m[rows]))
         return self.instrument.grid.loss(signals, self.shapes[rows])[0]
 
     def validation_loss(self, model: SpectrumModel) -> float:
@@ -211,21 +210,21 @@ class Fit:
         """The model with fitted planes and materials, after ``rounds`` scans of the planes for other minima."""
         if not len(model.constants.vector()) or not len(rows):
             return model
-        waves, shapes = model.waves(self._tx[rows]), self.shapes[rows]
+        waves, shapes = model.waves(self.tx_pos_m[rows]), self.shapes[rows]
         factor = model.factor(waves)
         prior = Constants(np.zeros(len(model.constants.offset_m)), model.room.slabs)
-        found, sd = model.constants, self._settings.offset_sd_m
+        found, sd = model.constants, self.settings.offset_sd_m
         for turn in range(max(rounds, 1)):
             if turn < rounds:
                 found = scan_offsets(waves, shapes, found, sd, factor)
-            found = fit_constants(waves, shapes, found, prior, sd, self._settings.steps, factor)
+            found = fit_constants(waves, shapes, found, prior, sd, self.settings.steps, factor)
         return model.replaced(constants=found)
 
     def surfaces(self, model: SpectrumModel, how: Chaining) -> SpectrumModel:
         """The model with further surfaces as far as they lower the validation rows' loss; see `Search`."""
-        frames = model.frames(self._tx[self.rows])
+        frames = model.frames(self.tx_pos_m[self.rows])
         search, signals = self._search(model, frames, self.rows)
-        found = search(signals, self._settings.surfaces, self._settings.surface_gain)
+        found = search(signals, self.settings.surfaces, self.settings.surface_gain)
         # Sheet by sheet on validation rows, by their change at first order.
         judge, signals = self._search(model, frames, self.validation)
         before, kept = judge.loss(signals), []
@@ -247,7 +246,7 @@ class Fit:
 
     def _search(self, model: SpectrumModel, frames: list[Frame], rows: IntArray) -> tuple[Search, ComplexArray]:
         """A search with some rows, and their element signals."""
-        tx = self._tx[rows]
+        tx = self.tx_pos_m[rows]
         waves = model.waves(tx)
         known = KnownPaths.of(model.table, waves.paths, model.path_waves(waves), tx)
         return Search(frames, self.instrument, tx, self.shapes[rows], known), waves.sum @ known.wave
@@ -260,7 +259,7 @@ class Fit:
         Returns:
             The model, the prior deviation (0: none) and up to how many reflections chains vary with the position.
         """
-        waves, held_out = model.waves(self._tx[self.rows]), model.waves(self._tx[self.validation])
+        waves, held_out = model.waves(self.tx_pos_m[self.rows]), model.waves(self.tx_pos_m[self.validation])
         before = self.losses(model, self.validation, held_out)
         best, most, chosen = model, 0.0, (0.0, -1)
         for reflections in (-1, 0, 1):
@@ -275,14 +274,14 @@ class Fit:
         self, model: SpectrumModel, rows: IntArray, deviation: float, reflections: int, waves: Waves | None = None
     ) -> SpectrumModel:
         """The model with amplitudes of its chains, which vary with the position up to so many reflections."""
-        waves = waves or model.waves(self._tx[rows])
-        maps = map_centres(waves.paths, model.table.length, self._settings.scale_m, reflections)
-        steps = 4 * self._settings.steps
+        waves = waves or model.waves(self.tx_pos_m[rows])
+        maps = map_centres(waves.paths, model.table.length, self.settings.scale_m, reflections)
+        steps = 4 * self.settings.steps
         return model.replaced(maps=fit_maps(waves, self.shapes[rows], model.constants, maps, deviation, steps))
 
     def residual_field(self, model: SpectrumModel) -> ResidualField | None:
         """The field whose kriging predicts validation rows best; None: none helps."""
-        truth, position = self._spectra[self.validation], self._tx[self.validation]
+        truth, position = self.spectra[self.validation], self.tx_pos_m[self.validation]
         before = np.square(model.spectra(position) - truth).mean(axis=(1, 2))
         most, best = 0.0, None
         for field in (*RESIDUALS, *MIXES.values()):
@@ -296,7 +295,7 @@ class Fit:
         """The model with kriging of the residuals of some rows; unchanged without a field."""
         if field is None:
             return model
-        position, spectra = self._tx[rows], self._spectra[rows]
+        position, spectra = self.tx_pos_m[rows], self.spectra[rows]
         wavelength_m = self.instrument.wavelength_m
         return model.replaced(
             residual=ResidualKriging.of(position, spectra, model.spectra(position), field, wavelength_m)
