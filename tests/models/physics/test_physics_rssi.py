@@ -60,7 +60,7 @@ def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
 def test_posterior_equals_dense_gaussian_conditioning() -> None:
     """Shared coefficients and independent fields, against one covariance matrix of all receivers' rows."""
     rng = np.random.default_rng(1)
-    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0)
+    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0, 0.0, 0.0)
     prior = np.array([5.0, 1.0])
     places = [Poses(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
     bases = [rng.normal(size=(len(p), 2)) for p in places]
@@ -88,7 +88,7 @@ def test_reweighting_is_robust_to_outliers() -> None:
     places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
     part = Part(places, np.ones((21, 1)), value, np.ones(21))
-    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0)
+    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
     plain, robust = (
         PooledProcess([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
         for rounds in (0, 3)

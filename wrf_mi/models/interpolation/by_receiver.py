@@ -94,8 +94,7 @@ class ByReceiver:
                 row = inputs.first_row + rows[0] + 1
                 raise InputError(f"{self.name}: row {row}: no training row at {carrier_hz:.10g} Hz; trained on {known}")
             model = self.models[number[0] * receivers + receiver]
-            result: NDArray[Any] = model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows])
-            return result
+            return np.asarray(model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows]))
 
         return by_carrier(inputs.carriers_hz, of_carrier)
 

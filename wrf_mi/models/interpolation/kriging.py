@@ -9,18 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 from scipy.optimize import minimize
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings
 from ...tasks import task_of
 from .by_receiver import FitSingle, method_by_receiver, observed_rows
-from .kriging_equations import KERNELS, KrigingSystem, component_root, correlation
+from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)
@@ -158,47 +160,42 @@ class Kriged:
         return cls(kernel=str(arrays["kernel"]), circle=circle, trend=trend, **kept)
 
 
-class Kriging:
+@dataclass(frozen=True)
+class CovarianceSettings(CheckedSettings):
+    """Settings of kriging's covariance; null: of the greatest restricted likelihood of the training rows.
+
+    Attributes:
+        length_m: correlation length, metres, or null.
+        noise: variance of the noise as a share of the field's, or null.
+        heading_length: correlation length over headings, in chords of the unit circle, or null; unused without.
+        kernel: exponential, matern32 or gaussian, see `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+        likelihood_rows: most rows of the likelihood, drawn with the seed; the prediction uses all.
+    """
+
+    length_m: Annotated[float | None, Field(gt=0, description="more than 0")] = None
+    noise: float | None = None
+    heading_length: Annotated[float | None, Field(gt=0, description="more than 0")] = None
+    kernel: Literal["exponential", "matern32", "gaussian"] = "exponential"
+    likelihood_rows: Annotated[int, Field(ge=2, description="2 or more")] = 1000
+
+
+@dataclass(frozen=True)
+class Kriging(CovarianceSettings):
     """Kriging of real or complex observations over positions and, if given, headings.
 
-    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). Arguments that are
-    None are chosen by the restricted likelihood of the training rows, with the variance at its best value.
+    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). The likelihood that
+    chooses has the variance at its best value.
 
-    Args:
-        length_m: correlation length in metres, or None.
-        noise: variance of the noise as a share of the field's, or None.
-        heading_length: correlation length over headings, in chords of the unit circle, or None; unused without.
-        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+    Attributes:
         trend: columns of the trend; one unknown mean by default.
         trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
             kriging), in which every row weighs the same.
-        likelihood_rows: at most so many rows, drawn with ``seed``, enter the likelihood; all of them the prediction.
-        seed: seed of that draw.
+        seed: seed of the rows of the likelihood.
     """
 
-    def __init__(
-        self,
-        length_m: float | None = None,
-        noise: float | None = None,
-        heading_length: float | None = None,
-        kernel: str = "exponential",
-        trend: Trend = constant,
-        trend_fit: Literal["gls", "ols"] = "gls",
-        likelihood_rows: int = 1000,
-        seed: int = 0,
-    ) -> None:
-        for what, value in (("length", length_m), ("heading length", heading_length), ("noise", noise)):
-            zero = what == "noise"
-            if value is not None and not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
-                raise InputError(f"kriging: {what} {value}; choose a finite number above 0, or None to have it chosen")
-        if kernel not in KERNELS or trend_fit not in ("gls", "ols"):
-            known = f"choose a kernel of {', '.join(KERNELS)} and gls or ols"
-            raise InputError(f"kriging: kernel {kernel!r}, trend by {trend_fit!r}; {known}")
-        if likelihood_rows < 2:
-            raise InputError(f"kriging: likelihood of {likelihood_rows} rows; choose 2 or more")
-        self.length_m, self.noise, self.heading_length = length_m, noise, heading_length
-        self.kernel, self.trend, self.trend_fit = kernel, trend, trend_fit
-        self.likelihood_rows, self.seed = likelihood_rows, seed
+    trend: Trend = constant
+    trend_fit: Literal["gls", "ols"] = "gls"
+    seed: int = 0
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriged:
         """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
@@ -212,11 +209,11 @@ class Kriging:
             InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
                 or rows that coincide while the noise is zero.
         """
-        self._positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
+        positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
         like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
         y = values.reshape(len(values), -1).astype(complex if np.iscomplexobj(values) else float)
-        self._circle = None if heading is None else _circle(heading)
-        columns = self.trend(self._positions)
+        circle = None if heading is None else _circle(heading)
+        columns = self.trend(positions)
         if len(y) < columns.shape[1]:
             raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
         field, ordinary = y, None
@@ -224,9 +221,9 @@ class Kriging:
             # The field is the residual of the least-squares trend, which is taken as known from here on.
             ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
             field, columns = y - columns @ ordinary, columns[:, :0]
-        lengths, noise = self._choose(field, columns)
+        lengths, noise = self._choose(field, columns, positions, circle)
         try:
-            system = self._factored(slice(None), columns, lengths, noise)
+            system = self._factored(_coordinates(positions, circle, lengths), noise, columns)
         except LinAlgError:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
         beta = system.coefficients(field)
@@ -235,29 +232,28 @@ class Kriging:
         quadratic = (field.conj() * weights).real.sum(axis=0)
         # The trend's degrees of freedom make the residual too small by their share.
         variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
-        rows = lengths, self._positions, self._circle
+        rows = lengths, positions, circle
         return Kriged(self.kernel, *rows, coefficients, weights, like, self.trend, noise, variance, system)
 
-    def _factored(
-        self, rows: slice | NDArray[np.intp], columns: FloatArray, lengths: FloatArray, noise: float
-    ) -> KrigingSystem:
-        circle = None if self._circle is None else self._circle[rows]
-        x = _coordinates(self._positions[rows], circle, lengths)
-        return KrigingSystem(correlation(x, x, self.kernel), noise, columns[rows])
+    def _factored(self, coordinates: FloatArray, noise: float, columns: FloatArray) -> KrigingSystem:
+        return KrigingSystem(correlation(coordinates, coordinates, self.kernel), noise, columns)
 
-    def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
+    def _choose(
+        self, field: NDArray[np.inexact], columns: FloatArray, positions_m: FloatArray, circle: FloatArray | None
+    ) -> tuple[FloatArray, float]:
         """Lengths and noise: as given, or of the greatest likelihood."""
         rows = np.arange(len(field))
         if len(rows) > self.likelihood_rows:
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
-        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
+        positions_m, circle, columns = positions_m[rows], None if circle is None else circle[rows], columns[rows]
+        extent = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
         # Given value or None, limits, and first value of the search.
         table = [
             (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
-        given, limits, first = zip(*(table if self._circle is not None else [table[0], table[2]]), strict=True)
+        given, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
         free = np.array([value is None for value in given])
         value = np.array([0.0 if v is None else v for v in given])
         if not free.any():
@@ -270,7 +266,7 @@ class Kriging:
             """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
             value[free] = np.exp(logarithm)
             try:
-                system = self._factored(rows, columns, value[:-1], float(value[-1]))
+                system = self._factored(_coordinates(positions_m, circle, value[:-1]), float(value[-1]), columns)
             except LinAlgError:
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
@@ -300,28 +296,18 @@ def _circle(heading_rad: ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class KrigingSettings:
-    """Settings of kriging. Lengths and noise that are null are those of the greatest likelihood of the training rows.
+class KrigingSettings(CovarianceSettings):
+    """Settings of kriging.
 
     Attributes:
-        length_m: correlation length, metres, or null.
-        noise: variance of the noise as a share of the field's, or null.
-        heading_length: correlation length over headings, in chords of the unit circle, or null.
-        kernel: exponential, matern32 or gaussian.
         trend: constant, log-distance, or null: log-distance for signal strengths, else constant.
         trend_fit: gls (jointly with the field) or ols (before it), or null: ols for log-distance, else gls.
         heading: whether headings count, where the data have them and hold signal strengths.
-        likelihood_rows: most rows of the likelihood.
     """
 
-    length_m: float | None = None
-    noise: float | None = None
-    heading_length: float | None = None
-    kernel: str = "exponential"
     trend: str | None = None
     trend_fit: str | None = None
     heading: bool = True
-    likelihood_rows: int = 1000
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
@@ -335,10 +321,10 @@ def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitS
     how = cast(Literal["gls", "ols"], s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls"))
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
-    given = s.length_m, s.noise, s.heading_length, s.kernel
+    given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
 
     def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> Kriged:
-        model = Kriging(*given, _trend(name, receiver), how, s.likelihood_rows, seed)
+        model = Kriging(*given, _trend(name, receiver), how, seed)
         # The factored covariance of all receivers would fill the memory.
         return replace(model.fit(tx_pos, observed, heading), system=None)
 

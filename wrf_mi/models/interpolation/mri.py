@@ -71,8 +71,7 @@ def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
     columns, observed = columns[received], observed[received].astype(float)
     if len(observed) < 2 or not np.ptp(columns[:, 1]) > 0:
         raise InputError(f"mri: {len(observed)} rows at one distance; an exponent shows at two or more")
-    law: FloatArray = np.linalg.lstsq(columns, observed, rcond=None)[0]
-    return law
+    return np.asarray(np.linalg.lstsq(columns, observed, rcond=None)[0])
 
 
 METHOD = method_by_receiver(

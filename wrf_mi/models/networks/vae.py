@@ -71,8 +71,7 @@ def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
     n, height, width = spectra.shape
     side = max(s for s in range(1, pool + 1) if height % s == 0 and width % s == 0)
     blocks = spectra.reshape(n, height // side, side, width // side, side)
-    result: NDArray[np.float32] = blocks.mean(axis=(2, 4), dtype=np.float64).reshape(n, -1).astype(np.float32)
-    return result
+    return np.asarray(blocks.mean(axis=(2, 4), dtype=np.float64).reshape(n, -1), np.float32)
 
 
 class Decoder(Mlp):

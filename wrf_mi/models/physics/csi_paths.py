@@ -226,8 +226,7 @@ class Model:
         """Derivative of lengths [p, b, 3] by shift and tilts of each level's plane."""
         away = self.images.image_m[chain, -1] - position_m
         away /= np.linalg.norm(away, axis=1, keepdims=True)
-        result: FloatArray = np.einsum("plkd,pd->plk", self.images.slope[chain], away)
-        return result
+        return np.asarray(np.einsum("plkd,pd->plk", self.images.slope[chain], away))
 
     def phase_sd(self, chain: IntArray, position_m: FloatArray, covariance: FloatArray) -> FloatArray:
         """Standard deviation of phases [p] by the covariance of all planes' parameters, at the middle subcarrier."""

@@ -37,8 +37,8 @@ WIDER = 2.0
 
 
 @dataclass(frozen=True)
-class RssiSettings(CheckedSettings):
-    """Settings of the fit of an RSSI physics model.
+class RssiSettings(CheckedSettings, Hyperparameters):
+    """Settings of the fit of an RSSI physics model: hyperparameters at the start of the search, and the following.
 
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included.
@@ -48,14 +48,6 @@ class RssiSettings(CheckedSettings):
         traced_sd: standard deviation of the factor of the traced decibels about one.
         body_pattern_db: first harmonic of the transmitter's pattern, standard deviation; 0: none.
         receiver_pattern_db: first harmonic of each receiver's pattern, standard deviation; 0: none.
-        shadow_db: standard deviation of shadowing.
-        shadow_m: its correlation length.
-        body_db: standard deviation of the heading's effect that varies with the position.
-        body_m: its correlation length.
-        concentration: concentration of that effect in the heading.
-        drift_db: standard deviation of noise that persists while the transmitter stands.
-        noise_db: standard deviation of a single report's noise.
-        lever_m: distance of the antenna ahead of the stated position.
         skew_db: shift of predictions a priori, as fades reach deeper than peaks.
         search_rows: least number of training rows with which held-out rows choose hyperparameters.
         search_rounds: rounds of that search; 0: none.
@@ -75,14 +67,6 @@ class RssiSettings(CheckedSettings):
     traced_sd: float = 0.5
     body_pattern_db: float = 1.0
     receiver_pattern_db: float = 2.0
-    shadow_db: Positive = 4.5
-    shadow_m: Positive = 2.0
-    body_db: float = 1.5
-    body_m: Positive = 1.5
-    concentration: float = 1.0
-    drift_db: float = 2.8
-    noise_db: Positive = 2.8
-    lever_m: Finite = 0.0
     skew_db: Finite = 0.4
     search_rows: int = 500
     search_rounds: int = 1

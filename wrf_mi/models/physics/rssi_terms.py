@@ -26,6 +26,7 @@ from scipy.spatial.distance import cdist
 
 from ...core import InputError, Record
 from ...core.angles import FloatArray
+from ...core.settings import Finite, Positive
 from ...core.types import IntArray
 
 NEAREST_M = 0.05
@@ -81,24 +82,24 @@ class Hyperparameters:
     distance and h the headings.
 
     Attributes:
-        shadow_db: s.
-        shadow_m: l.
-        body_db: b.
-        body_m: m.
-        concentration: c.
+        shadow_db: s, standard deviation of shadowing.
+        shadow_m: l, its correlation length.
+        body_db: b, standard deviation of the heading's effect that varies with the position.
+        body_m: m, its correlation length.
+        concentration: c, concentration of that effect in the heading.
         drift_db: standard deviation of noise common to all rows of a stop.
         noise_db: standard deviation of noise of each row.
         lever_m: distance of the antenna ahead of the stated position, see `Poses.moved`.
     """
 
-    shadow_db: float
-    shadow_m: float
-    body_db: float
-    body_m: float
-    concentration: float
-    drift_db: float = 0.0
-    noise_db: float = 0.0
-    lever_m: float = 0.0
+    shadow_db: Positive = 4.5
+    shadow_m: Positive = 2.0
+    body_db: float = 1.5
+    body_m: Positive = 1.5
+    concentration: float = 1.0
+    drift_db: float = 2.8
+    noise_db: Positive = 2.8
+    lever_m: Finite = 0.0
 
     def changed(self, name: str, sign: int) -> Hyperparameters:
         """One parameter a step up or down; `NOISE` stands for both parts of the noise."""
@@ -114,8 +115,7 @@ class Hyperparameters:
         if here.heading_rad is not None and there.heading_rad is not None:
             turn = np.cos(here.heading_rad[:, None] - there.heading_rad[None]) - 1
             covariance += self.body_db**2 * np.exp(self.concentration * turn - distance / self.body_m)
-        result: FloatArray = covariance
-        return result
+        return np.asarray(covariance)
 
     def variance(self, headings: bool) -> float:
         """Variance of the field, with or without the part that depends on headings, dB^2."""

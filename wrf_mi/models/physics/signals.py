@@ -149,8 +149,7 @@ class Posterior:
     @property
     def ignorance(self) -> FloatArray:
         """Posterior variance as a share of the prior variance, [q]: 0 known, 1 unknown."""
-        result: FloatArray = self.variance.sum(axis=1) / self.prior.sum()
-        return result
+        return np.asarray(self.variance.sum(axis=1) / self.prior.sum())
 
 
 @dataclass(eq=False)
@@ -189,8 +188,7 @@ class SignalProcess:
     @property
     def prior(self) -> FloatArray:
         """Variance of each component without measurements, [m], noise included."""
-        total: FloatArray = self.weight.sum(axis=1) + self.noise
-        return total
+        return np.asarray(self.weight.sum(axis=1) + self.noise)
 
     def _posterior(self, mean: ComplexArray, variance: FloatArray) -> Posterior:
         return Posterior(mean @ self.basis.T, np.maximum(variance, self.noise), self.basis, self.prior)

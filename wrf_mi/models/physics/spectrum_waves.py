@@ -60,8 +60,7 @@ class Grid:
         """Observed spectra [n, height, width] as unit vectors on the grid [n, r * c]; zero spectra as 0."""
         values = spectra[:, self.row][:, :, self.column].reshape(len(spectra), -1).astype(float)
         norm = np.linalg.norm(values, axis=1, keepdims=True)
-        result: FloatArray = np.divide(values, norm, out=np.zeros_like(values), where=norm > 0)
-        return result
+        return np.asarray(np.divide(values, norm, out=np.zeros_like(values), where=norm > 0))
 
     def loss(self, signals: ComplexArray, shapes: FloatArray) -> tuple[FloatArray, ComplexArray]:
         """Losses [n], at least 0, of element signals [n, m] of any unit, and derivative G [n, m].
@@ -93,14 +92,12 @@ class Spectrometer:
     @property
     def wavenumber(self) -> float:
         """2 pi over the wavelength, rad/m."""
-        result: float = 2 * np.pi * self.frequency_hz / speed_of_light
-        return result
+        return float(2 * np.pi * self.frequency_hz / speed_of_light)
 
     @property
     def wavelength_m(self) -> float:
         """Wavelength, metres."""
-        result: float = speed_of_light / self.frequency_hz
-        return result
+        return float(speed_of_light / self.frequency_hz)
 
     @property
     def array_m(self) -> FloatArray:
@@ -197,8 +194,7 @@ class Waves:
 
     def image(self, offset_m: FloatArray) -> FloatArray:
         """The transmitters' images less the array's origin with planes displaced by ``offset_m`` [q], [p, 3]."""
-        result: FloatArray = self.paths.image_m + np.einsum("q,qpi->pi", offset_m, self.moved)
-        return result
+        return np.asarray(self.paths.image_m + np.einsum("q,qpi->pi", offset_m, self.moved))
 
     def gain(self, slabs: FloatArray, path: IntArray | None = None) -> ComplexArray:
         """Gains of all or some paths with materials ``slabs`` [3, b]."""

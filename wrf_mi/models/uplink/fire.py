@@ -84,8 +84,7 @@ def units_of(uplink: NDArray[np.complex128]) -> NDArray[np.complex128]:
     first = np.where(strong.any(axis=1), strong.argmax(axis=1), np.abs(total).argmax(axis=1))
     chosen = total[np.arange(len(total)), first]
     phase = np.divide(chosen, np.abs(chosen), out=np.ones_like(chosen), where=np.abs(chosen) > 0)
-    result: NDArray[np.complex128] = np.where(scale > 0, scale, 1.0) * phase
-    return result
+    return np.asarray(np.where(scale > 0, scale, 1.0) * phase)
 
 
 def parts(h: NDArray[np.complex128]) -> NDArray[np.float32]:
