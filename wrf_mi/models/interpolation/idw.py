@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...tasks import task_of
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from .by_receiver import FitSingle, model_by_receiver, observed_rows
 
 
 class InverseDistance:
@@ -105,7 +105,7 @@ def _fitter(record: Record, split: Split, settings: IdwSettings, seed: int) -> F
     return single
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "idw",
     None,
     IdwSettings,

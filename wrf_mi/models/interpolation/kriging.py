@@ -21,7 +21,7 @@ from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from .by_receiver import FitSingle, model_by_receiver, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
@@ -331,7 +331,7 @@ def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitS
     return single
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "kriging",
     None,
     KrigingSettings,

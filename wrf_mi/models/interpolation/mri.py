@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
-from .by_receiver import FitSingle, method_by_receiver
+from .by_receiver import FitSingle, model_by_receiver
 from .kriging import log_distance
 
 
@@ -74,7 +74,7 @@ def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
     return np.asarray(np.linalg.lstsq(columns, observed, rcond=None)[0])
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "mri",
     ("rssi",),
     MriSettings,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from .by_receiver import FitSingle, model_by_receiver, observed_rows
 
 
 class Trees:
@@ -171,7 +171,7 @@ def _fitter(record: Record, split: Split, settings: TreesSettings, seed: int) ->
     return single
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "trees",
     ("rssi",),
     TreesSettings,

@@ -195,4 +195,4 @@ KIND = SpectrumNetwork(
     CHUNK_SIZE,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
 )
-METHOD = KIND.method()
+MODEL = KIND.model()

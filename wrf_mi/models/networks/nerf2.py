@@ -18,12 +18,12 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...core import Record, Split
@@ -31,7 +31,6 @@ from ...core.types import IntArray
 from ...tasks.conditions import channel_scales, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
 from ..method import (
-    Method,
     from_field_arrays,
     inputs_of,
     known_positions,
@@ -39,6 +38,7 @@ from ..method import (
     stored_settings,
     under,
 )
+from ..model import Arrays, Model, Problem
 from .layers import Coordinates, columns
 from .nerf2_field import Field, Nerf2Settings, step_loss
 from .nerf2_march import Nerf2Network
@@ -50,14 +50,14 @@ FAR_M = 10.0
 """Length of rays if positions are not known: the size of a large room."""
 
 
-def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, session: FitSession) -> Field:
+def fit(problem: Problem, split: Split, session: FitSession) -> Field:
     """Fit the networks.
 
     Raises:
         InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
     """
-    known = split.all_train
-    outputs = outputs_of(record)
+    record, known = problem.record, split.all_train
+    outputs, settings = outputs_of(record), problem.settings
     where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
     known_rx = np.stack([receiver.position_m for receiver in record.receivers])
     rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
@@ -67,7 +67,7 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, sessio
         where, farthest = rx, FAR_M
     scales = channel_scales(record, known)
     field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    field.networks = [_fit_group(record, split, field, seed, session, members) for members in field.groups]
+    field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
     return field
 
 
@@ -123,14 +123,15 @@ def _fit_group(
     return trained
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> Field:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> Field:
     """The fields that `Field.arrays` described."""
     settings = stored_settings(Nerf2Settings, arrays, "nerf2")
     coordinates = from_field_arrays(Coordinates, arrays, "frame/")
-    field = Field(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+    field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
     field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
     return field
 
 
 SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
-METHOD = Method("nerf2", ("spectrum", "rssi", "csi"), Nerf2Settings, fit, load, SOURCE)
+TASKS = "spectrum", "rssi", "csi"
+MODEL = Model("nerf2", TASKS, Nerf2Settings, fit, load, SOURCE, uplink="optional", headings=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
-from ...core import InputError, Record
+from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
@@ -25,6 +25,7 @@ from ...tasks import Task, task_of
 from ...tasks.conditions import channels_from, known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import AdamConfig
 from ..method import Inputs, field_arrays, keyed, settings_array
+from ..model import Fitted
 from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
 from .training import NetworkSettings, network_adam, opaque_rows
@@ -102,7 +103,7 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
     return dr.moveaxis(both, 0, 1)
 
 
-class Field:
+class Field(Fitted):
     """A fitted field, evaluated in two steps that are recorded once.
 
     Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
@@ -174,7 +175,7 @@ class Field:
         receivers = sum(len(members) for members in self.groups)
         return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
 
         Raises:
@@ -186,7 +187,7 @@ class Field:
             self._seen = receiver, self.look(network, receiver)
         condition, divisor = self.condition_of(inputs, receiver)
         values, shape = self.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
-        return channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape)
+        return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""

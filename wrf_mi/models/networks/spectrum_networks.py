@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -12,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.device import to_float, to_tensor
-from ...core import Record, Split
+from ...core import Prediction, Split
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
 from ..method import (
     Inputs,
-    Method,
     field_arrays,
     from_field_arrays,
     keyed,
@@ -28,6 +28,7 @@ from ..method import (
     stored_settings,
     under,
 )
+from ..model import Arrays, Fitted, Model, Problem
 from .layers import Coordinates
 from .training import Network, train_network
 
@@ -93,13 +94,14 @@ class SpectrumNetwork:
     at_once: int
     source: str
 
-    def method(self) -> Method:
+    def model(self) -> Model:
         """Entry of the registry."""
-        return Method(self.name, ("spectrum",), self.settings, partial(_fit, self), partial(_load, self), self.source)
+        how = partial(_fit, self), partial(_load, self), self.source
+        return Model(self.name, ("spectrum",), self.settings, *how, uplink="optional", headings=True)
 
 
 @dataclass(frozen=True)
-class FittedNetworks:
+class FittedNetworks(Fitted):
     """Fitted networks.
 
     Attributes:
@@ -116,7 +118,7 @@ class FittedNetworks:
     generators: list[Any]
     shape: tuple[int, int]
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], float32."""
         s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
         for first in range(0, len(inputs), self.kind.at_once):
@@ -124,7 +126,7 @@ class FittedNetworks:
             where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
             with dr.suspend_grad():
                 out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
-        return out
+        return Prediction(out)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
@@ -135,9 +137,8 @@ class FittedNetworks:
         return arrays
 
 
-def _fit(
-    kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, session: FitSession
-) -> FittedNetworks:
+def _fit(kind: SpectrumNetwork, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
+    record, settings, seed = problem.record, problem.settings, problem.seed
     coordinates = Coordinates.of(known_positions(record, split.all_train, kind.name))
     generators = []
     for r, receiver in enumerate(record.receivers):
@@ -151,10 +152,12 @@ def _fit(
     return FittedNetworks(kind, settings, coordinates, generators, (height, width))
 
 
-def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record) -> FittedNetworks:
+def _load(kind: SpectrumNetwork, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
     settings: Any = stored_settings(kind.settings, arrays, kind.name)
     height, width = (int(side) for side in arrays["shape"])
     made = kind.make(settings, (height, width), np.random.default_rng(0))
-    generators = [made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(record.receivers))]
+    generators = [
+        made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(problem.record.receivers))
+    ]
     coordinates = from_field_arrays(Coordinates, arrays, "frame/")
     return FittedNetworks(kind, settings, coordinates, generators, (height, width))

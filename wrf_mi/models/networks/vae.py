@@ -152,4 +152,4 @@ KIND = SpectrumNetwork(
     CHUNK_SIZE,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
 )
-METHOD = KIND.method()
+MODEL = KIND.model()

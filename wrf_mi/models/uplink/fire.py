@@ -18,6 +18,7 @@ are divided by the uplink's scale and phase. Chosen here:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import drjit as dr
@@ -26,11 +27,12 @@ from drjit import nn
 from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
-from ...core import Record, Split
+from ...core import Prediction, Record, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
+from ..method import Inputs, keyed, settings_array, stored_settings, under
+from ..model import Arrays, Fitted, Model, Problem
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
@@ -136,7 +138,7 @@ def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
 
 
 @dataclass(frozen=True)
-class FittedFire:
+class FittedFire(Fitted):
     """A fitted network.
 
     Attributes:
@@ -151,12 +153,12 @@ class FittedFire:
     bands: Bands
     settings: FireSettings
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
         uplink = uplink_of(inputs)
         samples = samples_of(uplink, self.sample)
         out = predict_samples(self.network, samples, units_of(samples), len(self.bands.downlink_hz))
-        return out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64)
+        return Prediction(out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Kind of sample, settings, bands and weights."""
@@ -178,9 +180,10 @@ def predict_samples(
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
 
 
-def fit(record: Record, split: Split, settings: FireSettings, seed: int, session: FitSession) -> FittedFire:
+def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
     """Fit a network, or two of which the better is kept."""
-    train, validation = known_rows(METHOD.name, record, split)
+    record, settings, seed = problem.record, problem.settings, problem.seed
+    train, validation = known_rows(MODEL.name, record, split)
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
     few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
@@ -242,7 +245,7 @@ def _rows(samples: NDArray[Any], per_row: int) -> NDArray[Any]:
     return samples.reshape(len(samples) // per_row, -1)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
     """The network that `FittedFire.arrays` described."""
     settings, (_, bands) = stored_settings(FireSettings, arrays, "fire"), Bands.load(arrays)
     weights = under("network/", arrays)
@@ -252,4 +255,4 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
 
 
 SOURCE = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
-METHOD = Method("fire", ("csi",), FireSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("fire", ("csi",), FireSettings, fit, load, SOURCE, uplink="required", headings=True)

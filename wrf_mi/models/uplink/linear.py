@@ -22,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ...core import InputError, Record, Split
+from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, Method, field_arrays, from_field_arrays
+from ..method import Inputs, field_arrays, from_field_arrays
+from ..model import Fitted, Model, Problem
 from .csi_bands import known_rows, relative_error, uplink_of
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
@@ -49,7 +50,7 @@ class LinearSettings(CheckedSettings):
 
 
 @dataclass(frozen=True)
-class LinearMap:
+class LinearMap(Fitted):
     """A fitted map.
 
     Attributes:
@@ -62,9 +63,9 @@ class LinearMap:
     antennas: int
     penalty: float
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        return (uplink_of(inputs) @ self.matrix).astype(np.complex64)
+        return Prediction((uplink_of(inputs) @ self.matrix).astype(np.complex64))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Matrix, number of antennas and penalty."""
@@ -128,9 +129,10 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
     return PENALTIES[int(np.argmin(errors))]
 
 
-def fit(record: Record, split: Split, settings: LinearSettings, seed: int, session: FitSession) -> LinearMap:
+def fit(problem: Problem, split: Split, session: FitSession) -> LinearMap:
     """Choose the penalty, then fit the map to all training rows."""
-    train, validation = known_rows(METHOD.name, record, split)
+    record, settings = problem.record, problem.settings
+    train, validation = known_rows(MODEL.name, record, split)
     known = np.concatenate([train, validation])
     if not len(validation):
         picked = np.arange(len(train)) % JUDGES == 0
@@ -142,12 +144,13 @@ def fit(record: Record, split: Split, settings: LinearSettings, seed: int, sessi
 
 
 SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-METHOD = Method(
+MODEL = Model(
     "linear",
     ("csi",),
     LinearSettings,
     fit,
-    lambda arrays, record: from_field_arrays(LinearMap, arrays),
+    lambda arrays, problem, folder: from_field_arrays(LinearMap, arrays),
     SOURCE,
-    needs_uplink=True,
+    uplink="required",
+    headings=True,
 )

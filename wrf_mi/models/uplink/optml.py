@@ -17,17 +17,19 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Record, Split
+from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..method import Method, keyed, settings_array, stored_settings, under
+from ..method import keyed, settings_array, stored_settings, under
+from ..model import Arrays, Model, Problem
 from ..networks.training import NetworkSettings, network_adam
 from .csi_bands import Bands
 from .path_network import PathMap, Simulation, fit_paths
@@ -118,15 +120,16 @@ def prune(
     return theta, kept, waves.solve(theta, kept, h).residual
 
 
-def fit(record: Record, split: Split, settings: OptMLSettings, seed: int, session: FitSession) -> OptML:
+def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
     """Choose the wave model on validation rows, then learn from simulated channels."""
-    kind, bands = choose(METHOD.name, record, split, settings, session.report)
+    settings = problem.settings
+    kind, bands = choose(MODEL.name, problem.record, split, settings, session.report)
     waves = waves_of(kind, bands, settings.max_distance_m)
-    network = fit_paths(waves, bands, settings.simulation, settings.width, settings, seed, session)
+    network = fit_paths(waves, bands, settings.simulation, settings.width, settings, problem.seed, session)
     return OptML(kind, bands, settings, network)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> OptML:
     """The model that `OptML.arrays` described."""
     settings, (kind, bands) = stored_settings(OptMLSettings, arrays, "optml"), Bands.load(arrays)
     waves = waves_of(kind, bands, settings.max_distance_m)
@@ -135,4 +138,4 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
 
 
 SOURCE = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
-METHOD = Method("optml", ("csi",), OptMLSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("optml", ("csi",), OptMLSettings, fit, load, SOURCE, uplink="required", headings=True)

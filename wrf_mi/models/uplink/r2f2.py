@@ -23,15 +23,17 @@ bands.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Record, Split
+from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings, Count, Positive
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, Method, keyed, under
+from ..method import Inputs, keyed, under
+from ..model import Arrays, Fitted, Model, Problem
 from .csi_bands import Bands, bands_of, known_rows, relative_error, uplink_of
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, waves_of
@@ -106,17 +108,18 @@ def choose(
     return options[int(np.argmin(errors))]
 
 
-class R2F2:
+class R2F2(Fitted):
     """Downlink from paths of the uplink, with the chosen wave model ``kind`` and bands."""
 
     def __init__(self, kind: str, bands: Bands, settings: PathSettings) -> None:
         self.kind, self.bands, self.settings = kind, bands, settings
         self.waves = waves_of(kind, bands, settings.max_distance_m)
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
         paths = self.paths(uplink_of(inputs))
-        return self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz).astype(np.complex64)
+        found = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
+        return Prediction(found.astype(np.complex64))
 
     def paths(self, h: Complex) -> Paths:
         """Paths of uplinks [m, antennas, f]."""
@@ -128,16 +131,16 @@ class R2F2:
         return self.bands.arrays(self.kind) | keyed("settings/", settings)
 
 
-def fit(record: Record, split: Split, settings: PathSettings, seed: int, session: FitSession) -> R2F2:
+def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
     """Choose the wave model and, where frequencies are unknown, the bands."""
-    return R2F2(*choose(METHOD.name, record, split, settings, session.report), settings)
+    return R2F2(*choose(MODEL.name, problem.record, split, problem.settings, session.report), problem.settings)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> R2F2:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
     """The model that `R2F2.arrays` described."""
     settings = {name: value.item() for name, value in under("settings/", arrays).items()}
     return R2F2(*Bands.load(arrays), PathSettings(**settings))
 
 
 SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
-METHOD = Method("r2f2", ("csi",), PathSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("r2f2", ("csi",), PathSettings, fit, load, SOURCE, uplink="required", headings=True)
