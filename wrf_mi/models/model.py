@@ -186,11 +186,6 @@ class Model:
     prepare: Callable[[Problem, Sequence[Split], Session], Any] | None = None
     by_data: Callable[[str, bool], Model] | None = None
 
-    @property
-    def needs_uplink(self) -> bool:
-        """Whether it predicts from the uplink alone."""
-        return self.uplink == "required"
-
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks

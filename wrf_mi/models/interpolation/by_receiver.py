@@ -32,8 +32,9 @@ class Single(Protocol):
         """Arrays of a run file."""
 
 
-FitSingle = Callable[[Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
-"""From a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to its model."""
+FitSingle = Callable[[Problem, Split, Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
+"""From a problem, its split, a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to the
+receiver's model."""
 
 
 def observed_rows(
@@ -114,7 +115,7 @@ def model_by_receiver(
     name: str,
     tasks: tuple[str, ...] | None,
     settings: type,
-    fitter: Callable[[Record, Split, Any, int], FitSingle],
+    fit_single: FitSingle,
     load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
     source: str,
     heading: Callable[[Record, Any], bool] = lambda record, settings: False,
@@ -125,7 +126,7 @@ def model_by_receiver(
         name: name of the method.
         tasks: tasks that it serves; None: all.
         settings: class of its settings.
-        fitter: ``fitter(record, split, settings, seed)``: fit of one receiver.
+        fit_single: fit of one receiver.
         load_single: the model of a receiver from its arrays.
         source: publication.
         heading: ``heading(record, settings)``: whether headings count where the record has them.
@@ -134,7 +135,6 @@ def model_by_receiver(
     def fit(problem: Problem, split: Split, session: FitSession) -> ByReceiver:
         record, rows, stated = problem.record, split.all_train, problem.record.carriers_hz
         known_positions(record, rows, name)
-        fit_single = fitter(record, split, problem.settings, problem.seed)
         headings = record.tx_heading_rad if heading(record, problem.settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
         parts = (
@@ -145,7 +145,8 @@ def model_by_receiver(
             turned = None if headings is None else headings[part]
             for receiver, observed in zip(record.receivers, record.observation, strict=True):
                 try:
-                    models.append(fit_single(receiver, record.tx_pos_m[part], observed[part], turned))
+                    rows_of = record.tx_pos_m[part], observed[part], turned
+                    models.append(fit_single(problem, split, receiver, *rows_of))
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
                 session.report(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from .by_receiver import FitSingle, model_by_receiver, observed_rows
+from ..model import Problem
+from .by_receiver import model_by_receiver, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
@@ -39,13 +40,11 @@ class Trend:
     """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
 
     Attributes:
-        name: ``constant`` or ``log-distance``.
-        receiver_m: position [3] from which d is the distance, metres.
+        receiver_m: position [3] from which d is the distance, metres; None: one unknown mean.
 
     Source: Rappaport, "Wireless Communications" (2002), section 4.9.
     """
 
-    name: str
     receiver_m: FloatArray | None = None
 
     def __call__(self, positions_m: FloatArray) -> FloatArray:
@@ -58,13 +57,13 @@ class Trend:
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-constant = Trend(CONSTANT)
+constant = Trend()
 """Trend of one unknown mean."""
 
 
 def log_distance(receiver_m: ArrayLike) -> Trend:
     """Trend of the log-distance law at a receiver's position [3], metres."""
-    return Trend(LOG_DISTANCE, np.asarray(receiver_m, float))
+    return Trend(np.asarray(receiver_m, float))
 
 
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
@@ -148,7 +147,8 @@ class Kriged:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
         circle = np.zeros((0, 2)) if self.circle is None else self.circle
-        names = {"trend": np.asarray(self.trend.name), "kernel": np.asarray(self.kernel)}
+        trend = CONSTANT if self.trend.receiver_m is None else LOG_DISTANCE
+        names = {"trend": np.asarray(trend), "kernel": np.asarray(self.kernel)}
         return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
 
     @classmethod
@@ -314,28 +314,27 @@ def _trend(name: str, receiver: Receiver) -> Trend:
     return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
 
 
-def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitSingle:
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> Kriged:
+    s, record = problem.settings, problem.record
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
-    how = cast(Literal["gls", "ols"], s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls"))
+    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> Kriged:
-        model = Kriging(*given, _trend(name, receiver), how, seed)
-        # The factored covariance of all receivers would fill the memory.
-        return replace(model.fit(tx_pos, observed, heading), system=None)
-
-    return single
+    model = Kriging(*given, _trend(name, receiver), how, problem.seed)
+    # The factored covariance of all receivers would fill the memory.
+    return replace(model.fit(tx_pos, observed, heading), system=None)
 
 
 MODEL = model_by_receiver(
     "kriging",
     None,
     KrigingSettings,
-    _fitter,
+    _fit,
     lambda receiver, arrays: Kriged.from_arrays(arrays, receiver),
     "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
     lambda record, settings: settings.heading and task_of(record).in_decibel,

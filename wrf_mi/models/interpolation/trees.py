@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.angles import FloatArray
-from .by_receiver import FitSingle, model_by_receiver, observed_rows
+from ...core.settings import CheckedSettings, Count
+from ..model import Problem
+from .by_receiver import model_by_receiver, observed_rows
 
 
-class Trees:
+@dataclass(frozen=True)
+class Trees(CheckedSettings):
     """An average of extremely randomised regression trees over x, y, z and, if given, cosine and sine of the heading.
 
-    Args:
+    Attributes:
         trees: number of trees.
         leaf_rows: least number of training rows in a leaf, which averages noise out.
         seed: seed of the random cuts.
@@ -24,10 +27,9 @@ class Trees:
     Source: Geurts, Ernst and Wehenkel, "Extremely randomized trees" (2006); scikit-learn's `ExtraTreesRegressor`.
     """
 
-    def __init__(self, trees: int = 300, leaf_rows: int = 5, seed: int = 0) -> None:
-        if trees < 1 or leaf_rows < 1:
-            raise InputError(f"{trees} trees with {leaf_rows} rows in a leaf: choose 1 or more of both")
-        self.trees, self.leaf_rows, self.seed = trees, leaf_rows, seed
+    trees: Count = 300
+    leaf_rows: Count = 5
+    seed: int = 0
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> GrownTrees:
         """Grow the trees on the rows that were observed.
@@ -164,18 +166,17 @@ class TreesSettings:
     heading: bool = True
 
 
-def _fitter(record: Record, split: Split, settings: TreesSettings, seed: int) -> FitSingle:
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> GrownTrees:
-        return Trees(settings.trees, settings.leaf_rows, seed).fit(tx_pos, observed, heading)
-
-    return single
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> GrownTrees:
+    return Trees(problem.settings.trees, problem.settings.leaf_rows, problem.seed).fit(tx_pos, observed, heading)
 
 
 MODEL = model_by_receiver(
     "trees",
     ("rssi",),
     TreesSettings,
-    _fitter,
+    _fit,
     lambda receiver, arrays: GrownTrees(**arrays),
     "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
     lambda record, settings: settings.heading,

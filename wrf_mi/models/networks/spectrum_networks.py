@@ -51,11 +51,6 @@ class ReceiverRows:
     where: Any
     train: int
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of a spectrum."""
-        return int(self.spectra.shape[1]), int(self.spectra.shape[2])
-
     def network(self, kind: SpectrumNetwork, module: Any, loss: Any, data: Any, draw: Any) -> Network:
         """Training of a network on these rows, scored by the median structural similarity of those that choose."""
         count = len(self.spectra) - self.train
@@ -64,7 +59,7 @@ class ReceiverRows:
             asked, truth = to_tensor(self.where.numpy()[:, self.train :]), to_float(self.spectra[self.train :])
             with dr.suspend_grad():
                 predicted = getattr(module, kind.generator).spectra(asked)
-            return float(np.median(ssim(predicted, truth, count, *self.shape).numpy()))
+            return float(np.median(ssim(predicted, truth, count, *self.spectra.shape[1:]).numpy()))
 
         rows = [np.arange(self.train)], [np.arange(len(self.spectra))], score if count else None
         name = f"{kind.name} {self.receiver}"

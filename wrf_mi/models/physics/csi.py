@@ -24,6 +24,8 @@ from ...core import InputError, Receiver, Record, receiver_arrays, stored_receiv
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
+from ...tracing.search import shoot
+from ...tracing.surfaces import scene_surfaces
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
 from ..method import field_arrays, from_field_arrays
@@ -132,9 +134,7 @@ class CsiPhysics(PhysicsModel):
     fit_facts: dict[str, float]
     task: ClassVar[str] = "csi"
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[Complex, FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))
         paths = paths_of_rows(self.model, rows)
         odds = self.visibility.log_odds(self.model.walls, self.model.images, paths)
@@ -251,9 +251,6 @@ def _start(record: Record, scene: Any | None, settings: CsiSettings, seed: int) 
     line_of_sight = np.full((1, depth), -1)
     walls, chains = no_walls(), [line_of_sight] * len(source_m)
     if scene is not None:
-        from ...tracing.search import shoot
-        from ...tracing.surfaces import scene_surfaces
-
         surfaces = scene_surfaces(scene)
         walls = walls_of(surfaces)
         for index, antenna_m in enumerate(source_m):

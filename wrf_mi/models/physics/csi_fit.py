@@ -20,7 +20,7 @@ from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from .csi_paths import CandidatePaths, Complex, Explained, Model, candidate_paths, refit
-from .csi_visibility import Learner, Visibility, prior_odds
+from .csi_visibility import MARGINS_M, Learner, Visibility, prior_odds
 
 FLIPS = (24, 24, 14, 9)
 """Hypotheses flip 1, 2, 3 or 4 of so many most uncertain paths of a row against their likelier prior state."""
@@ -195,7 +195,8 @@ class Fit:
 
     def __init__(self, model: Model, rows: Rows, settings: CsiSettings, seed: int) -> None:
         self.model, self._rows, self._settings, self._seed = model, rows, settings, seed
-        self.visibility = Visibility.of_scene(len(model.scan.edge_m), settings.outline_sd_m, seed)
+        unlearned = np.zeros(1 + 2 * len(MARGINS_M)), np.zeros(0, np.int64), np.zeros(0)
+        self.visibility = Visibility(np.zeros(len(model.scan.edge_m)), *unlearned, settings.outline_sd_m, seed)
         self.covariance = np.diag(np.square(prior_sd(model, settings)).reshape(-1))
         self.facts = {"rows": float(len(rows.channel))}
         self._paths = paths_of_rows(model, rows)

@@ -194,9 +194,7 @@ class MeasuredSpectrumPhysics(PhysicsModel):
     task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 16
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[NDArray[np.float32], FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         side = self.sides[receiver]
         posterior = side.signals.predict(tx_pos_m)
         mean, std = side.mixed(posterior, side.nearby.predict(tx_pos_m), side.nearby.std(tx_pos_m))

@@ -114,9 +114,7 @@ class RssiPhysics(PhysicsModel):
         """Whether the training rows had headings."""
         return self.field.headings
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         headings = [heading_rad]
         if self.uses_heading and heading_rad is None:
             headings = [np.full(len(tx_pos_m), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]

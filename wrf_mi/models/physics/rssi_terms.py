@@ -28,6 +28,10 @@ from ...core import InputError, Record
 from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
+from ...receivers import rssi_dbm
+from ...tracing import TraceOptions, trace_paths
+from ...tracing.devices import solid_around
+from ...tracing.solve import Prepared
 
 NEAREST_M = 0.05
 """Least distance between antennas in the law of distance."""
@@ -272,11 +276,6 @@ def trace_map(
     Raises:
         InputError: no path to a receiver from anywhere, or a scene filled by a solid.
     """
-    from ...receivers import rssi_dbm
-    from ...tracing import TraceOptions, trace_paths
-    from ...tracing.devices import solid_around
-    from ...tracing.solve import Prepared
-
     box = scene.mi_scene.bbox()
     low = np.minimum([box.min.x, box.min.y], record.tx_pos_m[:, :2].min(axis=0))
     high = np.maximum([box.max.x, box.max.y], record.tx_pos_m[:, :2].max(axis=0))

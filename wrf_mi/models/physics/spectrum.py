@@ -77,9 +77,7 @@ class SpectrumPhysics(PhysicsModel):
         """Name the receivers."""
         self.receivers = tuple(model.instrument.receiver for model in self.models)
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[NDArray[np.float32], NDArray[Any]]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         model = self.models[receiver]
         mean = model.spectra(tx_pos_m)
         return mean, mean.std(axis=(1, 2), keepdims=True) if model.error is None else model.error.astype(float)
@@ -181,7 +179,7 @@ def fit_spectrum(
 
         instrument = Spectrometer(receiver, float(record.frequencies_hz[0]), height, width, record.tx_antenna)
         report("chains of planes", 0.0)
-        model = begin(instrument, scene, settings.chaining(seed))
+        model = begin(instrument, scene, settings, seed)
         usable = np.sort(rows[~np.isnan(record.observation[index, rows]).any(axis=(1, 2))])
         if len(usable):
             spectra = np.asarray(record.observation[index, usable], np.float32)
@@ -202,7 +200,7 @@ MODEL = physics_model("spectrum", SpectrumSettings, fit_spectrum, SpectrumPhysic
 
 def _fitted(fit: Fit, model: SpectrumModel, seed: int, on_progress: OnProgress) -> tuple[SpectrumModel, dict[str, Any]]:
     """The model fitted to training rows, and facts."""
-    settings, how = fit.settings, fit.settings.chaining(seed)
+    settings = fit.settings
     everyone, truth = np.arange(len(fit.spectra)), fit.spectra[fit.validation]
     losses: dict[str, Any] = {"as given": fit.validation_loss(model)}
 
@@ -214,7 +212,7 @@ def _fitted(fit: Fit, model: SpectrumModel, seed: int, on_progress: OnProgress) 
     note("planes and materials", 0.2)
     for turn in range(settings.rounds if settings.surfaces else 0):
         before = model.learned
-        model = fit.surfaces(model, how)
+        model = fit.surfaces(model, seed)
         again = fit.constants(model, fit.rows[:SEARCHED_ROWS], rounds=0)
         model = min(model, again, key=fit.validation_loss)
         note(f"surfaces, round {turn + 1}", 0.2 + 0.5 * (turn + 1) / settings.rounds)

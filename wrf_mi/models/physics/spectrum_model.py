@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Inside, Positive
 from ...core.types import IntArray
+from ...tracing.search import shoot
+from ...tracing.surfaces import Surfaces
 from ...tracing.walls import plane_centres
 from .spectrum_fit import (
     MIXES,
@@ -25,7 +27,7 @@ from .spectrum_fit import (
     map_centres,
     scan_offsets,
 )
-from .spectrum_rays import Chaining, ChainTable, Room, find_chains
+from .spectrum_rays import ChainTable, Room
 from .spectrum_search import KINDS, Frame, KnownPaths, Search, Sheet, frames_of
 from .spectrum_waves import ComplexArray, Spectrometer, Waves
 
@@ -68,10 +70,6 @@ class SpectrumSettings(CheckedSettings):
     rest: bool = True
     steps: int = 15
     validation: Inside = 0.15
-
-    def chaining(self, seed: int) -> Chaining:
-        """Search for chains of planes."""
-        return Chaining(self.reflections, self.passed, self.rays, self.chains, seed)
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ class SpectrumModel:
         return frames_of(surfaces.normal, plane_centres(surfaces)[1], surfaces.triangles.reshape(-1, 3))
 
     def with_sheets(
-        self, sheets: list[Sheet], frames: list[Frame], how: Chaining, single: bool = False
+        self, sheets: list[Sheet], frames: list[Frame], settings: SpectrumSettings, seed: int, single: bool = False
     ) -> SpectrumModel:
         """The model with further surfaces and their chains, without learned amplitudes.
 
@@ -152,7 +150,7 @@ class SpectrumModel:
         opened = room.open()
         assert opened is not None
         new, old = opened[1], self.table.surfaces
-        chain = find_chains(opened, self.instrument.receiver.position_m, how)
+        chain = find_chains(opened, self.instrument.receiver.position_m, settings, seed)
         learned = self.learned + len(sheets)
         if single:
             first = len(room.names) - learned
@@ -220,7 +218,7 @@ class Fit:
             found = fit_constants(waves, shapes, found, prior, sd, self.settings.steps, factor)
         return model.replaced(constants=found)
 
-    def surfaces(self, model: SpectrumModel, how: Chaining) -> SpectrumModel:
+    def surfaces(self, model: SpectrumModel, seed: int) -> SpectrumModel:
         """The model with further surfaces as far as they lower the validation rows' loss; see `Search`."""
         frames = model.frames(self.tx_pos_m[self.rows])
         search, signals = self._search(model, frames, self.rows)
@@ -238,7 +236,7 @@ class Fit:
         best, lowest = model, self.validation_loss(model)
         for count in sorted({len(kept), (len(kept) + 1) // 2} - {0}, reverse=True):
             for single in (False, True):
-                trial = model.with_sheets(kept[:count], frames, how, single)
+                trial = model.with_sheets(kept[:count], frames, self.settings, seed, single)
                 loss = self.validation_loss(trial)
                 if loss < lowest:
                     best, lowest = trial, loss
@@ -302,12 +300,22 @@ class Fit:
         )
 
 
-def begin(instrument: Spectrometer, scene: Any | None, how: Chaining) -> SpectrumModel:
+def find_chains(
+    opened_room: tuple[Any, Surfaces], receiver_m: FloatArray, settings: SpectrumSettings, seed: int
+) -> IntArray:
+    """Chains of planes seen from a receiver [3] in metres: shape [c, reflections], -1 beyond the last plane."""
+    depth = settings.reflections + settings.passed
+    found = shoot(*opened_room, receiver_m, settings.rays, depth, settings.reflections, seed)
+    order = np.argsort(np.count_nonzero(found >= 0, axis=1), kind="stable")
+    return found[order[: settings.chains]]
+
+
+def begin(instrument: Spectrometer, scene: Any | None, settings: SpectrumSettings, seed: int) -> SpectrumModel:
     """The room as given, with the chains of planes that the receiver sees."""
     room = Room.of(scene)
-    none = np.full((0, max(how.reflections, 1)), -1)
-    model = SpectrumModel(instrument, room, 0, none, how.passed, Constants(np.zeros(0), room.slabs))
+    none = np.full((0, max(settings.reflections, 1)), -1)
+    model = SpectrumModel(instrument, room, 0, none, settings.passed, Constants(np.zeros(0), room.slabs))
     if scene is None:
         return model
-    chain = find_chains(model.opened, instrument.receiver.position_m, how)
+    chain = find_chains(model.opened, instrument.receiver.position_m, settings, seed)
     return model.replaced(chain=chain, constants=Constants(np.zeros(len(model.opened[1].normal)), room.slabs))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..method import Inputs, field_arrays, from_field_arrays, received_rows
+from ..method import field_arrays, from_field_arrays, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -107,11 +107,6 @@ def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntAr
             "that the uplink has, [1, rows, antennas, subcarriers]"
         )
     return received_rows(record, split, 0, name)
-
-
-def uplink_of(inputs: Inputs) -> NDArray[np.complex128]:
-    """Uplink coefficients [m, antennas, subcarriers] of rows to predict, checked by `wrf_mi.models.checks`."""
-    return np.asarray(inputs.uplink, complex)
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:

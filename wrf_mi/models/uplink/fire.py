@@ -27,7 +27,7 @@ from drjit import nn
 from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
-from ...core import Prediction, Record, Split
+from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
@@ -36,7 +36,7 @@ from ..model import Arrays, Fitted, Model, Problem
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, bands_of, known_rows, relative_error, uplink_of
+from .csi_bands import Bands, bands_of, known_rows, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096
@@ -155,7 +155,7 @@ class FittedFire(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        uplink = uplink_of(inputs)
+        uplink = np.asarray(inputs.uplink, complex)
         samples = samples_of(uplink, self.sample)
         out = predict_samples(self.network, samples, units_of(samples), len(self.bands.downlink_hz))
         return Prediction(out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64))
@@ -182,7 +182,7 @@ def predict_samples(
 
 def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
     """Fit a network, or two of which the better is kept."""
-    record, settings, seed = problem.record, problem.settings, problem.seed
+    record, settings = problem.record, problem.settings
     train, validation = known_rows(MODEL.name, record, split)
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
@@ -190,21 +190,16 @@ def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
     unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
     if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
         kinds = ("antenna",)
-    fits = [(*_fit(record, train, validation, settings, seed, session, kind), kind) for kind in kinds]
+    fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
     network, _, kind = max(fits, key=lambda fit: fit[1])
     return FittedFire(kind, network, bands, settings)
 
 
 def _fit(
-    record: Record,
-    train: IntArray,
-    validation: IntArray,
-    s: FireSettings,
-    seed: int,
-    session: FitSession,
-    sample: str,
+    problem: Problem, train: IntArray, validation: IntArray, session: FitSession, sample: str
 ) -> tuple[Fire, float]:
     """Network and its best validation score."""
+    record, s = problem.record, problem.settings
     assert record.uplink is not None
     known = np.concatenate([train, validation])
     uplink, downlink = samples_of(record.uplink[known], sample), samples_of(record.observation[0, known], sample)
@@ -218,7 +213,7 @@ def _fit(
     weight = np.where(received, np.square(np.abs(unit)) / np.where(received, energy, 1), 0).astype(np.float32)[None]
     data = {"uplink": to_tensor(x), "downlink": to_tensor(y), "weight": to_tensor(weight)}
     dr.make_opaque(data)
-    seeds = seed, int(sample == "row")
+    seeds = problem.seed, int(sample == "row")
     fire = Fire(s, len(x), len(y), np.random.default_rng(seeds))
 
     def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
@@ -231,18 +226,14 @@ def _fit(
 
     def score(fire: Fire) -> float:
         predicted = predict_samples(fire, uplink[judges], unit[judges], downlink.shape[-1])
-        return float(np.median(relative_error(_rows(predicted, per_row), _rows(downlink[judges], per_row))))
+        found, truth = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
+        return float(np.median(relative_error(found, truth)))
 
     first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
     score_or_none = score if len(validation) else None
     network = Network(f"fire {sample}", fire, loss, data, draw, first, everything, score_or_none, "relative error")
     config = s if sample == "antenna" else replace(s, batch=s.row_batch)
     return train_network(network, config, seeds, session)
-
-
-def _rows(samples: NDArray[Any], per_row: int) -> NDArray[Any]:
-    """Samples [rows * per_row, antennas, f] as [rows, all of them]."""
-    return samples.reshape(len(samples) // per_row, -1)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:

@@ -28,7 +28,7 @@ from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..method import Inputs, field_arrays, from_field_arrays
 from ..model import Fitted, Model, Problem
-from .csi_bands import known_rows, relative_error, uplink_of
+from .csi_bands import known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -65,7 +65,7 @@ class LinearMap(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        return Prediction((uplink_of(inputs) @ self.matrix).astype(np.complex64))
+        return Prediction((np.asarray(inputs.uplink, complex) @ self.matrix).astype(np.complex64))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Matrix, number of antennas and penalty."""

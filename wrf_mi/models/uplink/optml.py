@@ -20,22 +20,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.device import to_tensor, to_uint
 from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
+from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
 from ..method import keyed, settings_array, stored_settings, under
 from ..model import Arrays, Model, Problem
-from ..networks.training import NetworkSettings, network_adam
+from ..networks.layers import columns
+from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .csi_bands import Bands
-from .path_network import PathMap, Simulation, fit_paths
+from .path_network import PathMap, Simulation, side_by_side, simulate
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import Complex, Mask, Waves, waves_of
+
+MAX_VALIDATION = 100
+"""Most maps that validate."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +128,40 @@ def prune(
 
 
 def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
-    """Choose the wave model on validation rows, then learn from simulated channels."""
-    settings = problem.settings
+    """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
+    settings: OptMLSettings = problem.settings
     kind, bands = choose(MODEL.name, problem.record, split, settings, session.report)
     waves = waves_of(kind, bands, settings.max_distance_m)
-    network = fit_paths(waves, bands, settings.simulation, settings.width, settings, problem.seed, session)
+    session.report("simulating channels", 0.0)
+    rng = np.random.default_rng(problem.seed)
+    seen, truth = simulate(waves, settings.simulation, bands, rng)
+    channels, cells = seen.shape[1:]
+    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
+    around = to_uint(waves.around)
+    # One column a map, so that a batch is a choice of columns.
+    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
+    data = flat | {"around": around}
+    dr.make_opaque(data)
+
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        return opaque_rows(rows)
+
+    def chosen(maps: Any, rows: Any) -> Any:
+        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
+        return dr.reshape(x, (channels, dr.width(rows) * cells))
+
+    def loss(network: PathMap, data: Any, rows: Any) -> Any:
+        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
+        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
+
+    asked, wanted = side_by_side(seen[:judges]), side_by_side(truth[:judges]).numpy()
+
+    def score(network: PathMap) -> float:
+        return float(np.square(network(asked, around).numpy() - wanted).mean())
+
+    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
+    maps = Network("paths", PathMap(waves, settings.width, rng), loss, data, draw, *rows, score, "mean squared error")
+    network = train_network(maps, settings, (problem.seed,), session)[0]
     return OptML(kind, bands, settings, network)
 
 

@@ -19,11 +19,7 @@ from pydantic import Field
 from ...backend.device import to_tensor, to_uint
 from ...core.angles import FloatArray
 from ...core.settings import Count
-from ...core.types import IntArray
-from ...training.loop_config import LoopConfig
-from ...training.session import FitSession
-from ..networks.layers import Linear, Module, columns
-from ..networks.training import Network, opaque_rows, train_network
+from ..networks.layers import Linear, Module
 from .csi_bands import Bands
 from .uplink_waves import ArrayWaves, Complex, Waves
 
@@ -31,8 +27,6 @@ FLOOR_DB = 30.0
 """Range of maps, dB: 0 is this far below the strongest path, 1 the strongest path."""
 BLUR = 1.0
 """Width of a path in the map to be learned, in cells."""
-MAX_VALIDATION = 100
-"""Most maps that validate."""
 CHUNK_SIZE = 256
 """Maps that are made together: bounds the memory."""
 
@@ -140,7 +134,7 @@ class PathMap(Module):
         """Up to ``count`` paths of each uplink: parameters [n, count, p] and which of them rise above ``threshold``."""
         waves = self.waves
         n, channels, cells = len(h), len(waves.grid), len(waves.cosines)
-        found = self(_side_by_side(maps_of(waves, h)), to_uint(waves.around)).numpy()
+        found = self(side_by_side(maps_of(waves, h)), to_uint(waves.around)).numpy()
         found = found.reshape(channels, n, cells).transpose(1, 0, 2)
         padded = np.full((n, channels + 2, cells + 1), -np.inf, np.float32)
         padded[:, 1:-1, :-1] = found
@@ -170,49 +164,6 @@ def _patches(x: Any, around: Any, cells: int) -> Any:
     return type(x)(dr.gather(type(x.array), x.array, source, neighbour < cells), (count * channels, total))
 
 
-def _side_by_side(maps: NDArray[np.float32]) -> Any:
+def side_by_side(maps: NDArray[np.float32]) -> Any:
     """Maps [n, channels, cells] as a tensor [channels, n * cells]."""
     return to_tensor(maps.transpose(1, 0, 2).reshape(maps.shape[1], -1))
-
-
-def fit_paths(
-    waves: Waves,
-    bands: Bands,
-    simulation: Simulation,
-    width: int,
-    config: LoopConfig,
-    seed: int,
-    session: FitSession,
-) -> PathMap:
-    """Simulate channels and learn the maps of their paths by the squared error."""
-    session.report("simulating channels", 0.0)
-    rng = np.random.default_rng(seed)
-    seen, truth = simulate(waves, simulation, bands, rng)
-    channels, cells = seen.shape[1:]
-    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
-    around = to_uint(waves.around)
-    # One column a map, so that a batch is a choice of columns.
-    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
-    data = flat | {"around": around}
-    dr.make_opaque(data)
-
-    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return opaque_rows(rows)
-
-    def chosen(maps: Any, rows: Any) -> Any:
-        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
-        return dr.reshape(x, (channels, dr.width(rows) * cells))
-
-    def loss(network: PathMap, data: Any, rows: Any) -> Any:
-        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
-        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
-
-    asked, wanted = _side_by_side(seen[:judges]), _side_by_side(truth[:judges]).numpy()
-
-    def score(network: PathMap) -> float:
-        return float(np.square(network(asked, around).numpy() - wanted).mean())
-
-    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
-    network = Network("paths", PathMap(waves, width, rng), loss, data, draw, *rows, score, "mean squared error")
-    trained: PathMap = train_network(network, config, (seed,), session)[0]
-    return trained

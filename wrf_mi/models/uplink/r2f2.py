@@ -34,7 +34,7 @@ from ...core.settings import CheckedSettings, Count, Positive
 from ...training.session import FitSession, OnProgress
 from ..method import Inputs, keyed, under
 from ..model import Arrays, Fitted, Model, Problem
-from .csi_bands import Bands, bands_of, known_rows, relative_error, uplink_of
+from .csi_bands import Bands, bands_of, known_rows, relative_error
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, waves_of
 
@@ -117,7 +117,7 @@ class R2F2(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        paths = self.paths(uplink_of(inputs))
+        paths = self.paths(np.asarray(inputs.uplink, complex))
         found = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
         return Prediction(found.astype(np.complex64))
 
