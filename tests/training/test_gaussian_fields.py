@@ -15,6 +15,7 @@ from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import by_component
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import learned_field
+from wrf_mi.models import Problem
 from wrf_mi.models.method import inputs_of
 from wrf_mi.models.networks import nerf2
 from wrf_mi.models.networks.nerf2_field import Nerf2Settings
@@ -241,8 +242,8 @@ def test_fit_is_invariant_to_the_power_of_a_receiver(model: str) -> None:
 
     def predicted(one: Record):
         if model == "nerf2":
-            kept = nerf2.METHOD.fit(one, split, small, 0, FitSession())
-            return kept.predict(inputs_of(one, split.test), 1)
+            kept = nerf2.MODEL.fit(Problem(one, small, 0), split, FitSession())
+            return kept.predict(inputs_of(one, split.test), 1).mean
         own = f"model={model}", "view.components=2", "steps=10", "patience=0"
         return fitted(one, split, *own)(one.tx_pos_m[split.test], 1)
 
@@ -392,7 +393,7 @@ def test_unknown_poses_are_refused_for_fields_over_positions(model: str, lost: s
 
     def fit():
         if model == "nerf2":
-            return nerf2.METHOD.fit(record, halves(record), quick, 0, FitSession())
+            return nerf2.MODEL.fit(Problem(record, quick, 0), halves(record), FitSession())
         return Trainer(record, halves(record), config(record, f"model={model}"))
 
     with pytest.raises(InputError, match=r"made: the pose of receiver rx1 is not known.*give its position") as error:

@@ -1,11 +1,11 @@
-"""Inputs of predictions, and the short form of a model: a method that is fitted to a record's rows alone."""
+"""Inputs of predictions, rows of fits, and arrays of run files."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol, TypeVar
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.settings import settings_from
 from ..core.types import IntArray
-from ..training.session import FitSession
 
 Settings = TypeVar("Settings")
 PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
@@ -58,43 +57,6 @@ def _chosen(source: Inputs | Record, rows: slice | IntArray) -> dict[str, Any]:
     return {name: None if values is None else values[rows] for name, values in every.items()}
 
 
-class FittedRows(Protocol):
-    """A fitted `Method`."""
-
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """Observations of the receiver of that index, [m, ...] as in `wrf_mi.core.Record`."""
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that `Method.load` needs: no key begins with ``run/``."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A model that is fitted to a record's rows alone, see `wrf_mi.models.Model` for all others.
-
-    Attributes:
-        name: name as in ``wrf-mi train --model``.
-        tasks: tasks that it serves; None: all.
-        settings: frozen dataclass of its settings, all with defaults.
-        fit: ``fit(record, split, settings, seed, session)``. ``split.validation`` may choose settings; the result uses
-            all of ``split.all_train`` and no other row. Training step by step keeps a checkpoint in the session's
-            folder and continues from it; all other fits call ``session.report``.
-        load: ``load(arrays, record)``, from `FittedRows.arrays` and poses, frequencies and shapes of the record.
-        source: publication.
-        needs_uplink: whether it predicts from the uplink alone.
-        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
-    """
-
-    name: str
-    tasks: tuple[str, ...] | None
-    settings: type
-    fit: Callable[[Record, Split, Any, int, FitSession], FittedRows]
-    load: Callable[[dict[str, NDArray[Any]], Record], FittedRows]
-    source: str
-    needs_uplink: bool = False
-    several_carriers: bool = False
-
-
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
     """Rows that a receiver received: those that train at first, and those that choose settings.
 
@@ -133,6 +95,19 @@ def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[
 def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
+    named = ((one.name, getattr(value, one.name)) for one in fields(value))
+    return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
+
+
+def from_field_arrays(kind: type, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
+    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
+    names = (one.name for one in fields(kind) if f"{prefix}{one.name}" in arrays)
+    stored = {name: arrays[f"{prefix}{name}"] for name in names}
+    return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
 
 
 def settings_array(settings: Any) -> NDArray[Any]:

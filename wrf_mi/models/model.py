@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,9 +16,8 @@ from ..core import AntennaOptions, Prediction, Receiver, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.types import IntArray
 from ..parallel import Scheduler
-from ..training.checkpoint import checkpoint_seconds
 from ..training.session import FitSession
-from .method import FittedRows, Inputs, Method
+from .method import Inputs
 
 Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
@@ -140,15 +138,15 @@ class Fitted(ABC):
 class Model:
     """An entry of the registry.
 
-    A model of another package is a `Model`, or a `wrf_mi.models.method.Method`, that an entry point of the group
-    ``wrf_mi.models`` names.
+    A model of another package is a `Model` that an entry point of the group ``wrf_mi.models`` names.
 
     Attributes:
         name: name as in ``wrf-mi train --model``.
         tasks: tasks that it serves; None: all.
         settings: frozen dataclass of its settings, all with defaults; or several by purpose (`by_data`).
         fit: ``fit(problem, split, session)``. ``split.validation`` may choose settings; the result uses no row but
-            ``problem.rows(split)``. It may continue from its files in ``session.folder``.
+            ``problem.rows(split)``. Training step by step keeps a checkpoint in ``session.folder`` and continues from
+            it; all other fits call ``session.report``.
         load: ``load(arrays, problem, folder)``, from `Fitted.arrays`; ``folder`` holds the fitted model.
         source: publication.
         scene: whether it takes a scene.
@@ -188,11 +186,6 @@ class Model:
     prepare: Callable[[Problem, Sequence[Split], Session], Any] | None = None
     by_data: Callable[[str, bool], Model] | None = None
 
-    @property
-    def needs_uplink(self) -> bool:
-        """Whether it predicts from the uplink alone."""
-        return self.uplink == "required"
-
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks
@@ -200,39 +193,3 @@ class Model:
     def serving(self, task: str, with_scene: bool) -> Model:
         """The entry for data of a task, with or without a scene."""
         return self if self.by_data is None or not self.serves(task) else self.by_data(task, with_scene)
-
-
-class FittedMethod(Fitted):
-    """A fitted `Method` as a fitted model, without standard deviations."""
-
-    def __init__(self, fitted: FittedRows, train_seconds: float | None = None) -> None:
-        self.fitted, self.train_seconds = fitted, train_seconds
-
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Observations of the receiver of that index, [m, ...]."""
-        return Prediction(self.fitted.predict(inputs, receiver))
-
-    def arrays(self) -> Arrays:
-        """All that `Method.load` needs."""
-        return self.fitted.arrays()
-
-
-def model_of(method: Method) -> Model:
-    """The entry of a model that is fitted to a record's rows alone."""
-
-    def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-        before, start = checkpoint_seconds(session.folder), time.perf_counter()
-        fitted = method.fit(problem.record, split, problem.settings, problem.seed, session)
-        return FittedMethod(fitted, before + time.perf_counter() - start)
-
-    return Model(
-        method.name,
-        method.tasks,
-        method.settings,
-        fit,
-        lambda arrays, problem, folder: FittedMethod(method.load(arrays, problem.record)),
-        method.source,
-        uplink="required" if method.needs_uplink else "optional",
-        several_carriers=method.several_carriers,
-        headings=True,
-    )

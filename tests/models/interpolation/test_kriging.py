@@ -149,11 +149,15 @@ def test_standard_deviation_is_calibrated_on_held_out_rows():
 def test_bad_arguments_are_refused():
     positions, heading, rng = made(6)
     values = rng.normal(size=6)
-    for wrong in ({"length_m": 0.0}, {"noise": -0.1}, {"heading_length": np.nan}, {"kernel": "cubic"}):
-        with pytest.raises(InputError, match="kriging: "):
+    for wrong in (
+        {"length_m": 0.0},
+        {"noise": -0.1},
+        {"heading_length": np.nan},
+        {"kernel": "cubic"},
+        {"likelihood_rows": 1},
+    ):
+        with pytest.raises(InputError, match=f"setting {next(iter(wrong))}: "):
             Kriging(**wrong)
-    with pytest.raises(InputError, match="likelihood of 1 rows"):
-        Kriging(likelihood_rows=1)
     for model in (Kriging(1.0, 0.1), Trees(2)):
         with pytest.raises(InputError, match="6 positions and 5 observations"):
             model.fit(positions, values[:5])

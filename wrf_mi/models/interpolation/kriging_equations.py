@@ -156,12 +156,3 @@ def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, floa
     weights = -column.conj() @ precision[block]
     weights[block] = 0
     return weights, float((unit @ column).real)
-
-
-def simple_weights(covariance: FloatArray, cross: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Simple kriging of m positions from k rows each: weights [m, k], and the reduction of the variance [m].
-
-    ``covariance`` of each position's rows includes noise [m, k, k]; ``cross`` is that of the position with them [m, k].
-    """
-    weights = np.asarray(np.linalg.solve(covariance, cross[..., None])[..., 0], float)
-    return weights, np.asarray((weights * cross).sum(axis=-1))

@@ -76,8 +76,9 @@ class _Patches(dr.CustomOp):
         column = grid.wrapped(grid.wrapped(column + tap % side + (grid.width - 1)))
         return dr.gather(type(x), x, grid.index(image, row - 1, column), (row >= 1) & (row <= grid.height))
 
-    def _adjoint(self, g: Any) -> Any:
+    def backward(self) -> None:
         channels, grid, side = self.sizes
+        g: Any = self.grad_out()
         per_tap = channels * grid.columns
         image, row, column = grid.at(dr.arange(dr.uint32_array_t(type(g)), per_tap))
         total: Any = 0
@@ -89,14 +90,7 @@ class _Patches(dr.CustomOp):
                 beside = grid.wrapped(grid.wrapped(column + (grid.width + 1 - right)))
                 index = (down * side + right) * per_tap + grid.index(image, above, beside)
                 total = total + dr.gather(type(g), g, index, inside)
-        return total
-
-    def forward(self) -> None:
-        channels, grid, side = self.sizes
-        self.set_grad_out(_Patches.eval(self, self.grad_in("x"), channels, grid, side))
-
-    def backward(self) -> None:
-        self.set_grad_in("x", self._adjoint(self.grad_out()))
+        self.set_grad_in("x", total)
 
     def name(self) -> str:
         return "patches"

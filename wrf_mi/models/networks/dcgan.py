@@ -29,8 +29,7 @@ from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from .conv import Convolution, Grid, InstanceNorm, coarser, finer, resized
-from .coordinates import feature_count
-from .layers import GAIN, Linear, Module, columns, relu, sigmoid
+from .layers import GAIN, Linear, Module, columns, feature_count, relu, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 
@@ -40,8 +39,6 @@ leaky = nn.LeakyReLU(0.2)
 """Activation of the discriminator (Radford et al.)."""
 MOMENTUM = 0.5
 """Adam's decay of the first moment (Radford et al.)."""
-CHUNK_SIZE = 16
-"""Spectra that are predicted together: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +171,7 @@ def network(rows: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> N
     """Generator and discriminator of a receiver, to be trained together."""
     data = {"where": rows.where, "truth": to_float(rows.spectra)}
     dr.make_opaque(data)
-    dcgan = Dcgan(s, rows.shape, rng)
+    dcgan = Dcgan(s, rows.spectra.shape[1:], rng)
     # The generator starts near the mean grey of the rows that it may learn from.
     grey = float(np.clip(rows.spectra[: rows.train].mean(dtype=np.float64), 0.01, 0.99))
     dcgan.g.layers[-1].bias += np.float32(np.log(grey / (1 - grey)))
@@ -193,7 +190,7 @@ KIND = SpectrumNetwork(
     network,
     Generator,
     "g",
-    CHUNK_SIZE,
+    16,
     "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
 )
-METHOD = KIND.method()
+MODEL = KIND.model()

@@ -106,8 +106,7 @@ class AnisotropicKriging:
         centred = flat - self._mean.astype(np.float32) @ flat
         squares = np.einsum("np,np->p", self._precision.astype(np.float32) @ centred, centred)
         variance = squares / max(len(centred) - 1, 1)
-        result: FloatArray = np.sqrt(np.maximum(variance, 0)).reshape(self.observed.shape[1:])
-        return result
+        return np.asarray(np.sqrt(np.maximum(variance, 0)).reshape(self.observed.shape[1:]))
 
     def held_out(self, radius_m: float, rows: IntArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Prediction and deviation at rows [q] from rows beyond ``radius_m``; without any, the mean of all."""

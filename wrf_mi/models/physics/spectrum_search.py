@@ -19,9 +19,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.image_method import mirrored
 from ...tracing.slab import slab
-from .spectrum_gains import gains, spherical_waves
-from .spectrum_loss import ComplexArray, Spectrometer
 from .spectrum_rays import ChainPaths, ChainTable
+from .spectrum_waves import ComplexArray, Spectrometer, gains, spherical_waves
 
 KINDS = np.array([[1.0, 1e7, 0.002], [2.6, 0.02, 0.02]]).T
 """Relative permittivity, conductivity (S/m) and thickness (m) of a sheet, [3, kinds]: metal, or a wooden board."""
