@@ -133,8 +133,8 @@ CSI, YML = "csidata.npy", "base-station.yml"
 WRONG: dict[str, tuple[Change, str, str]] = {
     "no channels": (lambda folder: (folder / CSI).unlink(), CSI, "missing"),
     "no station": (lambda folder: (folder / YML).unlink(), YML, "missing"),
-    "damaged": (write(CSI, "no array"), CSI, "not readable as .npy"),
-    "pickled": (save(np.array([{}], object)), CSI, "not readable as .npy"),
+    "damaged": (write(CSI, "no array"), CSI, "not readable .*; write it again"),
+    "pickled": (save(np.array([{}], object)), CSI, "not readable .*; write it again"),
     "real": (save(channels().real), CSI, "holds float64; give complex numbers"),
     "two axes": (save(channels()[0]), CSI, r"shape \[3, 8\]; give complex numbers \[samples, antennas, subcarriers\]"),
     "nothing": (save(channels()[:0]), CSI, r"shape \[0, 3, 8\]"),

@@ -206,9 +206,7 @@ def _workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_workers(), "wrf-mi-operator")
+_POOL = ThreadPoolExecutor(_workers(), "wrf-mi-operator")  # without a thread until its first use
 
 
 class _Operator(ABC):
@@ -242,7 +240,7 @@ class _Operator(ABC):
 
         blocks = range(0, len(rows), BLOCK)
         with _blas().limit(limits=1, user_api="blas"):
-            list(_pool().map(compute, blocks) if len(blocks) > 1 and _workers() > 1 else map(compute, blocks))
+            list(_POOL.map(compute, blocks) if len(blocks) > 1 and _workers() > 1 else map(compute, blocks))
         return out.reshape(len(rows), self.height, self.width)
 
 

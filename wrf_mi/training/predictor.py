@@ -109,24 +109,18 @@ class Predictor:
             self._still = StaticOperator(self._field, params, self.receivers, *size, self._store)
         return self._still
 
-    @property
-    def uses_heading(self) -> bool:
-        """Whether predictions depend on the transmitters' headings: a trained pattern turns with them."""
-        return self.graph.form.headings
-
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
         """Predictions [m, ...] for rows of a record at one receiver (`__call__`)."""
         uplink = None if record.uplink is None else record.uplink[rows]
-        heading = record.tx_heading_rad[rows] if self.uses_heading and record.tx_heading_rad is not None else None
-        return self(record.tx_pos_m[rows], receiver, uplink, heading)
+        turned = record.tx_heading_rad if self.graph.form.headings else None
+        return self(record.tx_pos_m[rows], receiver, uplink, None if turned is None else turned[rows])
 
     def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
         """Checked headings, or None where they are not used."""
-        if (tx_heading_rad is not None) != self.uses_heading:
-            text = "needs headings; give heading_rad"
-            if not self.uses_heading:
-                text = "does not know how the transmitter is turned; omit heading_rad"
-            raise InputError(f"transmitter: the model {text}")
+        used = self.graph.form.headings  # a trained pattern turns with them
+        if (tx_heading_rad is not None) != used:
+            unused = "does not know how the transmitter is turned; omit heading_rad"
+            raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")
         if tx_heading_rad is None:
             return None
         heading = np.asarray(tx_heading_rad, float)
@@ -257,7 +251,7 @@ class Predictor:
             receiver: name, or number from 0, of one of ``receivers``.
             uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them instead of
                 positions.
-            tx_heading_rad: yaw of each transmitter [m], radians, if and only if ``uses_heading``.
+            tx_heading_rad: yaw of each transmitter [m], radians, if and only if the form has ``headings``.
 
         Returns:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
