@@ -45,8 +45,7 @@ from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField
 from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field
-from .method import Inputs
-from .model import Arrays, Fitted, Model, Problem, Session
+from .model import Arrays, Fitted, Inputs, Model, Problem, Session
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"

@@ -20,7 +20,7 @@ from ..datasets import make_splits
 from ..datasets.observations import scorable
 from ..models import Fitted, Problem
 from ..models.interpolation.idw import InverseDistance
-from ..models.method import inputs_of
+from ..models.model import inputs_of
 from ..tasks import TASKS, UPLINK, Task
 from ..tasks.scores import inside_interval, summary
 from ..training.trainer import peak_memory_mb

@@ -13,7 +13,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines, write_atomically
-from ..models.method import Inputs
+from ..models.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS

@@ -30,7 +30,10 @@ from ...core import Record, Split
 from ...core.types import IntArray
 from ...tasks.conditions import channel_scales, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
-from ..method import (
+from ..model import (
+    Arrays,
+    Model,
+    Problem,
     from_field_arrays,
     inputs_of,
     known_positions,
@@ -38,7 +41,6 @@ from ..method import (
     stored_settings,
     under,
 )
-from ..model import Arrays, Model, Problem
 from .layers import Coordinates, columns
 from .nerf2_field import Field, Nerf2Settings, step_loss
 from .nerf2_march import Nerf2Network

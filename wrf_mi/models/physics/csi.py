@@ -28,8 +28,7 @@ from ...tracing.search import shoot
 from ...tracing.surfaces import scene_surfaces
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, NUMBERS, Complex, Model, images_of
 from .csi_visibility import Visibility

@@ -39,8 +39,7 @@ from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays
 from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .selection import PhysicsModel, physics_model
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals

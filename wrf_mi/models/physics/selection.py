@@ -18,8 +18,7 @@ from ...core.types import IntArray
 from ...tracing.polarization import check_polarization
 from ...tracing.solve import Prepared
 from ...training.session import OnProgress
-from ..method import Inputs
-from ..model import Arrays, Fitted, Model, Problem, Session
+from ..model import Arrays, Fitted, Inputs, Model, Problem, Session
 
 logger = logging.getLogger(__name__)
 

@@ -34,7 +34,7 @@ from ...core.types import IntArray
 from ...receivers.beams import mirror_order
 from ...receivers.retrieve import align_signals
 from ..interpolation.kriging_equations import KrigingSystem, left_out
-from ..method import field_arrays, from_field_arrays
+from ..model import field_arrays, from_field_arrays
 from .anisotropic_kriging import chosen_rows
 
 ComplexArray = NDArray[np.complex128]

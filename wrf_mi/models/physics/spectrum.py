@@ -28,8 +28,7 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays, keyed, under
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
 from .selection import PhysicsModel, physics_model
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin

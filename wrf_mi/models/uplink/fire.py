@@ -31,8 +31,7 @@ from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, keyed, settings_array, stored_settings, under
-from ..model import Arrays, Fitted, Model, Problem
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence

@@ -26,8 +26,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, field_arrays, from_field_arrays
-from ..model import Fitted, Model, Problem
+from ..model import Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays
 from .csi_bands import known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
