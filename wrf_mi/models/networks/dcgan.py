@@ -23,6 +23,7 @@ layer?", 2016): `finer`. A convolution of stride two is the reverse: `coarser`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any
 
 import drjit as dr
@@ -339,7 +340,7 @@ def network(rows: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> N
     def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
         return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, len(chosen))))}
 
-    both = rows.network(KIND, dcgan, lambda dcgan, data, given: duel_loss(dcgan, data, given, s), data, draw)
+    both = rows.network(KIND, dcgan, partial(duel_loss, s=s), data, draw)
     rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), s.adversary_rate)
     return replace(both, rates=rates, momentum=MOMENTUM)
 

@@ -18,6 +18,7 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +100,6 @@ def _fit_group(
         rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
-    def loss(network: Nerf2Network, data: Any, given: Any) -> Any:
-        return step_loss(network, data, given, field)
-
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
     def score(network: Nerf2Network) -> float:
@@ -119,8 +117,8 @@ def _fit_group(
     everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
-    score_or_none = score if able else None
-    network = Network(name, initial, loss, data, draw, train, everything, score_or_none, "mean squared error")
+    rows_of = draw, train, everything, score if able else None
+    network = Network(name, initial, partial(step_loss, field=field), data, *rows_of, "mean squared error")
     trained: Nerf2Network = train_network(network, config, (seed, *members), session)[0]
     return trained
 

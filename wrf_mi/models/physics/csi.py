@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,7 +131,6 @@ class CsiPhysics(PhysicsModel):
     sharpness: float
     covariance: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "csi"
 
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))

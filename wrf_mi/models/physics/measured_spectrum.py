@@ -190,7 +190,6 @@ class MeasuredSpectrumPhysics(PhysicsModel):
     sides: tuple[Side, ...]
     frequency_hz: float
     shape: tuple[int, int]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 16
 
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:

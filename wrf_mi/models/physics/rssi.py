@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +106,6 @@ class RssiPhysics(PhysicsModel):
     shift_db: float
     widen: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "rssi"
 
     @property
     def uses_heading(self) -> bool:

@@ -27,12 +27,10 @@ class PhysicsModel(ABC):
     """A fitted physics model.
 
     Attributes:
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``.
         chunk_size: transmitters that are predicted together, which bounds the memory.
         receivers: receivers whose observations are predicted, in the record's order.
     """
 
-    task: ClassVar[str]
     chunk_size: ClassVar[int] = 1024
     receivers: tuple[Receiver, ...]
 

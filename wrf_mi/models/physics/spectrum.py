@@ -69,7 +69,6 @@ class SpectrumPhysics(PhysicsModel):
 
     models: tuple[SpectrumModel, ...]
     fit_facts: dict[str, Any]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 256
 
     def __post_init__(self) -> None:
