@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..training.session import FitSession
 
-Settings = TypeVar("Settings")
+Kind = TypeVar("Kind")
 Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
 UNUSED_UPLINK = "its model does not predict from the uplink; omit uplink"
@@ -283,9 +283,9 @@ def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
     return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
 
 
-def from_field_arrays(kind: type, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Any:
+def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
     """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    names = (one.name for one in fields(kind) if f"{prefix}{one.name}" in arrays)
+    names = (one.name for one in fields(cast(Any, kind)) if f"{prefix}{one.name}" in arrays)
     stored = {name: arrays[f"{prefix}{name}"] for name in names}
     return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
 
@@ -295,6 +295,6 @@ def settings_array(settings: Any) -> NDArray[Any]:
     return np.asarray(json.dumps(asdict(settings)))
 
 
-def stored_settings(kind: type[Settings], arrays: Mapping[str, NDArray[Any]], name: str) -> Settings:
+def stored_settings(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], name: str) -> Kind:
     """Settings of a run file, from `settings_array`."""
     return settings_from(kind, json.loads(str(arrays["settings"])), name)
