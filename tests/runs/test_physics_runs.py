@@ -268,7 +268,7 @@ def test_bad_calls_are_refused(
         ([*train, "--split", "nowhere"], "split 'nowhere'"),
         ([*train, "--split", ""], "split ''"),
         ([*train, "--seed", -1], "seed -1"),
-        ([*train, "--set", "lengths=0"], "setting lengths: 0; choose 1 or more"),
+        ([*train, "--set", "lengths=0"], "setting lengths: 0 is out of range, choose 1 or more"),
         ([*train, "--set", "lengths=many"], "expected int, got 'many'"),
         (
             [*train, "--material", "concrete"],

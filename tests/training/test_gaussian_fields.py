@@ -16,7 +16,7 @@ from wrf_mi.gaussians.parameters import by_component
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.models import Problem
-from wrf_mi.models.method import inputs_of
+from wrf_mi.models.model import inputs_of
 from wrf_mi.models.networks import nerf2
 from wrf_mi.models.networks.nerf2_field import Nerf2Settings
 from wrf_mi.models.networks.nerf2_march import Networks

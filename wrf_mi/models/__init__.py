@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from ..core import InputError
 from ..core.registry import Registry
 from ..training.session import Interrupted
-from .method import Inputs
-from .model import Fitted, Model, Problem, Session
+from .model import Fitted, Inputs, Model, Problem, Session
 
 ENTRY_POINTS = "wrf_mi.models"
 """Group of the entry points by which other packages add models."""

@@ -11,7 +11,7 @@ from ..core import InputError, Record
 from ..core.carriers import carriers_text
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
-from .method import Inputs
+from .model import Inputs
 
 if TYPE_CHECKING:
     from .model import Model

@@ -21,7 +21,7 @@ from ..datasets.observations import scorable
 from ..models import Fitted, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.idw import IdwSettings
-from ..models.method import inputs_of
+from ..models.model import inputs_of
 from ..tasks import TASKS, UPLINK
 from ..tasks.scores import inside_interval, summary
 from ..training.trainer import peak_memory_mb

@@ -15,7 +15,7 @@ from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_atomically
 from ..datasets.folder_files import read_csv
-from ..models.method import Inputs
+from ..models.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS

@@ -21,7 +21,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models import Model, Problem
-from wrf_mi.models.method import inputs_of
+from wrf_mi.models.model import inputs_of
 from wrf_mi.models.networks import dcgan, nerf2, vae
 from wrf_mi.models.networks.dcgan import DcganSettings
 from wrf_mi.models.networks.nerf2 import Nerf2Settings

@@ -13,9 +13,20 @@ import pytest
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import with_settings
-from wrf_mi.models.method import field_arrays, from_field_arrays
-from wrf_mi.models.networks.conv import NORM_FLOOR, Convolution, Grid, InstanceNorm, coarser, finer, patches, resized
-from wrf_mi.models.networks.dcgan import DcganSettings, Generator, softplus
+from wrf_mi.models.model import field_arrays, from_field_arrays
+from wrf_mi.models.networks.dcgan import (
+    NORM_FLOOR,
+    Convolution,
+    DcganSettings,
+    Generator,
+    Grid,
+    InstanceNorm,
+    coarser,
+    finer,
+    patches,
+    resized,
+    softplus,
+)
 from wrf_mi.models.networks.layers import Coordinates, Module, columns
 from wrf_mi.models.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
 from wrf_mi.models.networks.training import Network, NetworkSettings, NetworkTrainer

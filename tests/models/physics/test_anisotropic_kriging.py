@@ -12,10 +12,10 @@ from made_waves import FREQUENCY_HZ, SIZE, WAVELENGTH_M, positions, wave_record,
 from scipy.spatial.distance import cdist
 
 from wrf_mi.core import InputError, Record
-from wrf_mi.models.method import field_arrays, from_field_arrays
-from wrf_mi.models.physics import anisotropic_kriging as nearby
+from wrf_mi.models.interpolation import kriging_equations as nearby
+from wrf_mi.models.interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
+from wrf_mi.models.model import field_arrays, from_field_arrays
 from wrf_mi.models.physics import measured_spectrum
-from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
 from wrf_mi.models.physics.measured_spectrum import (
     GAPS,
     LEAST_ROWS,

@@ -14,7 +14,7 @@ from small_fits import network_settings
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models import Problem
-from wrf_mi.models.method import Inputs, inputs_of
+from wrf_mi.models.model import Inputs, inputs_of
 from wrf_mi.models.networks import nerf2
 from wrf_mi.models.networks.nerf2_field import Nerf2Settings
 from wrf_mi.models.networks.nerf2_march import Networks

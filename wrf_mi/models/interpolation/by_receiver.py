@@ -15,8 +15,7 @@ from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, keyed, known_positions, under
-from ..model import Arrays, Fitted, Model, Problem
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
 HEADING, CARRIERS = "heading", "carriers_hz"
 """Keys of the arrays: whether headings are used, and the carriers where there are several."""
@@ -137,9 +136,7 @@ def model_by_receiver(
         known_positions(record, rows, name)
         headings = record.tx_heading_rad if heading(record, problem.settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
-        parts = (
-            [rows] if stated is None or carriers is None else [rows[stated[rows] == carrier] for carrier in carriers]
-        )
+        parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
         models: list[Single] = []
         for part in parts:
             turned = None if headings is None else headings[part]

@@ -100,12 +100,6 @@ class Kriged:
     variance: FloatArray | None = None
     system: KrigingSystem | None = None
 
-    @property
-    def chosen(self) -> dict[str, float]:
-        """Length in metres, noise as a share of the variance, and the heading's length where there is one."""
-        names = ("length_m", "heading_length")
-        return dict(zip(names, map(float, self.lengths), strict=False)) | {"noise": float(self.noise)}
-
     def _correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
         """Correlations [m, n] of positions [m, 3] with the rows."""
         if (tx_heading_rad is None) != (self.circle is None):

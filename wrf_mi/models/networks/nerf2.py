@@ -18,6 +18,7 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,10 @@ from ...core import Record, Split
 from ...core.types import IntArray
 from ...tasks.conditions import channel_scales, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
-from ..method import (
+from ..model import (
+    Arrays,
+    Model,
+    Problem,
     from_field_arrays,
     inputs_of,
     known_positions,
@@ -38,7 +42,6 @@ from ..method import (
     stored_settings,
     under,
 )
-from ..model import Arrays, Model, Problem
 from .layers import Coordinates, columns
 from .nerf2_field import Field, Nerf2Settings, step_loss
 from .nerf2_march import Nerf2Network
@@ -97,9 +100,6 @@ def _fit_group(
         rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
-    def loss(network: Nerf2Network, data: Any, given: Any) -> Any:
-        return step_loss(network, data, given, field)
-
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
     def score(network: Nerf2Network) -> float:
@@ -117,8 +117,8 @@ def _fit_group(
     everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
-    score_or_none = score if able else None
-    network = Network(name, initial, loss, data, draw, train, everything, score_or_none, "mean squared error")
+    rows_of = draw, train, everything, score if able else None
+    network = Network(name, initial, partial(step_loss, field=field), data, *rows_of, "mean squared error")
     trained: Nerf2Network = train_network(network, config, (seed, *members), session)[0]
     return trained
 

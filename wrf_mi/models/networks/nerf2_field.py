@@ -24,8 +24,7 @@ from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
 from ...tasks.conditions import channels_from, known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import AdamConfig
-from ..method import Inputs, field_arrays, keyed, settings_array
-from ..model import Fitted
+from ..model import Fitted, Inputs, field_arrays, keyed, settings_array
 from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
 from .training import NetworkSettings, network_adam, opaque_rows

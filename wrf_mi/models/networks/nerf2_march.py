@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -166,8 +166,7 @@ def march(network: Nerf2Network, seen: Seen, condition: Any, samples: int) -> tu
     amplitude: Any = dr.reshape(strength(out[:outputs, :]), (outputs, batch, n))
     angle: Any = dr.reshape(phase(out[outputs:, :]), (outputs, batch, n))
     sine, cosine = dr.sincos(angle)
-    weights: list[Any] = [dr.reshape(w, (outputs, 1, n)) for w in (seen.weight_re, seen.weight_im)]
-    w_re, w_im = weights
+    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (seen.weight_re, seen.weight_im))
     re = amplitude * (cosine * w_re - sine * w_im)
     im = amplitude * (cosine * w_im + sine * w_re)
     return dr.block_sum(re.array, samples), dr.block_sum(im.array, samples)

@@ -17,8 +17,12 @@ from ...core import Prediction, Split
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
-from ..method import (
+from ..model import (
+    Arrays,
+    Fitted,
     Inputs,
+    Model,
+    Problem,
     field_arrays,
     from_field_arrays,
     keyed,
@@ -28,7 +32,6 @@ from ..method import (
     stored_settings,
     under,
 )
-from ..model import Arrays, Fitted, Model, Problem
 from .layers import Coordinates
 from .training import Network, train_network
 

@@ -14,6 +14,7 @@ output representation using deep conditional generative models" (2015). Chosen h
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -137,7 +138,7 @@ def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Net
         noise, prior = rng.standard_normal((2, s.latent, len(chosen)))
         return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
 
-    return rows.network(KIND, vae, lambda vae, data, given: elbo_loss(vae, data, given, s), data, draw)
+    return rows.network(KIND, vae, partial(elbo_loss, s=s), data, draw)
 
 
 KIND = SpectrumNetwork(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ from ...tracing.search import shoot
 from ...tracing.surfaces import scene_surfaces
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
 from .csi_paths import MOUNTED_M, NUMBERS, Complex, Model, images_of
 from .csi_visibility import Visibility
@@ -132,7 +131,6 @@ class CsiPhysics(PhysicsModel):
     sharpness: float
     covariance: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "csi"
 
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))

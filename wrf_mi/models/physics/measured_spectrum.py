@@ -6,7 +6,7 @@ Two estimates of a spectrum are mixed:
   leaving within a cone around the line of sight (`wrf_mi.models.physics.signals`), and the spectrum to be expected from
   them: at each direction the beam former's output is a complex Gaussian number, so its magnitude is Rician;
 - *nearby*: kriging of the spectra themselves along and across the line of sight
-  (`wrf_mi.models.physics.anisotropic_kriging`).
+  (`wrf_mi.models.interpolation.kriging_equations`).
 
 Kriging is best over millimetres, as it needs no phase, and the signals over a wavelength; beyond, the mean of the
 spectra, to which kriging falls back, is safest. So the signals have the weight v^2 / (v^2 + c^2) (1 - v), v being their
@@ -39,9 +39,8 @@ from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays
-from ..model import Arrays
-from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
+from ..interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
+from ..model import Arrays, field_arrays, from_field_arrays
 from .selection import PhysicsModel, physics_model
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
@@ -191,7 +190,6 @@ class MeasuredSpectrumPhysics(PhysicsModel):
     sides: tuple[Side, ...]
     frequency_hz: float
     shape: tuple[int, int]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 16
 
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:

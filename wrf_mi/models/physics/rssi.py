@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
 from .rssi_terms import Hyperparameters, Measured, Poses, PowerMap, Stops, stops_of, trace_map
 from .selection import PhysicsModel, physics_model
@@ -107,7 +106,6 @@ class RssiPhysics(PhysicsModel):
     shift_db: float
     widen: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "rssi"
 
     @property
     def uses_heading(self) -> bool:
@@ -128,7 +126,7 @@ class RssiPhysics(PhysicsModel):
         stops, prior = field.stops, field.prior
         arrays: dict[str, Any] = {
             **receiver_arrays(self.receivers),
-            "stop.position_m": stops.poses.position_m,
+            **field_arrays(stops.poses, "stop."),
             **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
             "base": np.array([prior.transmit_dbm, prior.frequency_hz]),
             "prior.shared": prior.sd,
@@ -141,8 +139,6 @@ class RssiPhysics(PhysicsModel):
             "fact.value": np.array(list(self.fit_facts.values()), float),
             **field_arrays(field.hyperparameters, "knob."),
         }
-        if stops.poses.heading_rad is not None:
-            arrays["stop.heading_rad"] = stops.poses.heading_rad
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced, "map.")
         return {name: np.asarray(value) for name, value in arrays.items()}
@@ -155,8 +151,12 @@ class RssiPhysics(PhysicsModel):
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receiver_position_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        poses = Poses(arrays["stop.position_m"], arrays.get("stop.heading_rad"))
-        stops = Stops(poses, arrays["stop.value_dbm"], arrays["stop.count"], arrays["stop.row"])
+        stops = Stops(
+            from_field_arrays(Poses, arrays, "stop."),
+            arrays["stop.value_dbm"],
+            arrays["stop.count"],
+            arrays["stop.row"],
+        )
         field = Field(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(stored_receivers(arrays), field, float(arrays["shift_db"]), arrays["widen"], facts)

@@ -59,7 +59,7 @@ class Poses:
     """Positions [n, 3] and headings [n] of the transmitter; None where the data have no headings."""
 
     position_m: FloatArray
-    heading_rad: FloatArray | None
+    heading_rad: FloatArray | None = None
 
     def __len__(self) -> int:
         """Number of poses."""

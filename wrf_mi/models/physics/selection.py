@@ -18,8 +18,7 @@ from ...core.types import IntArray
 from ...tracing.polarization import check_polarization
 from ...tracing.solve import Prepared
 from ...training.session import OnProgress
-from ..method import Inputs
-from ..model import Arrays, Fitted, Model, Problem, Session
+from ..model import Arrays, Fitted, Inputs, Model, Problem, Session
 
 logger = logging.getLogger(__name__)
 
@@ -28,12 +27,10 @@ class PhysicsModel(ABC):
     """A fitted physics model.
 
     Attributes:
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``.
         chunk_size: transmitters that are predicted together, which bounds the memory.
         receivers: receivers whose observations are predicted, in the record's order.
     """
 
-    task: ClassVar[str]
     chunk_size: ClassVar[int] = 1024
     receivers: tuple[Receiver, ...]
 

@@ -33,9 +33,8 @@ from ...core.angles import FloatArray, fibonacci_sphere
 from ...core.types import IntArray
 from ...receivers.beams import mirror_order
 from ...receivers.retrieve import align_signals
-from ..interpolation.kriging_equations import KrigingSystem, left_out
-from ..method import field_arrays, from_field_arrays
-from .anisotropic_kriging import chosen_rows
+from ..interpolation.kriging_equations import KrigingSystem, chosen_rows, left_out
+from ..model import field_arrays, from_field_arrays
 
 ComplexArray = NDArray[np.complex128]
 LEAST_NOISE = 3e-3

@@ -28,8 +28,7 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from ..method import field_arrays, from_field_arrays, keyed, under
-from ..model import Arrays
+from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
 from .selection import PhysicsModel, physics_model
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin
@@ -70,7 +69,6 @@ class SpectrumPhysics(PhysicsModel):
 
     models: tuple[SpectrumModel, ...]
     fit_facts: dict[str, Any]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 256
 
     def __post_init__(self) -> None:

@@ -175,6 +175,7 @@ class SpectrumModel:
         return model
 
 
+@dataclass
 class Fit:
     """Fits a `SpectrumModel` to rows [n, 3] with spectra [n, height, width].
 
@@ -182,18 +183,16 @@ class Fit:
     take four times as many.
     """
 
-    def __init__(
-        self,
-        instrument: Spectrometer,
-        tx_pos_m: FloatArray,
-        spectra: NDArray[np.float32],
-        rows: IntArray,
-        validation: IntArray,
-        settings: SpectrumSettings,
-    ) -> None:
-        self.tx_pos_m, self.rows, self.validation, self.spectra = tx_pos_m, rows, validation, spectra
-        self.instrument, self.shapes = instrument, instrument.grid.shapes(spectra)
-        self.settings = settings
+    instrument: Spectrometer
+    tx_pos_m: FloatArray
+    spectra: NDArray[np.float32]
+    rows: IntArray
+    validation: IntArray
+    settings: SpectrumSettings
+
+    def __post_init__(self) -> None:
+        """Take the spectra's shapes on the grid."""
+        self.shapes = self.instrument.grid.shapes(self.spectra)
 
     def losses(self, model: SpectrumModel, rows: IntArray, waves: Waves | None = None) -> FloatArray:
         """Loss of each of some rows."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..method import field_arrays, from_field_arrays, received_rows
+from ..model import field_arrays, from_field_arrays, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -95,7 +95,7 @@ def principal(elements_m: FloatArray) -> FloatArray:
 
 
 def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.method.received_rows`.
+    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
 
     Raises:
         InputError: several receivers, no axis of antennas, or fewer than two rows.

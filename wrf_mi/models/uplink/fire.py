@@ -18,6 +18,7 @@ are divided by the uplink's scale and phase. Chosen here:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,8 +32,7 @@ from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, keyed, settings_array, stored_settings, under
-from ..model import Arrays, Fitted, Model, Problem
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
@@ -219,9 +219,6 @@ def _fit(
     def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
         return {"rows": opaque_rows(rows), "noise": to_tensor(rng.standard_normal((s.latent, len(rows))))}
 
-    def loss(fire: Fire, data: Any, given: Any) -> Any:
-        return fire_loss(fire, data, given, s.beta)
-
     judges = slice(len(train) * per_row, None)
 
     def score(fire: Fire) -> float:
@@ -230,8 +227,8 @@ def _fit(
         return float(np.median(relative_error(found, truth)))
 
     first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
-    score_or_none = score if len(validation) else None
-    network = Network(f"fire {sample}", fire, loss, data, draw, first, everything, score_or_none, "relative error")
+    rows_of = draw, first, everything, score if len(validation) else None
+    network = Network(f"fire {sample}", fire, partial(fire_loss, beta=s.beta), data, *rows_of, "relative error")
     config = s if sample == "antenna" else replace(s, batch=s.row_batch)
     return train_network(network, config, seeds, session)
 

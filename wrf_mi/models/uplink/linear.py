@@ -16,6 +16,7 @@ Source: Kay, "Fundamentals of statistical signal processing: estimation theory" 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,8 +27,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, field_arrays, from_field_arrays
-from ..model import Fitted, Model, Problem
+from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays
 from .csi_bands import known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
@@ -143,14 +143,10 @@ def fit(problem: Problem, split: Split, session: FitSession) -> LinearMap:
     return LinearMap(matrix, record.observation.shape[2], penalty)
 
 
+def load(arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
+    """The map that `LinearMap.arrays` described."""
+    return from_field_arrays(LinearMap, arrays)
+
+
 SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-MODEL = Model(
-    "linear",
-    ("csi",),
-    LinearSettings,
-    fit,
-    lambda arrays, problem, folder: from_field_arrays(LinearMap, arrays),
-    SOURCE,
-    uplink="required",
-    headings=True,
-)
+MODEL = Model("linear", ("csi",), LinearSettings, fit, load, SOURCE, uplink="required", headings=True)

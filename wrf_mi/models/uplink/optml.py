@@ -31,8 +31,7 @@ from ...core.settings import Count
 from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..method import keyed, settings_array, stored_settings, under
-from ..model import Arrays, Model, Problem
+from ..model import Arrays, Model, Problem, keyed, settings_array, stored_settings, under
 from ..networks.layers import columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .csi_bands import Bands

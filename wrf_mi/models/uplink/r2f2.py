@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings, Count, Positive
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, keyed, under
-from ..model import Arrays, Fitted, Model, Problem
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, under
 from .csi_bands import Bands, bands_of, known_rows, relative_error
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, waves_of

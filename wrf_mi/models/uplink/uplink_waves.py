@@ -59,15 +59,6 @@ class Solved:
         return np.asarray(np.square(np.abs(self.residual)).sum(axis=(1, 2)))
 
 
-def distances(bands: Bands, max_distance_m: float) -> FloatArray:
-    """Distances of the first search, metres, also negative ones, within the range that the spacing resolves."""
-    width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
-    reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
-    step = speed_of_light / width / FINE
-    count = max(int(np.ceil(reach / step)), 1)
-    return np.linspace(-reach, reach, 2 * count + 1)
-
-
 def strongest(waves: Waves, residual: Complex) -> FloatArray:
     """The path [n, p] on a wave model's grid that explains most of a residual."""
     power = waves.power(residual)
@@ -109,7 +100,11 @@ class Waves:
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
         self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
         self.reference_hz = bands.reference_hz
-        self.grid = distances(bands, max_distance_m)
+        # Distances of the first search, also negative ones, within the range that the spacing resolves.
+        width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
+        reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
+        count = max(int(np.ceil(reach / (speed_of_light / width / FINE))), 1)
+        self.grid = np.linspace(-reach, reach, 2 * count + 1)
         self.cosines, self.lattice = np.zeros((1, 0)), np.zeros((1, 0), np.int64)
         self.steering = np.exp(self.grid[:, None] * self.slope)
         self.freedom = 1 + 2 * bands.antennas
