@@ -63,13 +63,18 @@ class PhysicsModel(ABC):
             heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
             if heading.shape != (len(positions),) or not np.isfinite(heading).all():
                 raise InputError(f"predict: {len(positions)} positions and headings {heading.shape}; give one for each")
-        index, chunks = receiver_index(self.receivers, receiver), []
+        index = receiver_index(self.receivers, receiver)
+        mean, std = np.empty(0), np.empty(0)  # filled chunk by chunk: joined chunks would take the memory twice
         for begin in range(0, max(len(positions), 1), self.chunk_size):
             rows = slice(begin, begin + self.chunk_size)
-            chunks.append(self._predict(positions[rows], index, None if heading is None else heading[rows]))
-        means, deviations = zip(*chunks, strict=True)
-        mean = np.concatenate(means)
-        std = deviations[0] if deviations[0].ndim < mean.ndim else np.concatenate(deviations)
+            values, deviation = self._predict(positions[rows], index, None if heading is None else heading[rows])
+            shared = deviation.ndim < values.ndim
+            if not begin:
+                mean = np.empty((len(positions), *values.shape[1:]), values.dtype)
+                std = deviation if shared else np.empty((len(positions), *deviation.shape[1:]))
+            mean[rows] = values
+            if not shared:
+                std[rows] = deviation
         return Prediction(mean, np.broadcast_to(std, mean.shape))
 
     @abstractmethod
