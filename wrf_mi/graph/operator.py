@@ -24,8 +24,7 @@ from ..gaussians.footprint import Pose
 from ..gaussians.operator import Images, in_blocks, weight_strips
 from ..gaussians.parameters import Gaussians
 from ..gaussians.tiles import Plane
-from ..receivers.array import array_response
-from ..receivers.beams import mirror_order
+from ..receivers.array import array_response, mirror_order
 from .combine import LEAST_POWER
 from .evaluations import facing_down, hemisphere_pair
 

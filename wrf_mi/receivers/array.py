@@ -7,14 +7,37 @@ relative to the array's origin.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
+from scipy.spatial.distance import cdist
 
-from ..core.angles import FloatArray
-from .beams import beams
+from ..core.angles import FloatArray, pixel_directions
+from ..core.types import IntArray
 
 ComplexArray = NDArray[np.complex128]
+
+TABLE_BYTES = 1 << 25
+"""Largest table of responses; 360 x 90 directions of a 4 x 4 array take 8 MB. `KEPT_TABLES` are kept between calls."""
+KEPT_TABLES = 4
+CHUNK_SIZE = 16
+"""Signals whose spectra are computed together."""
+
+
+def mirror_order(elements_m: ArrayLike, tolerance: float = 1e-6) -> IntArray | None:
+    """Index of the element opposite to each through the array's centre, [m]; None where an element has no opposite.
+
+    Args:
+        elements_m: [m, 3], or [m, 1] on a line.
+        tolerance: distance from the opposite position, as a share of the extent.
+    """
+    elements = np.asarray(elements_m, float)
+    centre = elements.mean(axis=0)
+    distance = cdist(2 * centre - elements, elements)
+    extent = max(float(np.ptp(elements, axis=0).max()), np.finfo(float).tiny)
+    return distance.argmin(axis=1) if distance.min(axis=1).max() < tolerance * extent else None
 
 
 def array_response(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
@@ -51,12 +74,22 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
     Source: Van Trees, "Optimum Array Processing" (2002), section 6.2.
     """
     signals = np.asarray(h, dtype=complex)
-    # A power of two keeps squares within the range of double precision, without rounding.
-    exponent = np.clip(np.frexp(np.abs(signals).max(initial=0))[1], -1000, 1000)
-    flat = signals.reshape(-1, signals.shape[-1]) * np.ldexp(1.0, -exponent)
-    images = beams(positions_m, frequency_hz, height, width).magnitude(flat)
-    images *= np.ldexp(1.0, exponent)
+    flat, elements = signals.reshape(-1, signals.shape[-1]), np.asarray(positions_m, float).tobytes()
+    images = np.empty((len(flat), height * width))
+    step = max(1, TABLE_BYTES // (16 * signals.shape[-1]))
+    for begin in range(0, height * width, step):
+        table = _beams(elements, float(frequency_hz), height, width, begin, begin + step)
+        for first in range(0, len(flat), CHUNK_SIZE):
+            some = slice(first, first + CHUNK_SIZE)
+            images[some, begin : begin + step] = np.abs(flat[some] @ table)
     return images.reshape(*signals.shape[:-1], height, width)
+
+
+@lru_cache(KEPT_TABLES)
+def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin: int, end: int) -> ComplexArray:
+    """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
+    directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
+    return array_response(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).conj().T.copy()
 
 
 def minmax_scale(spectrum: ArrayLike) -> FloatArray:

@@ -17,6 +17,9 @@ from ..core.types import IntArray
 from .array import bartlett_spectrum, minmax_scale
 from .channel import antenna_csi, csi, element_signals, rssi_dbm
 
+CHUNK_SIZE = 64
+"""Transmitters whose spectra are computed together."""
+
 
 @dataclass(frozen=True)
 class Instrument(ABC):
@@ -103,8 +106,9 @@ class SpectrumInstrument(Instrument):
         for index, (receiver, some) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
             signals = element_signals(some, receiver, receiver.array_m, self.carrier_hz)[0]
-            # One transmitter at a time: float64 spectra of all would take several times the memory of the result.
-            for row, signal in enumerate(signals):
-                image = bartlett_spectrum(signal, receiver.array_m, self.carrier_hz, *self.size)
-                images[index, row] = minmax_scale(image)
+            # Float64 spectra of all would take several times the memory of the result.
+            for start in range(0, len(signals), CHUNK_SIZE):
+                rows = slice(start, start + CHUNK_SIZE)
+                spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
+                images[index, rows] = minmax_scale(spectra)
         return images
