@@ -87,25 +87,17 @@ class Lags:
         values = np.asarray(squared, float)
         if values.shape[-2:] != self.shape:
             raise InputError(f"lags: image {values.shape[-2:]}, not {self.shape}; build the lags for its grid")
-        coordinates: FloatArray = values.reshape(*values.shape[:-2], -1) @ self._orthonormal
+        coordinates: FloatArray = values.reshape(*values.shape[:-2], -1) @ self._factors[0]
         return coordinates
 
     def to_coordinates(self, lags: ArrayLike) -> FloatArray:
         """`coordinates` of the squared spectra of lags [..., count], without computing them."""
-        return np.asarray(lags, float) @ self._triangle.T
+        return np.asarray(lags, float) @ self._factors[1].T
 
     def residual(self, image: ArrayLike) -> FloatArray:
         """Part of images [..., height, width] outside the span of this array's squared spectra; the same shape."""
         values = np.asarray(image, float)
-        return values - (self.coordinates(values) @ self._orthonormal.T).reshape(values.shape)
-
-    @property
-    def _orthonormal(self) -> FloatArray:
-        return self._factors[0]
-
-    @property
-    def _triangle(self) -> FloatArray:
-        return self._factors[1]
+        return values - (self.coordinates(values) @ self._factors[0].T).reshape(values.shape)
 
     @cached_property
     def _factors(self) -> tuple[FloatArray, FloatArray]:

@@ -134,7 +134,7 @@ def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
     return matrix
 
 
-def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatArray:
+def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
     """Points [n, 2] along the walls of surfaces seen from above, in equal steps.
 
     Raises:
@@ -151,7 +151,7 @@ def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatA
         pieces.append(np.stack([middle + reach.min() * along, middle + reach.max() * along]))
     if not pieces:
         raise InputError("registration to walls: the scene has no wall; register by pairs of points")
-    return sample_walls(np.array(pieces), step_m)
+    return sample_walls(np.array(pieces))
 
 
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:

@@ -21,6 +21,9 @@ RAYS_PER_CHUNK = 1 << 20
 END_M = 1e-4
 """Distance from the end of a segment within which a hit is the surface that reflects there."""
 
+MARGIN_M = 1e-3
+"""Slack of the bounds of planes."""
+
 
 @dataclass(frozen=True)
 class ReflectionChains:
@@ -152,7 +155,7 @@ def _unique_rows(rows: IntArray) -> IntArray:
 
 
 def possible(
-    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray, margin_m: float = 1e-3
+    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
 
@@ -162,7 +165,6 @@ def possible(
         surfaces: surfaces of the scene.
         chains: chains from one source.
         targets_m: positions [n, 3], metres.
-        margin_m: slack of the bounds.
 
     Yields:
         Indices of chains and of targets, in chunks.
@@ -179,8 +181,8 @@ def possible(
         to_float(surfaces.offset),
         to_vectors(surfaces.axes[:, 0], mi.Vector3f),
         to_vectors(surfaces.axes[:, 1], mi.Vector3f),
-        to_vectors(surfaces.low - margin_m, mi.Point2f),
-        to_vectors(surfaces.high + margin_m, mi.Point2f),
+        to_vectors(surfaces.low - MARGIN_M, mi.Point2f),
+        to_vectors(surfaces.high + MARGIN_M, mi.Point2f),
     )
     step = max(1, PAIRS_PER_CHUNK // count)
     for reflections in range(1, chains.plane.shape[1] + 1):

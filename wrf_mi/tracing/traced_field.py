@@ -8,7 +8,7 @@ Everything is float64 over planes in float64, so that phases k d are exact to 1e
 float32 corners of its files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
-further than ``search_again_m`` (a quarter of a wavelength) from the position of the search; `TracedField.refresh` then
+further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
 searches again. Planes that move keep their paths (see `wrf_mi.tracing.plane_parameters`).
 """
 
@@ -53,8 +53,6 @@ class TracedOptions:
         pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
             `wrf_mi.tracing.pattern_parameters`).
         gain: initial amplitude factor of all paths, from the channel's units to the instrument's.
-        search_again_m: distance of the receiver from the last search beyond which paths are searched again; None: a
-            quarter of a wavelength.
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
@@ -66,7 +64,6 @@ class TracedOptions:
     trace: TraceOptions = field(default_factory=TraceOptions)
     pattern_degree: int = 0
     gain: float = 1.0
-    search_again_m: float | None = None
     tx_antenna: Antenna = ANTENNA
     materials: MaterialGrouping = "named"
     planes: bool = False
@@ -156,8 +153,6 @@ class TracedField:
         self._prepared = prepared
         self.frequency_hz = float(scene.frequency[0])
         self.searches = 0
-        quarter_m = speed_of_light / self.frequency_hz / 4
-        self._again_m = quarter_m if options.search_again_m is None else options.search_again_m
         self.surfaces: Surfaces = scene_surfaces(scene)
         self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
         self._constants = self.slabs.constants(Float64)
@@ -216,7 +211,7 @@ class TracedField:
             Whether paths were searched.
         """
         here = moved_m(self.receiver, parameters)
-        if np.linalg.norm(here - self.searched_at_m) <= self._again_m:
+        if np.linalg.norm(here - self.searched_at_m) <= speed_of_light / self.frequency_hz / 4:
             return False
         self.search(here)
         return True
