@@ -15,6 +15,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..backend.device import quads
 from ..core import InputError
 
 WINDOW = 7
@@ -56,8 +57,8 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
     single: Any = type(prediction)
     double: Any = dr.float64_array_t(single)
     x, y = double(prediction), double(dr.detach(truth))
-    moments = [dr.custom(_WindowMean, values, batch, height, width) for values in (x, y, x * x + y * y, x * y)]
-    mean_x, mean_y, squares, product = moments
+    moments = [x, y, x * x + y * y, x * y]
+    mean_x, mean_y, squares, product = dr.custom(_WindowMeans, moments, batch, height, width)
     means, across = mean_x * mean_x + mean_y * mean_y, mean_x * mean_y
     similarity = (2 * across + C1) / (means + C1)
     similarity *= (2 * SAMPLE * (product - across) + C2) / (SAMPLE * (squares - means) + C2)
@@ -65,43 +66,56 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
     return single(dr.block_sum(similarity, count) / count)
 
 
-def _window_mean(values: Any, batch: int, height: int, width: int) -> Any:
-    """Means over the windows wholly inside each image, [batch, height - 6, width - 6]."""
-    kind: Any = type(values)
+def _packed(values: list[Any]) -> Any:
+    """Four arrays [n] as one [4 n], whose gathers move four numbers at once."""
+    kind: Any = type(values[0])
+    count = max(dr.width(part) for part in values)
+    out, index = dr.empty(kind, 4 * count), dr.arange(dr.uint32_array_t(kind), count)
+    dr.scatter(out, quads(kind)(*values), index, mode=dr.ReduceMode.Permute)
+    return out
+
+
+def _window_means(values: list[Any], batch: int, height: int, width: int) -> list[Any]:
+    """Means of four arrays over the windows wholly inside each image, [batch, height - 6, width - 6]."""
+    kind: Any = type(values[0])
     inner_h, inner_w = height - BORDER, width - BORDER
-    i = dr.arange(dr.uint32_array_t(kind), batch * height * inner_w)
-    start = i + (i // inner_w) * BORDER
-    rows = sum((dr.gather(kind, values, start + k) for k in range(WINDOW)), kind(0))
-    i = dr.arange(dr.uint32_array_t(kind), batch * inner_h * inner_w)
-    start = i + (i // (inner_h * inner_w)) * (BORDER * inner_w)
-    return sum((dr.gather(kind, rows, start + k * inner_w) for k in range(WINDOW)), kind(0)) * (1 / PIXELS)
+    along_rows = batch * height * inner_w, inner_w, BORDER, 1
+    along_columns = batch * inner_h * inner_w, inner_h * inner_w, BORDER * inner_w, inner_w
+    for size, line, skipped, step in (along_rows, along_columns):
+        i, table = dr.arange(dr.uint32_array_t(kind), size), _packed(values)
+        start = i + (i // line) * skipped
+        values = list(sum(dr.gather(quads(kind), table, start + k * step) for k in range(WINDOW)) * (1 / WINDOW))
+    return values
 
 
-def _padded(values: Any, batch: int, height: int, width: int) -> Any:
-    """Images with a border of 6 zeros on each side, [batch, height + 12, width + 12]."""
-    kind: Any = type(values)
+def _padded(values: list[Any], batch: int, height: int, width: int) -> list[Any]:
+    """Four arrays of images with a border of 6 zeros on each side, [batch, height + 12, width + 12]."""
+    kind: Any = type(values[0])
     wide, high = width + 2 * BORDER, height + 2 * BORDER
     i = dr.arange(dr.uint32_array_t(kind), batch * high * wide)
     line = i // wide
     row, column = line % high - BORDER, i % wide - BORDER  # below zero they wrap around to large numbers
-    inside = (row < height) & (column < width)
-    return dr.gather(kind, values, (line // high * height + row) * width + column, inside)
+    source, inside = (line // high * height + row) * width + column, (row < height) & (column < width)
+    return [dr.gather(kind, part, source, inside) for part in values]
 
 
-class _WindowMean(dr.CustomOp):
-    """`_window_mean` with a reverse pass of the same kind."""
+class _WindowMeans(dr.CustomOp):
+    """`_window_means` with a reverse pass of the same kind."""
 
-    def eval(self, values: Any, batch: int, height: int, width: int) -> Any:
+    def eval(self, values: list[Any], batch: int, height: int, width: int) -> list[Any]:
         self.shape = batch, height, width
-        return _window_mean(values, batch, height, width)
+        return _window_means(values, batch, height, width)
 
     def forward(self) -> None:
-        self.set_grad_out(_window_mean(self.grad_in("values"), *self.shape))
+        values: Any = self.grad_in("values")
+        self.set_grad_out(_window_means(values, *self.shape))
 
     def backward(self) -> None:
         batch, height, width = self.shape
-        padded = _padded(self.grad_out(), batch, height - BORDER, width - BORDER)
-        self.set_grad_in("values", _window_mean(padded, batch, height + BORDER, width + BORDER))
+        gradient: Any = self.grad_out()
+        dr.eval(gradient)  # Dr.Jit 1.5 crashes where gathers would evaluate it
+        padded = _padded(gradient, batch, height - BORDER, width - BORDER)
+        self.set_grad_in("values", _window_means(padded, batch, height + BORDER, width + BORDER))
 
     def name(self) -> str:
-        return "window mean"
+        return "window means"
