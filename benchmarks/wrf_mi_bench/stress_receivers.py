@@ -27,7 +27,7 @@ from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelR
 from wrf_mi.graph.evaluations import hemisphere_pair, learned_field
 from wrf_mi.graph.operator import ArrayOperator, SectorOperator, port_matrix
 from wrf_mi.graph.ports import Ports, path_sum
-from wrf_mi.receivers import array_response, bartlett_spectrum, csi, element_signals, minmax_scale
+from wrf_mi.receivers import antenna_csi, array_response, bartlett_spectrum, csi, minmax_scale
 from wrf_mi.tracing.traced_field import TracedPaths
 
 from .stress_fields import (
@@ -174,7 +174,7 @@ def of_paths(count: int, each: int = 50) -> Row:
             n_rx=1,
         )
         for ports, truth in (
-            (Ports(elements, np.full(16, carrier_hz)), element_signals(known, here, elements, carrier_hz)),
+            (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, here, elements, carrier_hz)[..., 0]),
             (Ports(np.zeros((16, 3)), tones), csi(known, tones)),
         ):
             re, im = path_sum(traced, ports)

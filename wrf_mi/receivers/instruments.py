@@ -15,7 +15,7 @@ from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
 from .array import bartlett_spectrum, minmax_scale
-from .channel import antenna_csi, csi, element_signals, rssi_dbm
+from .channel import antenna_csi, csi, rssi_dbm
 
 CHUNK_SIZE = 64
 """Transmitters whose spectra are computed together."""
@@ -105,7 +105,7 @@ class SpectrumInstrument(Instrument):
         images = np.empty((len(self.receivers), paths.n_tx, *self.size), np.float32)
         for index, (receiver, some) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
-            signals = element_signals(some, receiver, receiver.array_m, self.carrier_hz)[0]
+            signals = antenna_csi(some, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
             # Float64 spectra of all would take several times the memory of the result.
             for start in range(0, len(signals), CHUNK_SIZE):
                 rows = slice(start, start + CHUNK_SIZE)

@@ -25,7 +25,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
-from ..core.angles import FloatArray, rotation_matrix
+from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.files import write_atomically
 from ..core.paths import Paths
 from .surfaces import Surface
@@ -40,6 +40,8 @@ ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
 """Name, marker and colour of each end of paths."""
 ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0
 """Direction of the viewer of the slanted view."""
+EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))
+"""Unit vector from the scene to the viewer."""
 LIGHT = np.array([0.35, -0.5, 0.79])
 CUT = 0.45
 """Share of the height at which the plan is cut."""
@@ -148,19 +150,11 @@ def draw_scene(
     return figure
 
 
-def _toward_viewer() -> FloatArray:
-    """Unit vector from the scene to the eye of the slanted view."""
-    elevation, azimuth = np.radians([ELEVATION_DEG, AZIMUTH_DEG])
-    flat = np.cos(elevation)
-    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-
-
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
     """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
     rgba = _coloured(figure, cloud.strength_db, "viridis", cloud.label, 0.4)
-    eye = _toward_viewer()
-    right = np.cross([0, 0, 1], eye) / np.linalg.norm(np.cross([0, 0, 1], eye))
-    screen = np.stack([right, np.cross(eye, right)])
+    right = np.cross([0, 0, 1], EYE) / np.linalg.norm(np.cross([0, 0, 1], EYE))
+    screen = np.stack([right, np.cross(EYE, right)])
     outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen
     slant.add_collection3d(Poly3DCollection(outlines, facecolors=rgba, edgecolors="none", zorder=5))
     flat = cloud.position_m[:, None, :2] + cloud.silhouettes(np.eye(3)[:2])
@@ -194,7 +188,7 @@ def _draw_slant(
     axes: Any, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
 ) -> None:
     """Faces without the ceiling, lit from the side; walls in front are transparent."""
-    middle, eye = (low + high) / 2, _toward_viewer()
+    middle = (low + high) / 2
     # The empty parts serve scenes that have ceilings only.
     faces, rgba, floor = [np.empty((0, 3, 3))], [np.empty((0, 4))], [np.empty(0, bool)]
     for surface, colour in zip(surfaces, colours, strict=True):
@@ -212,7 +206,7 @@ def _draw_slant(
         else:
             # A wall fades as a whole; a large body that holds a whole room fades face by face.
             place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
-            front = (place - middle)[:, :2] @ eye[:2] > 0.05 * np.linalg.norm(high - low)
+            front = (place - middle)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
         shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
         faces.append(corners[kept])
         rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[kept])
@@ -231,9 +225,8 @@ def _draw_slant(
     rims = [np.empty((0, 2, 3))]
     for surface in surfaces:
         if surface.kind != "ceiling" and len(surface.faces) <= 500:
-            edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-            edge, count = np.unique(edges, axis=0, return_counts=True)
-            rims.append(surface.vertices_m[edge[count == 1]])
+            edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
+            rims.append(surface.vertices_m[edges[trimesh.grouping.group_rows(edges, require_count=1)]])
     if len(lines := np.concatenate(rims)):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
     axes.set_proj_type("ortho")

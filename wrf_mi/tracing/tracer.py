@@ -14,7 +14,7 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
-from ..receivers import bartlett_spectrum, element_signals, minmax_scale
+from ..receivers import antenna_csi, bartlett_spectrum, minmax_scale
 from ..receivers.instruments import Instrument
 from .options import DEFAULTS, TraceOptions
 from .result import TraceResult, recompute
@@ -141,5 +141,5 @@ def trace_spectra(
     if not np.isclose(scene_hz, frequency_hz, rtol=1e-6):  # the scene keeps it in float32
         raise ValueError(f"trace_spectra: the scene is at {scene_hz:g} Hz, not {frequency_hz:g}; open it at that")
     paths = trace_paths(scene, tx_pos_m, receiver, options, progress).paths
-    signals = element_signals(paths, receiver, array_m, frequency_hz)[0]
+    signals = antenna_csi(paths, receiver, array_m, frequency_hz)[0, ..., 0]
     return minmax_scale(bartlett_spectrum(signals, array_m, frequency_hz, height, width)).astype(np.float32)
