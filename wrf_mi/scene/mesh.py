@@ -14,11 +14,10 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line
 from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
 from .planes import THICKEST_M, Plane, with_axes
 from .points import UNITS_M, check_extent, source_file
-from .surfaces import KINDS, Kind, Surface, number_names
+from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names
 from .surfaces import bodies as connected_bodies
 
 logger = logging.getLogger(__name__)
@@ -79,11 +78,7 @@ def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
             finite, or units that look like others.
     """
     file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    try:
-        parts: list[Any] = trimesh.load_scene(str(file), process=False).dump()
-    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
-        raise InputError(f"{file}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    parts = [part for part in parts if len(getattr(part, "faces", ()))]
+    parts = mesh_parts(file)
     if not parts:
         raise InputError(f"{file}: has no faces, so no surface; make a scene of points with wrf-mi mesh")
     surfaces = []

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import one_line
 from ..core.types import IntArray
 
 Kind = Literal["floor", "ceiling", "wall", "other"]
@@ -42,6 +45,19 @@ class Surface:
     def area_m2(self) -> float:
         """Sum of the areas of its faces."""
         return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
+
+
+def mesh_parts(path: str | Path) -> list[Any]:
+    """The parts of a mesh file that have faces, as trimesh reads them.
+
+    Raises:
+        InputError: a file that cannot be read as a mesh.
+    """
+    try:
+        parts: list[Any] = trimesh.load_scene(str(path), process=False).dump()
+    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
+        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
+    return [part for part in parts if len(getattr(part, "faces", ()))]
 
 
 def number_names(kinds: Sequence[Kind]) -> list[str]:

@@ -17,6 +17,7 @@ from ..core import InputError
 from ..core.files import one_line
 from ..scene.folder import FACTS_FILE, read_scene_folder
 from ..scene.materials import FILE as MATERIALS_FILE
+from ..scene.surfaces import mesh_parts
 from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
@@ -109,12 +110,7 @@ def _from_mesh(path: Path, material: str) -> Any:
             raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {known}")
         kind = name.removeprefix("itu_")
         radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
-    try:
-        loaded: list[Any] = trimesh.load_scene(str(path)).dump()
-        parts = [part for part in loaded if len(getattr(part, "faces", ()))]
-    except Exception as error:  # trimesh's readers raise a dozen types on damaged files
-        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    scene = rt.load_scene()
+    parts, scene = mesh_parts(path), rt.load_scene()
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
