@@ -19,9 +19,10 @@ from wrf_mi.core import Antenna, InputError, Receiver, Record, azimuth_elevation
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, registry
 from wrf_mi.receivers import antenna_csi
+from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.synthetic import laboratory_record, load_record
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
-from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths, trace_spectra
+from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
 from wrf_mi.tracing.fields import sionna_orientation
 from wrf_mi.tracing.materials import BELOW_1_GHZ
 
@@ -87,7 +88,8 @@ def test_paths_and_spectra_in_free_space(empty: Any, turn_deg: float):
     signals = antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
     np.testing.assert_allclose(signals, expected, rtol=SINGLE)
 
-    spectrum = trace_spectra(empty, positions, receiver, ARRAY_M, FREQUENCY_HZ)
+    instrument = SpectrumInstrument((replace(receiver, array_m=ARRAY_M),), np.array([FREQUENCY_HZ]))
+    spectrum = instrument.observe(paths)[0]
     assert spectrum.dtype == np.float32
     assert spectrum.shape == (2, 90, 360)
     azimuth, elevation = np.degrees(azimuth_elevation(np.array([0.2, 0.1, 1.0])))
@@ -198,8 +200,6 @@ def test_materials_below_their_range_have_constants(tmp_path: Path, caplog: pyte
 
 def test_wrong_arguments_are_refused(empty: Any, tmp_path: Path):
     receiver = upright(0, (0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="the scene is at"):
-        trace_spectra(empty, [[1.0, 0, 1]], receiver, ARRAY_M, 915e6)
     for wrong in ([[1.0, 2]], [[1.0, 2, np.nan]]):
         with pytest.raises(ValueError, match="finite"):
             trace_paths(empty, wrong, receiver)
@@ -242,7 +242,7 @@ def test_laboratory_is_cached_and_reproducible(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("traced although it was kept")
 
-    monkeypatch.setattr("wrf_mi.synthetic.laboratory.trace_spectra", refuse)
+    monkeypatch.setattr("wrf_mi.synthetic.laboratory.RayTracer", refuse)
     monkeypatch.delenv("WRF_MI_DATA", raising=False)
     for module in (registry, __import__("wrf_mi.synthetic.laboratory", fromlist=["user_cache"])):
         monkeypatch.setattr(module, "user_cache", lambda: folder.parent)

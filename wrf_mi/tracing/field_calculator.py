@@ -20,7 +20,7 @@ from scipy.constants import speed_of_light
 
 from ..core import Antenna
 from ..core.antenna import ANTENNA, POLE
-from ..gaussians.footprint import Pose
+from ..gaussians.footprint import Pose, dot, tangent_basis
 from .slab import slab
 
 ALONG = 1e-12
@@ -122,15 +122,15 @@ def evaluate_paths(
     """
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
-        height = dr.select(level.reflects, _dot(image, level.normal) - level.offset_m, 0)
+        height = dr.select(level.reflects, dot(image, level.normal) - level.offset_m, 0)
         image = [x - 2 * height * n for x, n in zip(image, level.normal, strict=True)]
     towards = [x - p for x, p in zip(image, pose.position, strict=True)]
-    length = dr.sqrt(_dot(towards, towards))
+    length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 
     directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
-        back = dr.select(level.reflects, _dot(directions[0], level.normal), 0)
+        back = dr.select(level.reflects, dot(directions[0], level.normal), 0)
         directions.insert(0, [k - 2 * back * n for k, n in zip(directions[0], level.normal, strict=True)])
 
     float_type = type(length)
@@ -150,7 +150,7 @@ def evaluate_paths(
     taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
     return EvaluatedPaths(
-        (_dot(taken, real) * loss, _dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
+        (dot(taken, real) * loss, dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
     )
 
 
@@ -164,14 +164,14 @@ def _interact(
         return dr.gather(type(table), table, level.material)
 
     # At place holders the wave comes straight, so that no unused denominator vanishes.
-    cosine = dr.select(met, dr.abs(_dot(before, level.normal)), 1)
+    cosine = dr.select(met, dr.abs(dot(before, level.normal)), 1)
     c = slab(cosine, of(tables.permittivity), of(tables.conductivity), of(tables.thickness_m), frequency_hz)
     share = of(tables.reflected)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
-    across = _unit_or(_cross(before, level.normal), _any_across(before))
+    across = _unit_or(_cross(before, level.normal), tangent_basis(before)[0])
     along_before, along_after = _cross(across, before), _cross(across, after)
-    (s_re, p_re), (s_im, p_im) = ((_dot(part, across), _dot(part, along_before)) for part in field)
+    (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
     s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
     p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
     out = []
@@ -192,7 +192,7 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     Returns:
         Three arrays [q], world frame.
     """
-    x, y, z = (_dot(direction, axis) for axis in axes)
+    x, y, z = (dot(direction, axis) for axis in axes)
     square = x * x + y * y
     pole: Any = square < POLE
     inverse = dr.rsqrt(dr.select(pole, 1, square))
@@ -220,27 +220,12 @@ def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, in
     return dr.exp(math.log(10) / 20 * (8 - dr.minimum(vertical + level_db, 30)))
 
 
-def _any_across(direction: Vector) -> Vector:
-    """Unit vector across a direction: the part across it of x, or of y near x (as Sionna RT)."""
-    zero, one = (type(direction[0])(value) for value in (0, 1))
-    steep = dr.abs(direction[0]) >= 0.9 * one
-    reference = [dr.select(steep, zero, one), dr.select(steep, one, zero), 0]
-    along = _dot(direction, reference)
-    across = [r - along * k for r, k in zip(reference, direction, strict=True)]
-    scale = dr.rsqrt(_dot(across, across))
-    return [scale * r for r in across]
-
-
 def _unit_or(vector: Vector, other: Vector) -> Vector:
     """Normalised vector, or ``other`` where it vanishes."""
-    square = _dot(vector, vector)
+    square = dot(vector, vector)
     usable: Any = square > ALONG
     scale = dr.rsqrt(dr.select(usable, square, 1))
     return [dr.select(usable, v * scale, o) for v, o in zip(vector, other, strict=True)]
-
-
-def _dot(a: Vector, b: Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

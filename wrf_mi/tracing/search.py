@@ -145,13 +145,10 @@ def unique_chains(sequence: IntArray) -> IntArray:
 
 
 def _unique_rows(rows: IntArray) -> IntArray:
-    """Distinct rows in lexical order, coded as numbers: ten times faster than `numpy.unique(axis=0)`."""
-    code, width = np.zeros(len(rows), np.int64), int(rows.max(initial=-1)) + 2
-    for level in range(rows.shape[1]):
-        if int(code.max(initial=0)) >= np.iinfo(np.int64).max // width - 1:
-            code = np.unique(code, return_inverse=True)[1].reshape(-1)
-        code = code * width + rows[:, level] + 1
-    return rows[np.unique(code, return_index=True)[1]]
+    """Distinct rows in lexical order, several times faster than `numpy.unique(axis=0)`."""
+    ordered = rows[np.lexsort(rows.T[::-1])]
+    repeated = (ordered[1:] == ordered[:-1]).all(axis=1)
+    return ordered[np.flatnonzero(~np.append(len(rows) == 0, repeated))]
 
 
 def possible(
