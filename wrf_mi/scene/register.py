@@ -219,19 +219,13 @@ def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
     return np.concatenate(parts)
 
 
-def _from_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
-    """Vector [n, 2] to each point [n, 2] from the nearest point on walls [m, 2, 2]."""
+def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
+    """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
     begin, along = walls_m[:, 0], walls_m[:, 1] - walls_m[:, 0]
     offset = points_m[:, None] - begin
     part = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
     away = offset - part[..., None] * along
-    nearest = np.argmin((away**2).sum(axis=-1), axis=1)
-    return np.asarray(away[np.arange(len(away)), nearest])
-
-
-def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
-    """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
-    return np.asarray(np.linalg.norm(_from_walls(points_m, walls_m), axis=-1))
+    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))
 
 
 def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -251,18 +245,11 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
     def misfit(pose: FloatArray) -> FloatArray:
         return distance_to_walls(_moved(centred, pose), walls)
 
-    def gradient(pose: FloatArray) -> FloatArray:
-        # A distance grows along its direction; a turn moves a point across its radius.
-        turned = _moved(centred, np.array([0.0, 0.0, pose[2]]))
-        away = _from_walls(turned + pose[:2], walls)
-        unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)
-        return np.column_stack([unit, unit[:, 1] * turned[:, 0] - unit[:, 0] * turned[:, 1]])
-
     fits = []
     for pose in _starts(centred, targets, cell):
         # A start is off by half a cell and half a turn's step.
         for width in (cell + radius * np.pi / TURNS, NEAR_M / 2):
-            pose = optimize.least_squares(misfit, pose, gradient, loss="cauchy", f_scale=width, max_nfev=30).x
+            pose = optimize.least_squares(misfit, pose, loss="cauchy", f_scale=width, max_nfev=30).x
         # The pose for the points themselves: R (x - middle) + t = R x + (t - R middle).
         whole = np.append(pose[:2] - rotation_2d(pose[2]) @ middle, pose[2])
         fits.append((whole, _agreement(_moved(centred, pose), targets, walls)))
