@@ -10,7 +10,6 @@ Vectors are lists of three Dr.Jit arrays, complex numbers pairs (re, im).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from ..core import Antenna
-from ..core.antenna import ANTENNA, POLE
+from ..core.antenna import ANTENNA
 from ..gaussians.footprint import Pose, dot, tangent_basis
 from .slab import slab
 
@@ -192,32 +191,8 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     Returns:
         Three arrays [q], world frame.
     """
-    x, y, z = (dot(direction, axis) for axis in axes)
-    square = x * x + y * y
-    pole: Any = square < POLE
-    inverse = dr.rsqrt(dr.select(pole, 1, square))
-    cosine, sine = dr.select(pole, 1, x * inverse), dr.select(pole, 0, y * inverse)
-    level = square * inverse
-    if antenna.polarization == "V":
-        local = [z * cosine, z * sine, -level]
-    else:
-        local = [-sine, cosine, dr.zeros(type(z), dr.width(z))]
-    amplitude = _amplitude(antenna.pattern, level, z, (cosine, sine), pole, inverse)
-    return [sum(amplitude * c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
-
-
-def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, inverse: Any) -> Any:
-    """Amplitude [q] of a pattern; ``level`` and ``z``: sine and cosine of the zenith angle, ``inverse``: 1 / level."""
-    if pattern == "iso":
-        return type(z)(1)
-    if pattern == "dipole":
-        return math.sqrt(1.5) * level
-    if pattern == "hw_dipole":
-        return dr.select(pole, 0, math.sqrt(1.643) * dr.cos(np.pi / 2 * z) * inverse)
-    width = math.radians(65)
-    vertical = dr.minimum(12 * dr.square((dr.atan2(level, z) - np.pi / 2) / width), 30)
-    level_db = dr.minimum(12 * dr.square(dr.atan2(azimuth[1], azimuth[0]) / width), 30)
-    return dr.exp(math.log(10) / 20 * (8 - dr.minimum(vertical + level_db, 30)))
+    local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
+    return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
 
 
 def _unit_or(vector: Vector, other: Vector) -> Vector:
