@@ -250,11 +250,8 @@ class CsiReceiver:
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
-        return float(np.log(_mean_square(observed) / _mean_square(report)) / 2)
-
-
-def _mean_square(values: NDArray[Any]) -> float:
-    return float(np.nanmean(np.square(np.asarray(values, float))))
+        there, here = (np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report))
+        return float(np.log(there / here) / 2)
 
 
 @dataclass(frozen=True)

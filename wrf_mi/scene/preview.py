@@ -189,8 +189,8 @@ def _draw_slant(
 ) -> None:
     """Faces without the ceiling, lit from the side; walls in front are transparent."""
     middle = (low + high) / 2
-    # The empty parts serve scenes that have ceilings only.
-    faces, rgba, floor = [np.empty((0, 3, 3))], [np.empty((0, 4))], [np.empty(0, bool)]
+    # Floors, then all else. The empty parts serve scenes that have ceilings only.
+    drawn = [([np.empty((0, 3, 3))], [np.empty((0, 4))]) for _ in range(2)]
     for surface, colour in zip(surfaces, colours, strict=True):
         if surface.kind == "ceiling":
             continue
@@ -208,19 +208,13 @@ def _draw_slant(
             place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
             front = (place - middle)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
         shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
+        faces, rgba = drawn[surface.kind != "floor"]
         faces.append(corners[kept])
         rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[kept])
-        floor.append(np.full(np.count_nonzero(kept), surface.kind == "floor"))
-    corners, shades, is_floor = np.concatenate(faces), np.concatenate(rgba), np.concatenate(floor)
-    largest = np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]
-    for part, order in ((is_floor[largest], 1), (~is_floor[largest], 2)):
-        chosen = largest[part]
-        if len(chosen):
-            axes.add_collection3d(
-                Poly3DCollection(
-                    corners[chosen], facecolors=shades[chosen], edgecolors="none", antialiaseds=False, zorder=order
-                )
-            )
+    for order, (corners, shades) in enumerate(([np.concatenate(part) for part in pair] for pair in drawn), start=1):
+        if len(largest := np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]):
+            flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}
+            axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
     rims = [np.empty((0, 2, 3))]
     for surface in surfaces:

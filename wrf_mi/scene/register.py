@@ -53,9 +53,6 @@ class Registration:
         matrix: shape [4, 4], applied to columns (x, y, z, 1) in metres.
         rms_m: rms residual; of a fit to walls, over the points that agree.
         share: share of the points within `NEAR_M` of a wall; 1 for pairs.
-        agreement: mean of the share of the scene that lies at walls and the share of the walls that it shows, each
-            point weighted by exp(-(d / 0.1 m)^2 / 2); 1 for pairs.
-        count: number of pairs, or points.
         scale: factor on the source's lengths that would fit best; far from 1, the units or the resolution are wrong.
             It is not in the matrix.
     """
@@ -63,8 +60,6 @@ class Registration:
     matrix: FloatArray
     rms_m: float
     share: float
-    agreement: float
-    count: int
     scale: float
 
     def apply(self, points_m: ArrayLike) -> FloatArray:
@@ -123,7 +118,7 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
     matrix = _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
-    return Registration(matrix, rms, 1.0, 1.0, n, float(similar.scale))
+    return Registration(matrix, rms, 1.0, float(similar.scale))
 
 
 def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
@@ -207,7 +202,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
                 f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
             )
     matrix, rms = _motion(rotation_2d(pose[2]), pose[:2]), float(np.sqrt(np.mean(near**2)))
-    return Registration(matrix, rms, share, score, len(points), scale)
+    return Registration(matrix, rms, share, scale)
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
@@ -257,7 +252,9 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
 
 
 def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> float:
-    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows."""
+    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows, each point
+    weighted by exp(-(d / 0.1 m)^2 / 2).
+    """
     there = np.exp(-0.5 * (distance_to_walls(placed, walls) / (NEAR_M / 2)) ** 2)
     back = np.exp(-0.5 * (cKDTree(placed).query(targets)[0] / (NEAR_M / 2)) ** 2)
     return float((there.mean() + back.mean()) / 2)

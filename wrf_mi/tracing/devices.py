@@ -80,14 +80,6 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     return moved
 
 
-def warn_of_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str]) -> None:
-    """Warn of named antennas that `before_walls` moved from positions [n, 3] to others."""
-    changed = np.flatnonzero((moved_m != positions_m).any(axis=1))
-    if len(changed):
-        text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
-        logger.warning(text, len(changed), len(moved_m), names[changed[0]])
-
-
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `solids`."""
     thing = np.full(len(positions_m), -1)

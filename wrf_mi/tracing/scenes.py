@@ -64,7 +64,12 @@ def open_scene(
     if not mesh and material is not None:
         raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
     scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
-    _check_size(scene, source)
+    if not scene.objects:
+        raise InputError(f"{source}: holds no surface; give a scene with triangles")
+    bounds = scene.mi_scene.bbox()
+    if (height := float(bounds.max.z - bounds.min.z)) > HIGHEST_M:
+        text = f"{height:.0f} m high, as if in millimetres"
+        raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
     set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})})
     return scene
 
@@ -122,12 +127,3 @@ def _from_mesh(path: Path, material: str) -> Any:
         if objects:
             scene.edit(add=objects)
     return scene
-
-
-def _check_size(scene: Any, source: str | Path) -> None:
-    if not scene.objects:
-        raise InputError(f"{source}: holds no surface; give a scene with triangles")
-    height = float(scene.mi_scene.bbox().max.z - scene.mi_scene.bbox().min.z)
-    if height > HIGHEST_M:
-        text = f"{height:.0f} m high, as if in millimetres"
-        raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
