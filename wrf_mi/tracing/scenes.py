@@ -78,7 +78,7 @@ def _folder(folder: Path) -> tuple[Path, Mapping[str, float]]:
     """Scene file and thicknesses of a scene folder, from a scan or like those that come with the package."""
     if (folder / MATERIALS_FILE).is_file():
         read = read_scene_folder(folder)
-        return read.xml, read.thickness_m
+        return read.xml, read.materials.thickness_m
     try:
         facts = yaml.safe_load((folder / FACTS_FILE).read_text(encoding="utf-8"))
         return folder / facts["xml"], facts.get("thickness_m", {})
