@@ -75,11 +75,9 @@ class Lags:
         """Matrices [2, m * m, count] that add real and imaginary parts of products h_m conj(h_n) up to lags."""
         half, lag_of, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
         matrices = np.zeros((2, len(lag_of), self.count))
-        for pair in np.flatnonzero(side > 0):
-            lag = lag_of[pair]
-            matrices[0, pair, lag] = np.sqrt(2) if lag else 1
-            if lag:
-                matrices[1, pair, half + lag] = np.sqrt(2)
+        same, first = np.flatnonzero((side > 0) & (lag_of == 0)), np.flatnonzero((side > 0) & (lag_of > 0))
+        matrices[0, same, 0] = 1
+        matrices[0, first, lag_of[first]] = matrices[1, first, half + lag_of[first]] = np.sqrt(2)
         return matrices
 
     def coordinates(self, squared: ArrayLike) -> FloatArray:

@@ -66,11 +66,8 @@ class Prepared:
         """
         names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
         names += [f"receiver {receiver.name}" for receiver in receivers]
-        traced_tx, traced_rx = self.placed(tx_pos_m, receivers)
-        stated, traced = (
-            np.concatenate([tx, [receiver.position_m for receiver in rx]])
-            for tx, rx in ((tx_pos_m, receivers), (traced_tx, traced_rx))
-        )
+        stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
+        traced = before_walls(self.surfaces, stated)
         for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
             new = [row for row in side if stated[row].tobytes() not in self._checked]
             if moved := [row for row in new if (stated[row] != traced[row]).any()]:
