@@ -27,6 +27,8 @@ ALONG = 1e-12
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
+Tables = tuple[Any, Any, Any, Any]
+"""Permittivity, conductivity, thickness and reflected share [n] of materials, as `SlabMaterials.constants`."""
 
 
 @dataclass
@@ -69,16 +71,6 @@ class Chains:
     def select(self, index: Any) -> Chains:
         """Select the paths of an unsigned integer array of indices."""
         return dr.gather(Chains, self, index)
-
-
-@dataclass
-class Tables:
-    """Tables [n] of materials: relative permittivity, conductivity (S/m), thickness (m), see `SlabMaterials`."""
-
-    permittivity: Any
-    conductivity: Any
-    thickness_m: Any
-    reflected: Any
 
 
 @dataclass
@@ -158,14 +150,10 @@ def _interact(
 ) -> tuple[Vector, Vector]:
     """Field (re, im), three arrays [q] each, after a reflection, a transmission, or a place holder."""
     met = level.reflects | level.transmits
-
-    def of(table: Any) -> Any:
-        return dr.gather(type(table), table, level.material)
-
+    permittivity, conductivity, thickness_m, share = (dr.gather(type(t), t, level.material) for t in tables)
     # At place holders the wave comes straight, so that no unused denominator vanishes.
     cosine = dr.select(met, dr.abs(dot(before, level.normal)), 1)
-    c = slab(cosine, of(tables.permittivity), of(tables.conductivity), of(tables.thickness_m), frequency_hz)
-    share = of(tables.reflected)
+    c = slab(cosine, permittivity, conductivity, thickness_m, frequency_hz)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
     across = _unit_or(_cross(before, level.normal), tangent_basis(before)[0])

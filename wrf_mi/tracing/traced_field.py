@@ -32,7 +32,7 @@ from ..core.types import IntArray
 from ..gaussians.footprint import Pose
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
-from .field_calculator import Chains, Complex, Level, Tables, Vector, evaluate_paths
+from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .material_parameters import MaterialGrouping, slabs_of_faces
 from .pattern_parameters import pattern_coefficients, pattern_factor
 from .plane_parameters import PlaneTables
@@ -230,8 +230,7 @@ class TracedField:
             row = dr.gather(mi.UInt32, rows, slot // self._each)
             chains = chains.select(row * self._each + slot % self._each)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        stated, fixed = self._constants[:2], self._constants[2:]
-        tables = Tables(*self.slabs.tables(parameters, stated), *fixed)
+        tables = (*self.slabs.tables(parameters, self._constants[:2]), *self._constants[2:])
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
@@ -276,7 +275,7 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         tx, used = traced.paths.tx, types != 0
-        material = self._slab(face, used)
+        material = self._slab(face)
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
         count = len(self) * each
@@ -292,7 +291,7 @@ class TracedField:
 
         levels = []
         for k in range(types.shape[1] if used.any() else 0):
-            plane = np.where(used[:, k], surfaces.plane[np.where(used[:, k], face[:, k], 0)], 0)
+            plane = np.append(surfaces.plane, 0)[face[:, k]]
             normal = surfaces.normal[plane] * used[:, k, None]
             levels.append(
                 Level(
@@ -312,11 +311,9 @@ class TracedField:
             levels,
         )
 
-    def _slab(self, face: IntArray, used: NDArray[np.bool_]) -> IntArray:
-        """Index of the material at each interaction, 0 for none."""
-        if not used.any():
-            return np.zeros(face.shape, np.int64)
-        number = np.where(used, self._slab_of_face[np.where(used, face, 0)], 0)
+    def _slab(self, face: IntArray) -> IntArray:
+        """Index of the material at each interaction, 0 for none (face -1)."""
+        number = np.append(self._slab_of_face, 0)[face]
         if (number < 0).any():
             index = self.surfaces.object_of(face[number < 0][:1])[0]
             name = self.surfaces.names[index]
