@@ -273,19 +273,15 @@ class PowerReceiver(CsiReceiver):
         """Shape of a report."""
         return ()
 
-    def _mean_field(self, traced: TracedPaths, float_type: Any) -> Complex:
-        """Root of the sum of paths' powers, equal at all frequencies, as a complex signal of phase zero."""
-        re, im = traced.gain
-        amplitude = float_type(dr.sqrt(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, traced.each) + LEAST_POWER))
-        wide = dr.repeat(amplitude, self._ports.count)
-        return wide, dr.zeros(float_type, dr.width(wide))
-
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
         count = self._ports.count
         here, there = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
-            here = self._mean_field(traced, _float_type(learned))
+            # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
+            power_of_paths = dr.block_reduce(dr.ReduceOp.Add, sum(part * part for part in traced.gain), traced.each)
+            mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
+            here = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
         return 10 * dr.log2(received + LEAST_POWER) / math.log2(10)
 

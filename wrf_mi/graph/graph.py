@@ -188,11 +188,6 @@ class Graph:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
 
-    @property
-    def moves_receivers(self) -> bool:
-        """Whether training moves receivers."""
-        return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
-
     def gaussians(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Gaussians:
         """Gaussians of a batch in the receiver's unit, one signal each.
 
@@ -228,12 +223,13 @@ class Graph:
             skip: parts of the Gaussians that are not evaluated.
         """
         model, receiver = self.models[number], self.receivers[number]
+        moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             paths = None if side is None else side(params, batch.slots)
             if self.field is None or not learned:
                 return model(paths, None)
-            here = receiver_pose(receiver, params, mi.Float) if self.moves_receivers else batch.pose
+            here = receiver_pose(receiver, params, mi.Float) if moves else batch.pose
             gaussians = self.gaussians(params, batch, paths)
             return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
 

@@ -156,7 +156,11 @@ def _interact(
     c = slab(cosine, permittivity, conductivity, thickness_m, frequency_hz)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
-    across = _unit_or(_cross(before, level.normal), tangent_basis(before)[0])
+    across = _cross(before, level.normal)
+    square = dot(across, across)
+    oblique: Any = square > ALONG
+    scale = dr.rsqrt(dr.select(oblique, square, 1))
+    across = [dr.select(oblique, c * scale, a) for c, a in zip(across, tangent_basis(before)[0], strict=True)]
     along_before, along_after = _cross(across, before), _cross(across, after)
     (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
     s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
@@ -181,14 +185,6 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     """
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
-
-
-def _unit_or(vector: Vector, other: Vector) -> Vector:
-    """Normalised vector, or ``other`` where it vanishes."""
-    square = dot(vector, vector)
-    usable: Any = square > ALONG
-    scale = dr.rsqrt(dr.select(usable, square, 1))
-    return [dr.select(usable, v * scale, o) for v, o in zip(vector, other, strict=True)]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
