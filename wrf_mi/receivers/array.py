@@ -24,20 +24,21 @@ TABLE_BYTES = 1 << 25
 KEPT_TABLES = 4
 CHUNK_SIZE = 16
 """Signals whose spectra are computed together."""
+MIRRORED = 1e-6
+"""Largest distance from the opposite position, as a share of the array's extent."""
 
 
-def mirror_order(elements_m: ArrayLike, tolerance: float = 1e-6) -> IntArray | None:
+def mirror_order(elements_m: ArrayLike) -> IntArray | None:
     """Index of the element opposite to each through the array's centre, [m]; None where an element has no opposite.
 
     Args:
         elements_m: [m, 3], or [m, 1] on a line.
-        tolerance: distance from the opposite position, as a share of the extent.
     """
     elements = np.asarray(elements_m, float)
     centre = elements.mean(axis=0)
     distance = cdist(2 * centre - elements, elements)
     extent = max(float(np.ptp(elements, axis=0).max()), np.finfo(float).tiny)
-    return distance.argmin(axis=1) if distance.min(axis=1).max() < tolerance * extent else None
+    return distance.argmin(axis=1) if distance.min(axis=1).max() < MIRRORED * extent else None
 
 
 def array_response(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
