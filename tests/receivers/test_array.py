@@ -30,7 +30,12 @@ RNG = np.random.default_rng(0)
 ARRAYS = {
     "regular": planar_array(4, 4, 0.16),
     "odd, off the origin": planar_array(3, 5, 0.16) + np.array([0.3, -0.2, 0.1]),
+    "two lines": planar_array(9, 8, 0.16) + np.array([0.1, 0, 0]),
+    "two lines, odd, shuffled": RNG.permutation(planar_array(9, 9, 0.12)) + np.array([0.3, -0.2, 0.1]),
+    "uneven lines": (np.array([[x, y, 0] for x in (0, 0.1, 0.3) for y in range(40)], float) * [1, 0.1, 1]),
+    "a grid with a gap": planar_array(9, 9, 0.1)[:-1],
     "not planar": RNG.normal(size=(70, 3)),
+    "tilted": planar_array(8, 8, 0.1) @ np.linalg.qr(RNG.normal(size=(3, 3)))[0],
     "single": np.array([[0.2, 0.1, 0.0]]),
     "coinciding": np.array([[0.2, 0, 0], [0.2, 0, 0], [-0.2, 0, 0], [-0.2, 0, 0.0]]),
 }

@@ -24,8 +24,10 @@ TABLE_BYTES = 1 << 25
 KEPT_TABLES = 4
 CHUNK_SIZE = 16
 """Signals whose spectra are computed together."""
-MIRRORED = 1e-6
-"""Largest distance from the opposite position, as a share of the array's extent."""
+LINES_FROM = 64
+"""Number of elements from which a planar grid is summed line by line."""
+MIRRORED, ALIGNED = 1e-6, 1e-9
+"""Distances within which positions are opposite or on one line, as shares of the array's extent."""
 
 
 def mirror_order(elements_m: ArrayLike) -> IntArray | None:
@@ -74,16 +76,39 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
 
     Source: Van Trees, "Optimum Array Processing" (2002), section 6.2.
     """
-    signals = np.asarray(h, dtype=complex)
-    flat, elements = signals.reshape(-1, signals.shape[-1]), np.asarray(positions_m, float).tobytes()
-    images = np.empty((len(flat), height * width))
-    step = max(1, TABLE_BYTES // (16 * signals.shape[-1]))
+    signals, elements = np.asarray(h, dtype=complex), np.asarray(positions_m, float)
+    first, second, order = _lines(elements)
+    grids = signals[..., order].reshape(-1, len(first), len(second))
+    images = np.empty((len(grids), height * width))
+    step = max(1, TABLE_BYTES // (16 * (len(first) + len(second))))
+    together = max(1, CHUNK_SIZE // len(first))
     for begin in range(0, height * width, step):
-        table = _beams(elements, float(frequency_hz), height, width, begin, begin + step)
-        for first in range(0, len(flat), CHUNK_SIZE):
-            some = slice(first, first + CHUNK_SIZE)
-            images[some, begin : begin + step] = np.abs(flat[some] @ table)
+        block = float(frequency_hz), height, width, begin, begin + step
+        outer, inner = (_beams(line.tobytes(), *block) for line in (first, second))
+        for start in range(0, len(grids), together):
+            some = slice(start, start + together)
+            waves = grids[some] @ inner
+            total = waves[:, 0] if len(first) == 1 else np.einsum("nxd,xd->nd", waves, outer)
+            images[some, begin : begin + step] = np.abs(total)
     return images.reshape(*signals.shape[:-1], height, width)
+
+
+def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Two lines whose sums are the elements of a large planar grid, and the elements' order in the grid.
+
+    The first line of other arrays is the origin alone: one sum is faster for few elements, and tables of lines are
+    smaller for many.
+    """
+    whole = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
+    grain = ALIGNED * float(np.ptp(elements_m, axis=0).max())
+    if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:
+        return whole
+    (x, column), (y, row) = (np.unique(np.round(part / grain), return_inverse=True) for part in elements_m.T[:2])
+    order = np.lexsort((row, column))
+    if len(x) * len(y) != len(elements_m) or (np.diff(column[order] * len(y) + row[order]) != 1).any():
+        return whole
+    grid = elements_m[order].reshape(len(x), len(y), 3)
+    return grid[:, 0], grid[0] - grid[0, 0], order
 
 
 @lru_cache(KEPT_TABLES)
