@@ -19,7 +19,7 @@ from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.chunks import gaussians_in_parts
-from wrf_mi.receivers import bartlett_spectrum, element_signals
+from wrf_mi.receivers import antenna_csi, bartlett_spectrum
 from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -111,7 +111,7 @@ def _paths() -> Any:
 
 def _antennas_of_paths(elements: int) -> Call:
     array_m = _array(elements)
-    return lambda: element_signals(_paths(), RECEIVER, array_m, FREQUENCY_HZ)
+    return lambda: antenna_csi(_paths(), RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
 
 
 def _bartlett(elements: int, height: int = HEIGHT, width: int = WIDTH) -> Call:

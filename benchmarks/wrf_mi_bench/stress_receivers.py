@@ -24,7 +24,7 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.ports import Ports, path_sum
-from wrf_mi.receivers import csi, element_signals
+from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.tracing.traced_field import TracedPaths
 
 from .stress_fields import (
@@ -131,7 +131,7 @@ def of_paths(count: int, each: int = 50) -> list[Row]:
             n_rx=1,
         )
         for ports, truth in (
-            (Ports(elements, np.full(16, carrier_hz)), element_signals(known, here, elements, carrier_hz)),
+            (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, here, elements, carrier_hz)[..., 0]),
             (Ports(np.zeros((16, 3)), tones), csi(known, tones)),
         ):
             re, im = path_sum(traced, ports)

@@ -31,7 +31,7 @@ from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray, fibonacci_sphere
 from ...core.types import IntArray
-from ...receivers.beams import mirror_order
+from ...receivers.array import mirror_order
 from ...receivers.retrieve import align_signals
 from ..interpolation.kriging_equations import KrigingSystem, chosen_rows, left_out
 from ..model import field_arrays, from_field_arrays
