@@ -69,9 +69,8 @@ ROOM = _set("steps=18000")
 """Schedule for transmitters anywhere in a room: SSIM 0.770 on validation rows, 0.754 after a third of the steps."""
 FURNISHED = {
     **SPECTRUM,
-    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM), few_seeds=ONE),
+    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
     "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
-    "nerf2": replace(SPECTRUM["nerf2"], few_seeds=ONE),
     "physics": Entry("physics, knows the bare walls", _model("physics", "--scene", NAMED), (), SEEDS),
 }
 UNSEEN = {
@@ -166,8 +165,7 @@ PARTS = (
         "traced-room",
         "official",
         FURNISHED,
-        True,
-        "room",
+        scene="room",
         once=("wrf-gs+", "wrf-gs", "physics"),
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
