@@ -58,6 +58,7 @@ class TracedOptions:
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
+        thickness: whether thicknesses are parameters, too.
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the scene's materials, add up
             to less than this share of the amplitudes of all; 0: none.
@@ -69,6 +70,7 @@ class TracedOptions:
     search_again_m: float | None = None
     tx_antenna: Antenna = ANTENNA
     materials: MaterialGrouping = "named"
+    thickness: bool = False
     planes: bool = False
     faint: float = 0.0
 
@@ -200,7 +202,7 @@ class TracedField:
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
-        values = self.slabs.parameters() | pose_parameters(self.receiver)
+        values = self.slabs.parameters(self.options.thickness) | pose_parameters(self.receiver)
         values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
         if self.options.pattern_degree:
             names = self.pattern_name, TX_PATTERN
@@ -235,8 +237,8 @@ class TracedField:
             row = dr.gather(mi.UInt32, rows, slot // self._each)
             chains = chains.select(row * self._each + slot % self._each)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        stated, fixed = self._constants[:2], self._constants[2:]
-        tables = Tables(*self.slabs.tables(parameters, stated), *fixed)
+        stated, reflected = self._constants[:3], self._constants[3]
+        tables = Tables(*self.slabs.tables(parameters, stated), reflected)
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
