@@ -7,18 +7,15 @@ import mitsuba as mi
 import numpy as np
 
 from wrf_mi.core import Receiver
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.skip import Skip
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.training.step import device_pose
 
 Float64 = dr.float64_array_t(mi.Float)
 RECEIVER = Receiver("r", np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.3, 0.2, 0.9]))
-POSE = Pose(
-    [Float64(float(x)) for x in RECEIVER.position_m],
-    [[Float64(float(x)) for x in row] for row in RECEIVER.to_world],
-)
+POSE = device_pose(RECEIVER, Float64)
 SIZE = (23, 61)
 COUNT, BATCH = 40, 2
 

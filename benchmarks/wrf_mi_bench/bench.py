@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-import yaml
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
@@ -115,17 +114,8 @@ _OWN: Mapping[str, Check] = {
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
     "flat-plan": _here("mesh of a flat", "plan:flat_plan", FLAT),
-    "flat-ble": _here("ray tracing in a flat", "physics_rssi:flat", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
-    "determinism": _here("the same again", "determinism:main", RFID, FLAT, CONFERENCE),
-    "physics-rfid-lab": _here("physics, rfid-lab", "physics_spectrum:rfid_lab", RFID),
-    "physics-flat": _here("physics, flat-ble", "physics_rssi:all_rows", FLAT),
-    "physics-flat-64": _here("physics, flat-ble", "physics_rssi:few_rows", FLAT),
-    "physics-conference": _here("physics, newrf", "physics_csi:conference", CONFERENCE),
-    "physics-office": _here("physics, newrf", "physics_csi:office", OFFICE),
-    "physics-room": _here("physics, traced room", "physics_room:main"),
-    "physics-starts": _here("WRF-GS+, traced room", "physics_room:starts"),
-    "pareto": _here("traced room", "pareto:main", "traced-room"),
+    "pareto": _here("run time against error", "pareto:main", resumes=True),
     "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main"),
     "budgets": _here("fields at budgets", "budget:main", RFID),
@@ -214,15 +204,12 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
     case = CASES[name]
     if not (folder / METRICS).exists() or not (folder / MEASURED).exists():
         wall = run_command(case.arguments, folder, f"bench {name}: ")
-        measured = {"wall_seconds": wall, "date": time.strftime("%Y-%m-%d"), "machine": machine(), **threads()}
-        write_atomically(folder / MEASURED, json.dumps(measured))
-    config = yaml.safe_load((folder / CONFIG).read_text())
+        write_atomically(folder / MEASURED, json.dumps({"wall_seconds": wall, **provenance()}))
     return {
         "case": name,
         "title": case.title,
         "command": f"wrf-mi {' '.join(case.arguments)} --out {folder}",
         **json.loads((folder / MEASURED).read_text()),
-        "versions": config["versions"],
         "metrics": json.loads((folder / METRICS).read_text()),
     }
 
@@ -254,28 +241,24 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
             raise InputError(message.removeprefix("wrf-mi: ")) if message else CheckRefused(f"bench {name}: refused")
         if status != 0:
             raise BenchFailed(f"bench {name}: ended with status {status} {message}".rstrip())
-        measured = json.loads(stored.read_text())
-        where = {"date": time.strftime("%Y-%m-%d"), "machine": machine(), "versions": versions(), **threads()}
-        measured = {"wall_seconds": time.perf_counter() - start, **where, "figures": measured}
+        figures = json.loads(stored.read_text())
+        measured = {"wall_seconds": time.perf_counter() - start, **provenance(), "figures": figures}
         write_atomically(stored, json.dumps(measured, indent=1))
     known = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
     return known | json.loads(stored.read_text())
 
 
-def threads() -> dict[str, int]:
-    """Number of threads of a worker, where this process is one."""
-    count = worker_threads()
-    return {} if count is None else {"worker_threads": count}
-
-
-def machine() -> dict[str, Any]:
-    """Processor, cores, memory and system of this machine."""
-    return {
-        "processor": versions()["device"],
+def provenance() -> dict[str, Any]:
+    """Date, machine, versions of packages and, in a worker, its number of threads."""
+    count, known = worker_threads(), versions()
+    machine = {
+        "processor": known["device"],
         "cores": os.cpu_count(),
         "memory_gb": round(psutil.virtual_memory().total / 1e9),
         "system": f"{platform.system()} {platform.machine()}",
     }
+    threads = {} if count is None else {"worker_threads": count}
+    return {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": known, **threads}
 
 
 def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compressed import compress_run, spectrum_times
-from wrf_mi.runs.fit_key import fit_key, fit_once
 from wrf_mi.runs.folder import FITTED
 from wrf_mi.runs.results import read_run
 from wrf_mi.synthetic import load_record
@@ -56,12 +54,8 @@ BUDGETS: Mapping[str, Budget] = {
 }
 
 
-def _folder_name(name: str) -> str:
-    return name.replace(" ", "-").replace(",", "")
-
-
 def budgets(
-    record: Record, work: Path, schedule: Sequence[str] = (), seed: int = 0, given: Mapping[str, Budget] = BUDGETS
+    record: Record, work: Path, schedule: Sequence[str] = (), given: Mapping[str, Budget] = BUDGETS
 ) -> dict[str, Any]:
     """Fit a field at each budget on the official split and measure them beside each other.
 
@@ -69,19 +63,19 @@ def budgets(
         By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
         `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
     """
-    rows, whole_fits, folders = make_splits(record, "official", seed)[0], dict[str, Path](), dict[str, Path]()
-    for name, budget in given.items():
+    fits, folders = dict[str, Path](), dict[str, Path]()
+    for number, (name, budget) in enumerate(given.items()):
         if not budget.of:
-            config = with_settings(TrainConfig(seed=seed), [*schedule, *budget.settings])
-            fitted = work / f"{_folder_name(name)}-{fit_key(record, rows, config)}"
-            whole_fits[name] = fit_once(fitted, partial(train, record, fitted, config.model, settings=config))
-        folders[name] = source = whole_fits[budget.of or name]
+            config = with_settings(TrainConfig(), [*schedule, *budget.settings])
+            fits[name] = train(record, work / f"fit{number}", config.model, settings=config).folder
+        folders[name] = source = fits[budget.of or name]
         if budget.how is not None:
-            small = work / f"{_folder_name(name)}-compressed-{fit_key(source.name, budget.how)}"
-            folders[name] = fit_once(small, partial(compress_run, source, small, budget.how, record))
+            folders[name] = work / f"small{number}"
+            compress_run(source, folders[name], budget.how, record)
     first = folders[next(iter(folders))]
     predictors = {name: open_run(folder, record).predictor() for name, folder in folders.items()}
-    times = spectrum_times(predictors, record.tx_pos_m[rows.all_train], REPEATS)
+    known = make_splits(record, "official")[0].all_train
+    times = spectrum_times(predictors, record.tx_pos_m[known], REPEATS)
     found, whole = {}, read_run(first).metrics["ssim"]["median"]
     for name, folder in folders.items():
         metrics, size = read_run(folder).metrics, (folder / FITTED).stat().st_size

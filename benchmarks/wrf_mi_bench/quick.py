@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +23,20 @@ import numpy as np
 
 from wrf_mi.backend import init
 from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.folder import versions
 from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.step import CompiledPredictor, device_pose
+from wrf_mi.training.step import device_pose, grey
 from wrf_mi.training.trainer import Trainer
 
-from .bench import BenchFailed, machine
+from .bench import BenchFailed, provenance
 from .stock import StockRenderer, rgb_variant
 from .workloads import HEIGHT, WIDTH, field, integrator, physics, record, splatting, tracer
 
@@ -98,7 +99,7 @@ def _batch() -> tuple[Call, Call]:
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     pose, plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
     positions = transmitter_path(count)[rng.permutation(count)]
-    together, alone = CompiledPredictor(trainer.field), CompiledPredictor(trainer.field)
+    together, alone = (Recorded(partial(grey, trainer.field)) for _ in range(2))
     dr.eval(params)
 
     def ours() -> Any:
@@ -192,9 +193,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
         "title": "interleaved pairs",
         "command": f"wrf-mi bench --quick --backend {init().name} --store",
         "wall_seconds": time.perf_counter() - start,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine(),
-        "versions": versions(),
+        **provenance(),
         "figures": {"ratios": found},
     }
     if stored is None:

@@ -17,9 +17,9 @@ from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.gaussians import FIELDS, InitialGaussians, random_gaussians
+from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.chunks import gaussians_in_parts
-from wrf_mi.receivers import bartlett_spectrum, element_signals
+from wrf_mi.receivers import antenna_csi, bartlett_spectrum
 from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -29,7 +29,7 @@ from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line
-from .workloads import HEIGHT, WIDTH, field, integrator, physics, size_deg, splatting, tracer
+from .workloads import HEIGHT, WIDTH, field, integrator, parameters, physics, size_deg, splatting, tracer
 
 logger = logging.getLogger(__name__)
 
@@ -79,14 +79,10 @@ def _directions(make: Callable[..., Call], count: int, directions: int) -> Call:
     return make(count, HEIGHT * finer, WIDTH * finer)
 
 
-def _start(count: int) -> InitialGaussians:
-    return random_gaussians([RECEIVER], count, np.random.default_rng(0), size_deg=size_deg(count))
-
-
 def _networks(count: int) -> Call:
     """Geometry and signals of WRF-GS+ for one transmitter."""
     field = FIELDS["wrf-gs+"]()
-    params = {k: to_tensor(v) for k, v in field.init(_start(count), np.random.default_rng(0)).items()}
+    params = {name: to_tensor(values) for name, values in parameters(field, count, size_deg(count)).items()}
     tx = to_tensor(transmitter_path(1).T)
     return lambda: vars(gaussians_in_parts(field, params, tx))
 
@@ -94,7 +90,7 @@ def _networks(count: int) -> Call:
 def _field(transmitters: int) -> Call:
     tx = transmitter_path(transmitters)
     field = make_field(TrainConfig().resolved(tx))
-    predictor = Predictor(field, field.init(_start(SMALL), np.random.default_rng(0)), [RECEIVER], HEIGHT, WIDTH)
+    predictor = Predictor(field, parameters(field, SMALL, size_deg(SMALL)), [RECEIVER], HEIGHT, WIDTH)
     return lambda: predictor(tx)
 
 
@@ -115,7 +111,7 @@ def _paths() -> Any:
 
 def _antennas_of_paths(elements: int) -> Call:
     array_m = _array(elements)
-    return lambda: element_signals(_paths(), RECEIVER, array_m, FREQUENCY_HZ)
+    return lambda: antenna_csi(_paths(), RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
 
 
 def _bartlett(elements: int, height: int = HEIGHT, width: int = WIDTH) -> Call:

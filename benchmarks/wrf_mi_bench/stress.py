@@ -28,7 +28,7 @@ from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
 from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
-from .stress_traced import phases, traced_gradients
+from .stress_traced import phases
 
 PICTURE = Path("docs/images/numerics.png")
 """Picture of the error curves, written only in a checkout of the project."""
@@ -101,7 +101,7 @@ def _functional(field: Any, tx: Any, rng: np.random.Generator) -> Callable[[dict
     return value
 
 
-def fits(count: int) -> Row:
+def fits(count: int) -> list[Row]:
     """Short fits with bad learning rates and starts: each ends with finite parameters or names step and group.
 
     All saved parameters have to be finite.
@@ -143,53 +143,43 @@ def fits(count: int) -> Row:
         unseen += not all(np.isfinite(values).all() for params in saved for values in params.values())
     what = f"{FITS} learning rates and starts, {count} cases"
     value = f"{finished} ended finite, {stated} said at which step which group was not, {unseen} did neither"
-    return {"what": what, "value": value, "asked": NEITHER}
+    return [{"what": what, "value": value, "asked": NEITHER}]
+
+
+PARTS: Sequence[tuple[Callable[..., list[Row]], tuple[Any, ...], tuple[Any, ...]]] = (
+    (images, (1000, 25), (5, 1)),
+    (gradients, (10,), (1, HARDEST)),
+    (field_functions, (), (tuple(FIELDS), 3)),
+    (of_fields, (50, 5), (2, 1)),
+    (derivatives, (2,), (1, ("spectrum", "RSSI"), ("random", *HARDEST[:1]))),
+    (of_paths, (25,), (1,)),
+    (losses, (10,), (1,)),
+    (phases, (), (5,)),
+    (joint, (), (1, (COPLANAR, CANCELLING), ("RSSI",))),
+    (plugin_images, (50, 5), (2, 1, 0)),
+    (plugin_gradients, (2,), (1, HARDEST[:1])),
+    (fits, (100,), (4,)),
+)
+"""Functions that make rows, with their arguments at full size and for few cases within a minute."""
 
 
 def main() -> dict[str, Any]:
     """All rows at full size, and a picture of error curves."""
-    rows = [
-        *images(1000, 25),
-        *gradients(10),
-        *field_functions(),
-        *of_fields(50, 5),
-        *derivatives(2),
-        of_paths(25),
-        *losses(10),
-        *phases(),
-        *traced_gradients(),
-        *joint(),
-        *plugin_images(50, 5),
-        *plugin_gradients(2),
-        fits(100),
-    ]
+    rows = [one for part, full, _ in PARTS for one in part(*full)]
     found = curves()
     if PICTURE.parent.is_dir():
         draw(found, PICTURE)
     return {"rows": rows, "curves": found}
 
 
-QUICK: Sequence[Callable[[], list[Row]]] = (
-    lambda: images(5, 1),
-    lambda: gradients(1, HARDEST),
-    lambda: field_functions(tries=3),
-    lambda: of_fields(2, 1),
-    lambda: derivatives(1, ("spectrum", "RSSI"), ("random", *HARDEST[:1])),
-    lambda: [of_paths(1)],
-    lambda: losses(1),
-    lambda: phases(5),
-    lambda: traced_gradients(2),
-    lambda: joint(1, (COPLANAR, CANCELLING), ("RSSI",)),
-    lambda: plugin_images(2, 1, 0),
-    lambda: plugin_gradients(1, HARDEST[:1]),
-    lambda: [fits(4)],
-)
-"""Rows with few cases each, within a minute."""
+def quick_rows() -> list[Row]:
+    """A few cases of each row."""
+    return [one for part, _, few in PARTS for one in part(*few)]
 
 
 def quick() -> dict[str, Any]:
-    """A few cases of each row; `BenchFailed` where a bound is not kept."""
-    rows = [one for part in QUICK for one in part()]
+    """`quick_rows`; `BenchFailed` where a bound is not kept."""
+    rows = quick_rows()
     if missed := [f"{one['what']}: {one['value']}, asked {one['asked']}" for one in rows if not held(one)]:
         raise BenchFailed(f"bench stress --quick: {'; '.join(missed)}")
     return {"rows": rows}

@@ -17,31 +17,30 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from wrf_mi_scenes.build_laboratory import Mesh, sheet
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.backend.device import on_device
-from wrf_mi.core import Antenna, Receiver, pixel_directions
-from wrf_mi.core.angles import FloatArray, solid_angles
+from wrf_mi.core import Antenna, Receiver
+from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.receivers import array_response, bartlett_spectrum
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.pose import receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
-from .stress_oracle import OraclePaths, TracedOracle, Values, slopes
-from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst, relative
-from .stress_traced import ROOM, box_sheets
+from .stress_oracle import ComplexArray, OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
+from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst
+from .stress_traced import box_sheets
 
 HZ = 920e6
+ROOM = (6.0, 5.0, 3.0)
+"""Size of the room in metres."""
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
 ELEMENTS_M = planar_array(3, 3, 0.16)
@@ -51,6 +50,7 @@ MODELS: Mapping[str, Any] = {
     "RSSI": PowerReceiver(*SIZE, (HZ,)),
     "CSI": CsiReceiver(*SIZE, (HZ, 1.01 * HZ)),
 }
+ORACLE = ReportOracle(SIZE, ELEMENTS_M, HZ)
 KINDS = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_metal")
 THICKNESS_M = {"itu_concrete": 0.3, "itu_metal": 0.1, **dict.fromkeys(KINDS[1:5], 0.02), "itu_chipboard": 0.02}
 GRAZING_M = 1e-3
@@ -169,10 +169,7 @@ class _Joint:
             self._cancel()
 
     def _cancel(self) -> None:
-        model, name = MODELS["RSSI"], self._traced.gain_name
-        learned = self._learned(model, self._values, DOUBLE)
-        there = model.signals(None, learned)[1]
-        wave = complex(there[0].numpy()[0], there[1].numpy()[0])
+        name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
         here = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
         factor = -wave / here * (1 + LEFT)
         gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
@@ -182,11 +179,8 @@ class _Joint:
         """Values and derivatives of the receiver models."""
         value, slope = Worst(), GradientWorst()
         references = {kind: _Reference(self, MODELS[kind]) for kind in models}
-        weights = {
-            kind: np.random.default_rng(3).normal(size=len(self._traced) * int(np.prod(MODELS[kind].shape)))
-            for kind in references
-        }
-        weights = {kind: weight.astype(np.float32) for kind, weight in weights.items()}
+        counts = {kind: len(self._traced) * int(np.prod(MODELS[kind].shape)) for kind in references}
+        weights = {kind: np.random.default_rng(3).normal(size=n).astype(np.float32) for kind, n in counts.items()}
 
         def functionals(values: Values) -> FloatArray:
             paths = self._oracle(values)
@@ -211,10 +205,15 @@ class _Joint:
             return values - self._case.receiver.position_m[:, None] if name == "field.position" else values
         return np.full(self._values[name].shape, _natural(name))
 
-    def _learned(self, model: Any, values: Values, kind: Any) -> Any:
-        return self._learned_of(model, {name: _tensor(value, kind) for name, value in values.items()}, kind)
+    def learned(self, model: Any) -> ComplexArray:
+        """Learned signals [n, directions or ports] in float64."""
+        re, im = self._learned(model, self._params(DOUBLE), DOUBLE)
+        return ORACLE.learned(model, (re.numpy() + 1j * im.numpy()).reshape(len(self._traced), -1))
 
-    def _learned_of(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
+    def _params(self, kind: Any) -> dict[str, Any]:
+        return {name: _tensor(value, kind) for name, value in self._values.items()}
+
+    def _learned(self, model: Any, params: Mapping[str, Any], kind: Any) -> Any:
         weights = {name.removeprefix("field."): v for name, v in params.items() if name.startswith("field.")}
         gaussians = self._field.gaussians(weights, _tensor(self._case.tx_pos_m.T, kind))
         pose = receiver_pose(self._case.receiver, params, kind)
@@ -224,10 +223,10 @@ class _Joint:
         self, model: Any, weight: Any, kind: Any, learned_alone: bool = False
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Report, and derivatives of its weighted sum, by both sides or with constant paths."""
-        params = {name: _tensor(value, kind) for name, value in self._values.items()}
+        params = self._params(kind)
         dr.enable_grad(params)
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
-        report = model(paths, self._learned_of(model, params, kind))
+        report = model(paths, self._learned(model, params, kind))
         dr.backward(dr.sum(report * on_device(weight, kind)))
         found = dr.detach(report).numpy().astype(float)
         return found, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
@@ -237,56 +236,19 @@ class _Reference:
     """Report in NumPy as a function of the paths, with the learned side of Dr.Jit's float64."""
 
     def __init__(self, joint: _Joint, model: Any) -> None:
-        self._model = model
-        re, im = joint._learned(model, joint._values, DOUBLE)
-        there = (re.numpy() + 1j * im.numpy()).reshape(len(joint._case.tx_pos_m), -1)
-        if isinstance(model, CsiReceiver):
-            there = np.repeat(there @ _solid(model)[:, None], len(model.frequencies_hz), axis=1)
-        self._there = there
+        self._model, self._there = model, joint.learned(model)
 
     def report(self, paths: OraclePaths) -> FloatArray:
         """Flat report."""
-        return self._report(self._here(paths), self._there)
+        model, ports = self._model, (ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))
+        if isinstance(model, CsiReceiver):
+            ports = np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz)
+        return ORACLE.report(model, paths.at(*ports), self._there)
 
     def error(self, found: FloatArray, paths: OraclePaths) -> float:
         """Error of a report."""
-        model, here, there = self._model, self._here(paths), self._there
-        truth = self._report(here, there)
-        if not isinstance(model, CsiReceiver):
-            return relative(found - truth, truth)
-        waves = np.abs(paths.gain).reshape(len(here), -1).sum(axis=1) + np.abs(there).max(axis=1)
-        if isinstance(model, PowerReceiver):
-            return float((np.abs(10 ** (found / 20) - 10 ** (truth / 20)) / waves).max())
-        return float((np.abs((found - truth).reshape(len(here), -1)) / waves[:, None]).max())
-
-    def _here(self, paths: OraclePaths) -> NDArray[np.complex128]:
-        """Traced signals [n, ports]."""
-        model = self._model
-        if isinstance(model, CsiReceiver):
-            return paths.at(np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz))
-        return paths.at(ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))
-
-    def _report(self, here: NDArray[np.complex128], there: NDArray[np.complex128]) -> FloatArray:
-        model = self._model
-        if isinstance(model, PowerReceiver):
-            return np.asarray(10 * np.log10((np.abs(here + there) ** 2).mean(axis=1) + LEAST_POWER))
-        if isinstance(model, CsiReceiver):
-            both = here + there
-            return np.stack([both.real, both.imag], axis=-1).ravel()
-        directions = _directions()
-        steering = array_response(ELEMENTS_M, directions, HZ)
-        if isinstance(model, ArrayReceiver):
-            h = here + (there * _solid(model)) @ steering
-            return np.sqrt(bartlett_spectrum(h, ELEMENTS_M, HZ, *SIZE) ** 2 + SQUARED_MAGNITUDE_EPS).ravel()
-        return np.sqrt(np.abs(here @ steering.conj().T + there) ** 2 + SQUARED_MAGNITUDE_EPS).ravel()
-
-
-def _directions() -> FloatArray:
-    return pixel_directions(*SIZE).reshape(-1, 3)
-
-
-def _solid(model: Any) -> FloatArray:
-    return np.tile(solid_angles(*SIZE), 2 if model.sphere else 1)
+        waves = np.abs(paths.gain).reshape(len(self._there), -1).sum(axis=1) + np.abs(self._there).max(axis=1)
+        return report_error(self._model, found, self.report(paths), waves)
 
 
 def _natural(name: str) -> float:

@@ -13,7 +13,7 @@ from skimage.metrics import structural_similarity
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.physics.spectrum_loss import Grid
+from wrf_mi.models.physics.spectrum_waves import Grid
 from wrf_mi.tasks.losses import SSIM_WEIGHT, absolute_error, spectrum_loss
 
 from .stress_fields import SIZE, Rng

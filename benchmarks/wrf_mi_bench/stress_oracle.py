@@ -1,7 +1,8 @@
-"""Traced side of the joint graph in NumPy, complex128: the reference of `wrf_mi.tracing.field_calculator`.
+"""Traced side of the joint graph and reports of receivers in NumPy, complex128.
 
-It shares the chains of planes and constants with the graph, but no device code. The direction of a leg is that from an
-image of the transmitter to an image of the receiver; slabs are Airy sums, patterns SciPy's spherical harmonics.
+The reference of `wrf_mi.tracing.field_calculator` shares the chains of planes and constants with the graph, but no
+device code. The direction of a leg is that from an image of the transmitter to an image of the receiver; slabs are Airy
+sums, patterns SciPy's spherical harmonics.
 """
 
 from __future__ import annotations
@@ -16,10 +17,16 @@ from scipy.constants import epsilon_0, speed_of_light
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from wrf_mi.core.angles import FloatArray
+from wrf_mi.core import pixel_directions
+from wrf_mi.core.angles import FloatArray, solid_angles
+from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
+from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PowerReceiver
+from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
 from wrf_mi.tracing.traced_field import TX_PATTERN, TracedField
 from wrf_mi.tracing.walls import Walls, walls_of
+
+from .stress_rows import relative
 
 ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
@@ -135,6 +142,52 @@ class TracedOracle:
         along = np.cross(across, before), np.cross(across, after)
         s, p = ((sent * one).sum(axis=-1, keepdims=True) for one in (across, along[0]))
         return np.where(met[:, None], te[:, None] * s * across + tm[:, None] * p * along[1], sent)
+
+
+@dataclass(frozen=True)
+class ReportOracle:
+    """Reports of receivers in NumPy.
+
+    Attributes:
+        size: rows and columns of a hemisphere's directions.
+        elements_m: positions of the array's elements [m, 3].
+        frequency_hz: carrier frequency of spectra.
+    """
+
+    size: tuple[int, int]
+    elements_m: FloatArray
+    frequency_hz: float
+
+    def learned(self, model: Any, field: ComplexArray) -> ComplexArray:
+        """Signals of complex fields [n, directions]: the same, or at an antenna, for each frequency, their sum."""
+        if not isinstance(model, CsiReceiver):
+            return field
+        return np.repeat(field @ np.tile(solid_angles(*self.size), 2)[:, None], len(model.frequencies_hz), axis=1)
+
+    def report(self, model: Any, traced: ComplexArray, learned: ComplexArray) -> FloatArray:
+        """Flat report of signals of paths at the ports [n, m] and of what `learned` returns."""
+        if isinstance(model, PowerReceiver):
+            return np.asarray(10 * np.log10((np.abs(traced + learned) ** 2).mean(axis=1) + LEAST_POWER))
+        if isinstance(model, CsiReceiver):
+            both = traced + learned
+            return np.stack([both.real, both.imag], axis=-1).ravel()
+        steering = array_response(self.elements_m, pixel_directions(*self.size).reshape(-1, 3), self.frequency_hz)
+        if not isinstance(model, ArrayReceiver):
+            return np.sqrt(np.abs(traced @ steering.conj().T + learned) ** 2 + SQUARED_MAGNITUDE_EPS).ravel()
+        h = traced + (learned * solid_angles(*self.size)) @ steering
+        bartlett = bartlett_spectrum(h, self.elements_m, self.frequency_hz, *self.size)
+        spectrum = np.sqrt(bartlett**2 + SQUARED_MAGNITUDE_EPS)
+        return np.asarray(minmax_scale(spectrum) if model.instrument_scale else spectrum).ravel()
+
+
+def report_error(model: Any, found: FloatArray, truth: FloatArray, waves: FloatArray) -> float:
+    """Error of a report, relative to its norm, or at an antenna to the sums [n] of the waves' magnitudes."""
+    if not isinstance(model, CsiReceiver):
+        return relative(found - truth, truth)
+    if isinstance(model, PowerReceiver):
+        found, truth = 10 ** (found / 20), 10 ** (truth / 20)
+        waves = np.maximum(waves, truth)
+    return float((np.abs(found - truth).reshape(len(waves), -1) / waves[:, None]).max())
 
 
 def _mirror(walls: Walls, plane: NDArray[Any], reflects: NDArray[np.bool_], points: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.runs.figures import save, score_cdf
 from wrf_mi.tasks import TASKS
 
-from .table_plan import PARTS, SHARES, Part, Row, plan
+from .table_plan import PARTS, SHARES, Part, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
@@ -36,15 +36,16 @@ def write_tables(place: Path, quick: bool = False) -> None:
         if shown := overview(name, stored, quick):
             text += [f"## {heading.capitalize()}: medians", shown]
     for part in PARTS:
-        rows = [row for row in plan(quick) if row.part == part and row.name in stored]
-        if not rows:
+        groups = grouped(part, stored, quick)
+        if not groups:
             continue
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, rows, stored)]
-        whole = [row for row in rows if row.share == max(row.share for row in rows) and row.seed == 0]
+        text += [f"## {title}", part_table(part, groups)]
+        most = max(share for share, _ in groups)
+        whole = {method: found[0] for (share, method), found in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
-            {row.entry.label: stored[row.name]["quantiles"] for row in whole}, {}, TASKS[part.task].label
+            {part.entries[method].label: one["quantiles"] for method, one in whole.items()}, {}, TASKS[part.task].label
         )
         save(figure, place / picture)
         text.append(f"![Distribution of the scores of each method]({picture})")
@@ -72,18 +73,31 @@ NOTE = (
 )
 
 
+Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
+"""Stored rows by share of the training rows and method, in the order of their seeds."""
+
+
+def grouped(part: Part, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> Groups:
+    """Stored rows of a part."""
+    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
+    for row in plan(quick):
+        if row.part == part and row.name in stored:
+            groups.setdefault((row.share, row.method), []).append(stored[row.name])
+    return groups
+
+
 def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> str:
     """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
     """
-    found: dict[Part, dict[str, list[float]]] = {}
-    for row in plan(quick):
-        if row.part.table == name and row.name in stored and (quick or row.share == SHARES[0]):
-            found.setdefault(row.part, {}).setdefault(row.method, []).append(stored[row.name]["score"]["median"])
-    if not found:
+    columns: dict[Part, dict[str, float]] = {}
+    for part in PARTS:
+        for (share, method), rows in grouped(part, stored, quick).items() if part.table == name else ():
+            if quick or share == SHARES[0]:
+                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
+    if not columns:
         return ""
-    columns = {part: {key: float(np.mean(each)) for key, each in methods.items()} for part, methods in found.items()}
     task = TASKS[next(iter(columns)).task]
     sign = -1 if task.higher_is_better else 1
     ranks: dict[str, list[float]] = {}
@@ -91,7 +105,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         for rank, method in enumerate(sorted(medians, key=lambda method: sign * medians[method])):
             ranks.setdefault(method, []).append(rank / max(len(medians) - 1, 1))
     entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
-    lines = _head([task.label, *(_title(part) for part in columns), "paper, other data"])
+    lines = _head([task.label, *(title_of(part) for part in columns), "paper, other data"])
     best = {part: min(medians.values(), key=lambda median: sign * median) for part, medians in columns.items()}
     for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
         cells = []
@@ -113,17 +127,15 @@ def _head(cells: Sequence[str]) -> list[str]:
     return [_cells(cells), _cells(["---"] * len(cells))]
 
 
-def _title(part: Part) -> str:
+def title_of(part: Part) -> str:
+    """Data set, and split where it is not the official one."""
     return part.dataset if part.split == "official" else f"{part.dataset}, {part.split}"
 
 
-def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str, Any]]) -> str:
+def part_table(part: Part, groups: Groups) -> str:
     """Markdown table of a data set and split: best median first, fewer rows below."""
     task = TASKS[part.task]
     sign = -1 if task.higher_is_better else 1
-    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row.share, row.method), []).append(stored[row.name])
 
     def median(key: tuple[float, str]) -> float:
         return float(np.mean([one["score"]["median"] for one in groups[key]]))
@@ -144,14 +156,14 @@ def part_table(part: Part, rows: Sequence[Row], stored: Mapping[str, Mapping[str
             f"{np.median([one['train_seconds'] for one in found]):.0f} s",
             f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
             f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
-            part.entries[method].published if share == max(row.share for row in rows) else "",
+            part.entries[method].published if share == max(share for share, _ in groups) else "",
         ]
         lines.append(_cells(cells))
     lines += _reference_rows(part, groups)
     return "\n".join(lines)
 
 
-def _reference_rows(part: Part, groups: Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]) -> list[str]:
+def _reference_rows(part: Part, groups: Groups) -> list[str]:
     """Lines of the references that every run states, where the part has no row of interpolation."""
     if "idw" in part.entries:
         return []

@@ -44,11 +44,10 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
 
 NAMED = "{scene}"
 """Argument that is replaced by the arguments of a scene."""
-IN_A_FLAT = (
-    *("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2"),
-    *("--calibrate", "gain,patterns"),
-)
-"""Transmission through walls of two surfaces each, and calibration of uncalibrated strengths."""
+IN_A_FLAT = ("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2")
+"""Transmission through walls of two surfaces each."""
+CALIBRATED = ("--calibrate", "gain,patterns")
+"""Calibration of uncalibrated strengths."""
 ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
 """Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
@@ -70,8 +69,9 @@ ROOM = _set("steps=18000")
 """Schedule for transmitters anywhere in a room: SSIM 0.770 on validation rows, 0.754 after a third of the steps."""
 FURNISHED = {
     **SPECTRUM,
-    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
+    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM), few_seeds=ONE),
     "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
+    "nerf2": replace(SPECTRUM["nerf2"], few_seeds=ONE),
     "physics": Entry("physics, knows the bare walls", _model("physics", "--scene", NAMED), (), SEEDS),
 }
 UNSEEN = {
@@ -91,8 +91,13 @@ RSSI: Mapping[str, Entry] = {
     "physics": Entry("physics, knows walls and heading", _model("physics", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
-        "ray tracing, calibrated, knows walls and heading", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+        "ray tracing, calibrated, knows walls and heading",
+        _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT, *CALIBRATED),
     ),
+    "ray-tracing-offsets": Entry(
+        "ray tracing, one offset a receiver", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+    ),
+    "physics-no-mesh": Entry("physics without a mesh, knows the heading", _model("physics")),
     "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
     "kriging": Entry("kriging, knows the heading", _model("kriging")),
     "idw": Entry("IDW", _model("idw")),
@@ -102,6 +107,7 @@ POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
     "physics": Entry("physics, in the scanned room", _model("physics", "--scene", NAMED), (), SEEDS),
+    "physics-no-mesh": Entry("physics without a mesh", _model("physics")),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "kriging": Entry("kriging", _model("kriging")),
@@ -160,7 +166,8 @@ PARTS = (
         "traced-room",
         "official",
         FURNISHED,
-        scene="room",
+        True,
+        "room",
         once=("wrf-gs+", "wrf-gs", "physics"),
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),

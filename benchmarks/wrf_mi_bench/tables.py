@@ -26,7 +26,7 @@ from wrf_mi.core import InputError
 from wrf_mi.core.files import atomic_folder, one_line, write_atomically
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.fit_key import content_digest, dataset_files, fit_key, scene_files
-from wrf_mi.runs.folder import CONFIG, METRICS, package_versions, versions
+from wrf_mi.runs.folder import CONFIG, METRICS, package_versions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
@@ -34,9 +34,9 @@ from wrf_mi.synthetic.floor_channels import MEASURED
 from wrf_mi.synthetic.furnished_room import traced_room
 from wrf_mi.tasks.scores import summary
 
-from .bench import BenchFailed, machine, run_command, threads
+from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
-from .physics_csi import SCANNED, scanned_scene
+from .scene import SCANNED, scanned_scene
 from .table_pages import read_rows, write_tables
 from .table_plan import NAMED, Part, Row, available, plan
 
@@ -104,7 +104,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         print(f"tables: {row.name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
     else:
         # Ray tracing takes seconds and cannot be resumed.
-        resumes = row.method != "ray-tracing"
+        resumes = not row.method.startswith("ray-tracing")
         if folder.exists() and not (resumes and (folder / CONFIG).exists()):
             shutil.rmtree(folder)  # stopped before its configuration was written
         wall = run_command(row.arguments(scene), folder, resumes=resumes)
@@ -116,12 +116,9 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         "share": row.share,
         "seed": row.seed,
         "command": row.command,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine(),
-        "versions": versions(),
+        **provenance(),
         "data": data,
         "wall_seconds": wall,
-        **threads(),
         **{key: run.metrics[key] for key in KEPT},
         "score": summary(scores),
         "quantiles": [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -16,7 +18,7 @@ from wrf_mi.core import Receiver, unit_vectors
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.timing import Within, seconds
+from wrf_mi.runs.timing import Within, interleaved, ratio
 from wrf_mi.training.step import device_pose
 
 from .comparison import line
@@ -143,12 +145,12 @@ def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int
     """
     rows = []
     for size in sizes_deg:
-        for ratio in (1.0, 2.0):
+        for axes in (1.0, 2.0):
             # The overlap is that of 300 Gaussians of 2 degrees, except at the largest sizes.
             count = max(30, int(300 * (2 / size) ** 2))
-            found = against_splatted(fields, size_deg=size, ratio=ratio, count=min(count, 1000))
+            found = against_splatted(fields, size_deg=size, ratio=axes, count=min(count, 1000))
             means = {name: float(np.mean([f[name] for f in found])) for name in found[0]}
-            rows.append({"size_deg": float(size), "ratio": ratio} | means)
+            rows.append({"size_deg": float(size), "ratio": axes} | means)
     return rows
 
 
@@ -164,24 +166,28 @@ def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, fl
     params = mi.traverse(scene)
     # Copied, as an update of the scene frees the memory.
     data, signal = (params[f"gaussians.{name}"].numpy().copy() for name in ("data", "signal"))
-    times: dict[str, list[float]] = {"traced_ms": [], "again_ms": [], "stock_ms": []}
     stock = StockRenderer(receiver, HEIGHT, WIDTH)
     colour = np.random.default_rng(0).standard_normal((count, 3)).astype(np.float32)
     stock.load(data.reshape(count, -1), opacity.numpy(), colour)
-    for _ in range(repeats + 1):
-        for name, key, values in (("traced_ms", "data", data), ("again_ms", "signal", signal)):
-            params[f"gaussians.{key}"] = to_float(values)
-            params.update()
-            times[name].append(1e3 * seconds(lambda: mi.render(scene)))
-        times["stock_ms"].append(1e3 * seconds(Within(stock.render, rgb_variant)))
-    # The first of each compiles.
-    median = {name: float(np.median(values[1:])) for name, values in times.items()}
+
+    @contextmanager
+    def changed(key: str, values: NDArray[np.float32]) -> Iterator[None]:
+        params[f"gaussians.{key}"] = to_float(values)
+        params.update()
+        yield
+
+    calls = {
+        "traced_ms": Within(partial(mi.render, scene), partial(changed, "data", data)),
+        "again_ms": Within(partial(mi.render, scene), partial(changed, "signal", signal)),
+        "stock_ms": Within(stock.render, rgb_variant),
+    }
+    times = interleaved(calls, repeats, 1)
     return {
         "size_deg": float(size_deg),
         "gaussians": float(count),
-        **median,
-        "stock_over_traced": float(np.median(np.divide(times["stock_ms"], times["traced_ms"])[1:])),
-        "stock_over_again": float(np.median(np.divide(times["stock_ms"], times["again_ms"])[1:])),
+        **{name: float(np.median(ms)) for name, ms in times.items()},
+        "stock_over_traced": ratio(times["stock_ms"], times["traced_ms"]).value,
+        "stock_over_again": ratio(times["stock_ms"], times["again_ms"]).value,
     }
 
 

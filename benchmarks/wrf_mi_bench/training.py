@@ -8,32 +8,30 @@ from __future__ import annotations
 
 import json
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import psutil
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.tiles import TILE_COLUMNS, TILE_ROWS, build_lists, perception_plane
-from wrf_mi.parallel import run_module
-from wrf_mi.runs.api import train
+from wrf_mi.runs.folder import METRICS
 from wrf_mi.runs.timing import Interval, bootstrap, interleaved, seconds
 from wrf_mi.synthetic import load_record
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.step import device_pose
-from wrf_mi.training.trainer import Trainer, peak_memory_mb
+from wrf_mi.training.trainer import Trainer
 
-from .bench import BenchFailed
+from .bench import run_command
 from .comparison import line
 
 DATA = "rfid-lab"
@@ -70,37 +68,20 @@ class Work:
 
 
 def fit(model: str) -> dict[str, Any]:
-    """Time, memory and accuracy of a fit with default settings on the authors' split, in this process."""
-    record = load_record(DATA)
-    processor = time.process_time()
+    """Time, memory and accuracy of a fit with default settings on the authors' split, in a subprocess."""
+    before = _children_seconds()
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "run"
-        train(record, folder, model)
-        metrics = json.loads((folder / "metrics.json").read_text())
-    return {
-        "seconds": metrics["train_seconds"],
-        "processor_seconds": time.process_time() - processor,
-        "peak_memory_mb": peak_memory_mb(),
-        "ssim": metrics["ssim"],
-        "gaussians": metrics.get("gaussians"),
-        "steps": metrics.get("steps"),
-    }
+        run_command(("train", DATA, "--model", model), folder, "bench training: ")
+        metrics = json.loads((folder / METRICS).read_text())
+    kept = {key: metrics.get(key) for key in ("peak_memory_mb", "ssim", "gaussians", "steps")}
+    return {"seconds": metrics["train_seconds"], "processor_seconds": _children_seconds() - before, **kept}
 
 
-fit_wrf_gs_plus, fit_wrf_gs, fit_factorised, fit_physics = (partial(fit, model) for model in TITLES)
-FITS = dict(zip(TITLES, ("fit_wrf_gs_plus", "fit_wrf_gs", "fit_factorised", "fit_physics"), strict=True))
-"""Function that fits each model in a subprocess, whose peak memory is then the fit's."""
-
-
-def fit_in_subprocess(model: str) -> dict[str, Any]:
-    """Result of `fit` in a subprocess; `BenchFailed` where it failed."""
-    with tempfile.TemporaryDirectory() as work:
-        out = Path(work) / "fit.json"
-        status, message = run_module("wrf_mi_bench.check", [f"{__name__}:{FITS[model]}", str(out)])
-        if status != 0:
-            raise BenchFailed(f"training: fitting {model} ended with status {status} {message}".rstrip())
-        result: dict[str, Any] = json.loads(out.read_text())
-        return result
+def _children_seconds() -> float:
+    """Processor time of all finished subprocesses."""
+    times = psutil.Process().cpu_times()
+    return float(times.children_user + times.children_system)
 
 
 def trainer(model: str, gaussians: int, batch: int) -> Trainer:
@@ -219,7 +200,7 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
 def main() -> dict[str, Any]:
     """Fits of all models, and their steps beside the machine's best."""
     load_record(DATA)  # missing data are reported first
-    fits = {model: fit_in_subprocess(model) for model in TITLES}
+    fits = {model: fit(model) for model in TITLES}
     trainers = {
         f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)
         for model in TITLES

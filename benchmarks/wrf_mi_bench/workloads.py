@@ -7,19 +7,20 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import Record
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.models.physics.selection import kind_of
+from wrf_mi.models.physics.spectrum import fit_spectrum
 from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.runs.timing import Call
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
-from wrf_mi.training.session import quiet
 from wrf_mi.training.step import device_pose
 
 from .traced import random_field, scene_of
@@ -59,6 +60,15 @@ def field(count: int, size: float | None = None, opacity: float = 0.4) -> Any:
     return random_field(0, "alpha", count, size_deg(count) if size is None else size, opacity=opacity)
 
 
+def parameters(model: Any, count: int, size: float) -> dict[str, NDArray[np.float32]]:
+    """Initial parameters of a field, with Gaussians of random shapes and rotations around `RECEIVER`."""
+    rng = np.random.default_rng(0)
+    params = model.init(random_gaussians([RECEIVER], count, rng, size_deg=size), rng)
+    params["log_scale"] += rng.normal(0, 0.3, (3, count)).astype(np.float32)
+    params["rotation"] = rng.standard_normal((4, count)).astype(np.float32)
+    return dict(params)
+
+
 def tracer(options: TraceOptions) -> RayTracer:
     """Ray tracer of the laboratory for spectra of a 4 x 4 array."""
     receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
@@ -77,7 +87,6 @@ def physics(transmitters: int) -> Call:
     """Prediction by a physics model without training rows, which evaluates traced paths in NumPy."""
     receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
     known = record(1, receivers=receivers, frequencies_hz=np.array([FREQUENCY_HZ]))
-    kind, scene = kind_of(known, True), open_scene("laboratory", FREQUENCY_HZ)
-    model = kind.fit(known, np.zeros(0, np.int64), scene, kind.settings(), 0, quiet)
+    model = fit_spectrum(known, np.zeros(0, np.int64), open_scene("laboratory", FREQUENCY_HZ))
     tx_pos_m = transmitter_path(transmitters)
     return lambda: model.predict(tx_pos_m, 0).mean

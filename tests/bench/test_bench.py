@@ -4,32 +4,34 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from wrf_mi_bench import plan as bench_plan
-from wrf_mi_bench.bench import CASES, CHECKS, bench, check_table, own_table, read_results, table
+from wrf_mi_bench.bench import (
+    CASES,
+    CHECKS,
+    BenchFailed,
+    bench,
+    case_folder,
+    check_table,
+    own_table,
+    read_results,
+    table,
+)
 from wrf_mi_bench.check import main
-from wrf_mi_bench.pareto import full_table
+from wrf_mi_bench.pareto import fronts, read_points
 from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
+from wrf_mi.parallel import Scheduler, open_scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-NEEDS_NO_DATA = (
-    "traced-and-splatted",
-    "physics-room",
-    "physics-starts",
-    "pareto",
-    "scaling",
-    "operator",
-    "stress",
-    "determinism",
-    "sentinels",
-)
-"""Checks on what is made here, and on stored figures; the traced room takes minutes."""
+NEEDS_NO_DATA = ("traced-and-splatted", "scaling", "operator", "stress", "pareto", "sentinels")
+"""Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     "pareto": "speed.md",
     "scaling": "speed.md",
@@ -37,10 +39,9 @@ ON_PAGE = {
     "budgets": "speed.md",
     "training": "speed.md",
     "stress": "numerics.md",
-    "determinism": "numerics.md",
     "sentinels": "results.md",
 }
-"""Pages that show a check's table; those of physics models have their own, and all others are in `docs/results.md`."""
+"""Pages that show a check's table; all others are in `docs/results.md`."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -100,21 +101,49 @@ def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: 
     assert line == "| mesh: walls | **0.9** | 0.8 |"
 
 
+@pytest.fixture(scope="module")
+def two() -> Iterator[Scheduler]:
+    with open_scheduler("local:2") as workers:
+        yield workers
+
+
+def test_bench_on_workers_writes_figures_and_reports_failures(
+    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A check that was measured before, and a run that cannot go on."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    folder = case_folder(runs, "flat-plan")
+    folder.mkdir(parents=True)
+    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
+    (folder / "check.json").write_text(json.dumps({"figures": figures}))
+    rows = bench(["flat-plan"], out, runs, two)
+    assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
+    assert rows[0]["figures"] == figures
+    assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
+    assert "cases that share a machine" in capsys.readouterr().err
+    case_folder(runs, "demo").mkdir()
+    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
+    with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
+        bench(["flat-plan", "demo"], out, runs, two)
+
+
 def test_documents_show_the_stored_results() -> None:
     results = (CHECKOUT / "docs" / "results.md").read_text()
     trained, checked = read_results(RESULTS)
-    physics = [one for one in checked if one["case"].startswith("physics-")]
-    others = [one for one in checked if one not in physics and one["case"] not in ON_PAGE]
-    page = (CHECKOUT / "docs" / "physics.md").read_text()
-    assert f"<!-- physics -->\n{check_table(physics)}\n<!-- /physics -->" in page
+    others = [one for one in checked if one["case"] not in ON_PAGE]
     for one in checked:
         name = one["case"]
         if name in ON_PAGE:
-            shown = full_table(one["figures"]["points"]) if name == "pareto" else own_table(one)
             page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
-            assert f"<!-- {name} -->\n{shown}\n<!-- /{name} -->" in page
+            assert f"<!-- {name} -->\n{own_table(one)}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
         assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+
+
+def test_documents_show_the_fronts_of_the_stored_tables() -> None:
+    rows = fronts(read_points(RESULTS / "tables"))
+    shown = check_table([{"title": CHECKS["pareto"].title, "figures": {"rows": rows}}])
+    assert f"<!-- pareto -->\n{shown}\n<!-- /pareto -->" in (CHECKOUT / "docs" / "speed.md").read_text()
 
 
 def test_documents_show_the_worst_of_each_stage() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -9,11 +12,9 @@ from small_fits import official, settings
 from wrf_mi_bench import training as bench_training
 from wrf_mi_bench.training import (
     BACKWARD,
-    FITS,
     FORWARD,
     SHARED_BACKWARD,
     SHARED_FORWARD,
-    TITLES,
     Work,
     product_call,
     rows,
@@ -68,10 +69,17 @@ def test_reference_calls_compute_a_product_and_a_copy() -> None:
     assert dr.width(stream_call(1000)()) == 1000
 
 
-def test_every_model_has_a_fit_function() -> None:
-    for model, name in FITS.items():
-        assert getattr(bench_training, name).args == (model,)
-    assert list(FITS) == list(TITLES)
+def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_command(arguments: tuple[str, ...], folder: Path, where: str) -> None:
+        assert arguments == ("train", bench_training.DATA, "--model", "wrf-gs")
+        folder.mkdir()
+        metrics = {"train_seconds": 9.0, "peak_memory_mb": 80.0, "ssim": {"median": 0.9}, "gaussians": 7, "steps": 3}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+
+    monkeypatch.setattr(bench_training, "run_command", run_command)
+    found = bench_training.fit("wrf-gs")
+    assert found["processor_seconds"] >= 0
+    assert (found["seconds"], found["peak_memory_mb"], found["gaussians"]) == (9.0, 80.0, 7)
 
 
 def test_lines_state_the_share_of_the_limit() -> None:

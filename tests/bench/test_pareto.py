@@ -1,122 +1,60 @@
-"""Run time against error: what is on the front, and what a measured method carries."""
+"""Run time against error from the tables' rows: points, fronts, text and picture."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from matplotlib.text import Text
-from wrf_mi_bench.methods import METHODS, FittedMethod, Method, MethodInput
-from wrf_mi_bench.pareto import front, full_table, measure_methods, pareto_figure, table
+from wrf_mi_bench.pareto import LEAST, Points, front, fronts, pareto_figure, points_of, read_points
+from wrf_mi_bench.table_plan import PARTS, Row
 
-from wrf_mi.core import Record
+from wrf_mi.core import InputError
 
-HELD_MB = 200
-BUSY_ROWS = 3_000_000
-"""Numbers that the slow method sorts: a hundred times what the fast one does."""
-
-
-def point(name: str, ms: float, error: float, **more: Any) -> dict[str, Any]:
-    def interval(value: float) -> dict[str, float]:
-        return {"value": value, "low": 0.9 * value, "high": 1.1 * value}
-
-    one = {"tracing": ms, "code_generation": 0.0, "execution": 0.0, "kernels": 0, "compiled": 0}
-    return {
-        "name": name,
-        "family": name[0],
-        "ms": interval(ms),
-        "error": interval(error),
-        "over_reference": interval(ms),
-        "split": {"first": one, "warm": one},
-        "memory_mb": {"one": 1.0, "batch": 20.0},
-        "stored_mb": 0.5,
-        "train_seconds": 0.0,
-    } | more
+PART = next(part for part in PARTS if part.dataset == "rfid-lab" and part.split == "official")
+POINTS: Points = {
+    "slow": {"score": 0.99, "ms_per_sample": 10, "train_seconds": 0},
+    "fast": {"score": 0.70, "ms_per_sample": 1, "train_seconds": 9},
+    "middle": {"score": 0.90, "ms_per_sample": 3, "train_seconds": 5},
+    "beaten": {"score": 0.80, "ms_per_sample": 5, "train_seconds": 7},
+}
 
 
-POINTS = [point("slow", 10, 0.01), point("fast", 1, 0.3), point("middle", 3, 0.1), point("beaten", 5, 0.2)]
-
-
-def test_front_holds_the_pareto_optimal_points() -> None:
-    assert front(POINTS) == ["fast", "middle", "slow"]
-    assert front([*POINTS, point("best", 0.5, 0.001)]) == ["best"]
+def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly() -> None:
+    assert front(POINTS, "ms_per_sample", True) == ["fast", "middle", "slow"]
+    assert front(POINTS, "train_seconds", True) == ["slow"]
+    assert front(POINTS, "ms_per_sample", False) == ["fast"]
     # As good in one and better in the other is better.
-    assert front([point("a", 1, 0.2), point("b", 1, 0.1), point("c", 2, 0.1)]) == ["b"]
+    even = {name: {"score": score, "ms": ms} for name, score, ms in (("a", 0.2, 1), ("b", 0.1, 1), ("c", 0.1, 2))}
+    assert front(even, "ms", False) == ["b"]
 
 
-def test_table_goes_from_fast_to_slow_and_has_memory() -> None:
-    rows = table([*POINTS, point("batched", 2, 0.5, batch_ms={"value": 0.25, "low": 0.2, "high": 0.3})])
-    assert [row["what"].split()[0] for row in rows] == ["fast", "batched", "middle", "beaten", "slow"]
-    assert "(on the front)" in rows[0]["what"]
-    assert "(on the front)" not in rows[1]["what"]
-    assert rows[1]["value"] == "SSIM 0.500, 2 ms, 0.25 ms in a batch"
+def test_points_are_means_of_medians_over_seeds_of_all_training_rows() -> None:
+    rows = [Row(PART, "vae", 1.0, 0), Row(PART, "vae", 1.0, 1), Row(PART, "vae", 1.0, 2), Row(PART, "physics", 0.1, 0)]
+    stored: dict[str, Any] = {
+        row.name: {"score": {"median": 0.1 * k}, "ms_per_sample": 10.0**k, "train_seconds": 2.0 * k}
+        for k, row in enumerate(rows)
+    }
+    assert points_of(PART, stored) == {
+        "vae": {"score": pytest.approx(0.1), "ms_per_sample": 10.0, "train_seconds": 2.0}
+    }
 
 
-def test_full_table_has_memory_and_the_parts_of_a_call() -> None:
-    lines = full_table(POINTS).splitlines()
-    assert [line.split(" | ")[0] for line in lines[2:]] == ["| **fast**", "| **middle**", "| beaten", "| **slow**"]
-    expected = "| 0.700 | 1 (0.9 to 1.1) |  | 1 | 1.0 + 0.0 + 0.0 | 20 MB | 0.5 MB |  |"
-    assert lines[2].removeprefix("| **fast** ") == expected
+def test_text_and_picture_show_both_fronts() -> None:
+    rows = fronts({PART: POINTS})
+    assert [row["what"] for row in rows] == ["rfid-lab, SSIM, prediction of a sample", "rfid-lab, SSIM, training"]
+    assert rows[0]["value"] == "fast 0.700 in 1 ms, middle 0.900 in 3 ms, slow 0.990 in 10 ms"
+    assert rows[1]["value"] == "slow 0.990 in 0 s"
+    figure = pareto_figure({PART: POINTS, PARTS[1]: POINTS})
+    assert len(figure.axes) == 4
+    assert {axes.get_xscale() for axes in figure.axes} == {"log"}
+    assert [text.get_text() for text in figure.legends[0].texts] == list(POINTS)
+    (step,) = figure.axes[0].lines
+    assert (step.get_xdata()[-1], step.get_ydata()[-1]) == (10, 0.99)
+    # A method without training lies at the left end.
+    assert figure.axes[1].lines[0].get_xdata()[0] == LEAST
 
 
-def test_picture_names_every_point_on_logarithmic_axes() -> None:
-    crowd = [point(f"crowd {k}", 7 + 0.01 * k, 0.2) for k in range(5)]
-    figure = pareto_figure([*POINTS, *crowd, point("batched", 2, 0.5, batch_ms={"value": 0.25})])
-    (axes,) = figure.axes
-    assert axes.get_xscale() == axes.get_yscale() == "log"
-    assert {text.get_text() for text in axes.texts} == {p["name"] for p in [*POINTS, *crowd]} | {"batched"}
-    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without the lines to their points
-    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
-    # The step through the front ends at its slowest point.
-    (step,) = [line for line in axes.lines if line.get_color() == "0.7"]
-    assert (step.get_xdata()[-1], step.get_ydata()[-1]) == (10, 0.01)
-
-
-def test_names_of_methods_are_unique_and_the_reference_is_there() -> None:
-    from wrf_mi_bench.pareto import REFERENCE
-
-    names = [method.name for method in METHODS]
-    assert len(set(names)) == len(names)
-    assert REFERENCE in names
-
-
-def test_user_defined_method_is_measured(one_gateway: Record, tmp_path: Path) -> None:
-    """One that answers truly and slowly, one that does not and fast; only the first gains nothing from batches."""
-    truth = one_gateway.observation[0]
-    entered: list[bool] = []
-
-    def true(place: MethodInput) -> FittedMethod:
-        def predict(tx_pos_m: np.ndarray) -> np.ndarray:
-            np.sort(np.random.default_rng(0).random(BUSY_ROWS))
-            np.ones(HELD_MB * 1_000_000 // 8)
-            apart = np.linalg.norm(place.record.tx_pos_m[None] - tx_pos_m[:, None], axis=-1)
-            return truth[apart.argmin(axis=1)]
-
-        return FittedMethod(predict, stored_mb=3.0, train_seconds=7.0)
-
-    def grey(place: MethodInput) -> FittedMethod:
-        from contextlib import contextmanager
-
-        @contextmanager
-        def context():
-            entered.append(True)
-            yield
-
-        return FittedMethod(lambda tx: np.full((len(tx), *truth.shape[1:]), 0.5), stored_mb=0.0, context=context)
-
-    methods = [Method("true", "mine", true, batches=False), Method("grey", "mine", grey)]
-    place = MethodInput(replace(one_gateway), Path("none"), tmp_path, rows=5)
-    found = {one["name"]: one for one in measure_methods(place, methods, "grey", repeats=3)}
-    assert found["true"]["error"]["value"] == pytest.approx(0, abs=1e-6)
-    assert found["grey"]["error"]["value"] > 0.1
-    assert found["true"]["over_reference"]["value"] > 5  # thousands, but for what a busy machine does to 10 us
-    assert found["true"]["stored_mb"] == 3.0
-    # What others in this process free meanwhile counts against it: seen to be some tens of MB after a thousand tests.
-    assert found["true"]["memory_mb"]["one"] > HELD_MB / 2
-    assert found["true"]["split"]["warm"]["tracing"] > found["true"]["split"]["warm"]["execution"]
-    assert "batch_ms" in found["grey"]
-    assert "batch_ms" not in found["true"]
-    assert entered
+def test_missing_rows_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no stored rows; call it in a checkout that has them, or run wrf-mi bench"):
+        read_points(tmp_path)

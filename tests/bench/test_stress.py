@@ -16,7 +16,7 @@ from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_plugins import plugin_gradients, plugin_images
 from wrf_mi_bench.stress_receivers import derivatives, of_fields, of_paths
 from wrf_mi_bench.stress_rows import held, worst_of
-from wrf_mi_bench.stress_traced import phases, traced_gradients
+from wrf_mi_bench.stress_traced import phases
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
@@ -74,19 +74,14 @@ def test_phases_and_losses_keep_their_bounds() -> None:
 
 
 def test_fits_end_finite_or_name_the_group_that_is_not() -> None:
-    value = bench_stress.fits(4)["value"]
+    value = bench_stress.fits(4)[0]["value"]
     assert value.endswith(" 0 did neither")
     assert "4 ended finite" not in value
 
 
 def test_receivers_keep_their_bounds() -> None:
     hard = ("random", "needles, 1e6 to 1", "signals of 1e-15 to 1e15", "none")
-    for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), of_paths(1)]:
-        assert held(row), row
-
-
-def test_derivatives_of_traced_fields_keep_their_bounds() -> None:
-    for row in traced_gradients(1):
+    for row in [*of_fields(1, 1, hard), *derivatives(1, ("RSSI",), ("random",)), *of_paths(1)]:
         assert held(row), row
 
 
@@ -168,7 +163,8 @@ def test_quick_stress_command_prints_rows_and_fails_beyond_a_bound(
     def few() -> list[dict[str, str]]:
         return [image_row("image, ordinary", {"random": lambda rng: made(20, rng)}, 1)]
 
-    monkeypatch.setattr(bench_stress, "QUICK", (few, lambda: losses(1), lambda: [bench_stress.fits(1)]))
+    parts = ((few, (), ()), (losses, (), (1,)), (bench_stress.fits, (), (1,)))
+    monkeypatch.setattr(bench_stress, "PARTS", parts)
     assert cli(["bench", "stress", "--quick"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 1 + 7 + 1

@@ -133,18 +133,8 @@ def test_train_with_one_row_logs_no_validation_score(
 
 def test_settings_override_the_preset(folder: Path, tmp_path: Path) -> None:
     """``--set`` takes precedence over ``--preset``."""
-    arguments = [
-        "train",
-        folder,
-        "--out",
-        tmp_path / "run",
-        "--preset",
-        "paper",
-        *SET,
-        "--set",
-        "encoding.tx_octaves=3",
-    ]
-    assert main([str(a) for a in arguments]) == 0
+    chosen = ["--preset", "paper", *SET, "--set", "encoding.tx_octaves=3"]
+    assert main(["train", str(folder), "--out", str(tmp_path / "run"), *chosen]) == 0
     text = (tmp_path / "run" / "config.yaml").read_text()
     assert "position_octaves: 10" in text
     assert "tx_octaves: 3" in text

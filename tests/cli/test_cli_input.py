@@ -124,12 +124,12 @@ def test_resume_takes_no_settings(own: list[str], run: Path, capsys: pytest.Capt
 
 
 BAD_POSITIONS = {
-    "row.csv": (b"x,y,z\n1,2,3\n1,two,3\n", "row.csv, row 2: '1,two,3' is not three numbers"),
-    "short.csv": (b"x,y,z\n1,2\n", "short.csv, row 1: '1,2' is not three numbers"),
-    "nan.csv": (b"x,y,z\n1,2,3\n\n4,nan,6\n", "nan.csv, row 2: not a finite number"),
-    "header.csv": (b"a,b,c\n1,2,3\n", "header.csv: header 'a,b,c' lacks x, y, z"),
-    "empty.csv": (b"", "empty.csv: header '' lacks x, y, z"),
-    "none.csv": (b"x,y,z\n", "none.csv: no positions"),
+    "row.csv": (b"x,y,z\n1,2,3\n1,two,3\n", "row.csv: row 2: y is 'two'; give a finite number"),
+    "short.csv": (b"x,y,z\n1,2\n", "short.csv: row 1: 2 fields, but the header has 3"),
+    "nan.csv": (b"x,y,z\n1,2,3\n\n4,nan,6\n", "nan.csv: row 2: y is 'nan'; give a finite number"),
+    "header.csv": (b"a,b,c\n1,2,3\n", "header.csv: line 1: header 'a,b,c' has no column x"),
+    "empty.csv": (b"", "empty.csv: empty; give a header"),
+    "none.csv": (b"x,y,z\n", "none.csv: no rows below the header"),
     "binary.csv": (b"\xff\xfe\x00\x80", "binary.csv: cannot be read"),
     "junk.npz": (b"no archive", "junk.npz: not readable as .npz"),
 }

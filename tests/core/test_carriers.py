@@ -66,7 +66,7 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
     several = one_gateway.at_carriers(np.arange(len(one_gateway)) % 2 + 1.0)
     for record in (flat, several):
         model = MODELS[name]
-        if model.serves(record.task) and not model.needs_uplink:
+        if model.serves(record.task) and model.uplink != "required":
             with pytest.raises(InputError, match=rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"):
                 train(record, tmp_path / "run", name, seed=1)
             assert not (tmp_path / "run").exists()

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import os
 import shutil
 import socket
 import threading
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
@@ -19,10 +19,6 @@ from wrf_mi.datasets.fetch import download
 from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DataSet, RemoteFile, known, remote_files
 
-DATA = os.environ.get("WRF_MI_DATA")
-needs_data = pytest.mark.skipif(
-    not DATA or not Path(DATA, "rfid-lab").is_dir(), reason="WRF_MI_DATA names no folder with rfid-lab/"
-)
 ROWS = 6
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room")
 NAMES += ("traced-csi-flat", "traced-csi-office")
@@ -180,15 +176,15 @@ def test_the_manifest_is_complete():
         assert rest in (entry.path, f"data_test200/{entry.path}")
 
 
-@needs_data
+@needs("rfid-lab")
 def test_fetch_rfid_lab_from_a_copy(server: tuple[str, Path], home: Path):
     url, root = server
     for entry in remote_files(known("rfid-lab")):
         (root / entry.remote).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(Path(DATA or "", "rfid-lab", entry.path), root / entry.remote)
+        shutil.copyfile(Path(DATA, "rfid-lab", entry.path), root / entry.remote)
     target = fetch("rfid-lab", base_url=url, progress=False)
     assert target == home / "cache" / "rfid-lab"
-    ours, theirs = load("rfid-lab"), read_spectrum_folder(Path(DATA or "", "rfid-lab"))
+    ours, theirs = load("rfid-lab"), read_spectrum_folder(Path(DATA, "rfid-lab"))
     np.testing.assert_array_equal(ours.observation, theirs.observation)
     np.testing.assert_array_equal(ours.folds, theirs.folds)
     (target / "blocked_folds.txt").unlink()
@@ -280,29 +276,29 @@ def test_a_pickle_with_other_content_is_refused_and_nothing_is_left(
     assert list((tmp_path / "home").iterdir()) == []
 
 
-@needs_data
+@needs("rfid-lab")
 def test_fetch_flat_ble_from_a_copy(server: tuple[str, Path], home: Path, capsys: pytest.CaptureFixture[str]):
     url, root = server
     for entry in remote_files(known("flat-ble")):
         (root / entry.remote).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(Path(DATA or "", "flat-ble", entry.path), root / entry.remote)
+        shutil.copyfile(Path(DATA, "flat-ble", entry.path), root / entry.remote)
     target = fetch("flat-ble", base_url=url)
     assert "lidar/points.npz and lidar/gridmap.npz" in capsys.readouterr().err
     assert "CC BY 4.0" in (target / "SOURCE.txt").read_text()
-    ours, theirs = load("flat-ble"), load(Path(DATA or "", "flat-ble"))
+    ours, theirs = load("flat-ble"), load(Path(DATA, "flat-ble"))
     np.testing.assert_array_equal(ours.observation, theirs.observation)
     assert ours.frequencies_hz == [2.44e9]
     assert all(one.array_m is None for one in ours.receivers)
 
 
-@needs_data
+@needs("rfid-lab")
 @pytest.mark.parametrize("name", ["rfid-lab", "flat-ble", "newrf-conference", "newrf-office"])
 def test_existing_copy_is_checked_without_network(name: str):
     folder = fetch(name, home=DATA, base_url="http://127.0.0.1:9", retries=0, progress=False)
-    assert folder.parent == Path(DATA or "")
+    assert folder.parent == DATA
 
 
-@needs_data
+@needs("rfid-lab")
 def test_rfid_lab_has_its_carrier_and_array():
     record = load("rfid-lab")
     assert record.frequencies_hz == [920e6]

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from changed_folders import refusal, remove, text, write
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits, read_nerf2_ble
 
 GATEWAYS = "gateway1: [1.0, 2.0, 3.0]\ngateway2: [4, 5, 6]\n"
 POSITIONS = "x,y,z\n0.5,1.5,1\n0.25,1.75,1\n1,2,1.5\n1.25,2,1\n"
 POWERS = "gateway1,gateway2\n-54.25,-100\n-60,-61\n-100,-100\n-100,-70.5\n"
-Change = Callable[[Path], None]
 
 
 @pytest.fixture
@@ -100,26 +97,6 @@ def test_blank_lines_are_skipped(folder: Path) -> None:
     np.testing.assert_array_equal(found.tx_pos_m, expected.tx_pos_m)
 
 
-def text(name: str, old: str, new: str) -> Change:
-    """Replace the first match of a pattern in a text file."""
-
-    def change(folder: Path) -> None:
-        path = folder / name
-        changed = re.sub(old, new, path.read_text(), count=1, flags=re.MULTILINE)
-        assert changed != path.read_text()
-        path.write_text(changed)
-
-    return change
-
-
-def write(name: str, content: str) -> Change:
-    return lambda folder: (folder / name).write_text(content) and None
-
-
-def remove(name: str) -> Change:
-    return lambda folder: (folder / name).unlink()
-
-
 YML, POS, RSSI = "gateway_position.yml", "tx_pos.csv", "gateway_rssi.csv"
 
 
@@ -194,7 +171,4 @@ WRONG = {
 def test_bad_folders_are_refused_with_one_line(folder: Path, case: str) -> None:
     change, name, message = WRONG[case]
     change(folder)
-    with pytest.raises(InputError, match=message) as error:
-        load(folder)
-    assert "\n" not in str(error.value)
-    assert str(error.value).startswith(f"{folder / name}: ")
+    assert refusal(load, folder, message).startswith(f"{folder / name}: ")

@@ -20,9 +20,9 @@ from wrf_mi.gaussians import (
     tiles,
 )
 from wrf_mi.gaussians.blend import GROUP, group_size
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.training.step import device_pose
 
 pytestmark = pytest.mark.all_threads
 
@@ -39,10 +39,6 @@ FIELDS: dict[str, Any] = {
     "wrf-gs+": WrfGsPlus(ENCODING, layers=2, width=16, skip=1, static_geometry=True),
     "factorised": Factorised(ENCODING, terms=4, layers=1, width=16),
 }
-
-
-def pose() -> Pose:
-    return Pose([Float64(x) for x in RECEIVER.position_m], [[Float64(x) for x in row] for row in RECEIVER.to_world])
 
 
 def drawn(name: str, batch: int) -> tuple[dict[str, Any], Any]:
@@ -69,7 +65,7 @@ def test_shared_geometry_equals_repeated_geometry(name: str, batch: int) -> None
         assert gaussians.shared
         gaussians = gaussians.spread() if spread else gaussians
         assert gaussians.shared != spread
-        re, im = splat(gaussians, pose(), plane)
+        re, im = splat(gaussians, device_pose(RECEIVER, Float64), plane)
         dr.backward(dr.sum(re * weight[0] + im * weight[1]))
         images.append(np.concatenate([re.numpy(), im.numpy()]))
         slopes.append({key: dr.grad(p).numpy().copy() for key, p in params.items()})
@@ -86,7 +82,7 @@ def test_counted_lists_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> N
     gaussians = FIELDS["factorised"].gaussians(params, tx_pos)
     for reserved in (tiles.RESERVED, 1):
         monkeypatch.setattr(tiles, "RESERVED", reserved)
-        images.append(splat(gaussians, pose(), plane)[0].numpy())
+        images.append(splat(gaussians, device_pose(RECEIVER, Float64), plane)[0].numpy())
     np.testing.assert_array_equal(*images)
     assert images[0].any()
 

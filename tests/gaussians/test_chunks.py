@@ -20,9 +20,9 @@ from wrf_mi.gaussians import (
 )
 from wrf_mi.gaussians.chunks import gaussians_in_parts
 from wrf_mi.gaussians.footprint import depth_order, project
-from wrf_mi.gaussians.operator import weight_strips
+from wrf_mi.gaussians.operator import pixel_weights
 from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
-from wrf_mi.training import step
+from wrf_mi.training import predictor
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
@@ -82,11 +82,11 @@ def test_lists_without_visible_gaussians_are_empty(monkeypatch: pytest.MonkeyPat
 def test_operator_is_the_same_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
     """Its strips are planes of a row of tiles each."""
     field, pose, plane = gaussians(1, 60, 0.3), device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
-    whole = [part.toarray() for _, part in weight_strips(field, pose, plane)]
+    whole = pixel_weights(field, pose, plane).toarray()
     monkeypatch.setattr(tiles, "RESERVED", 0)
-    counted = [part.toarray() for _, part in weight_strips(field, pose, plane)]
-    np.testing.assert_array_equal(np.concatenate(counted), np.concatenate(whole))
-    assert np.concatenate(whole).any()
+    counted = pixel_weights(field, pose, plane).toarray()
+    np.testing.assert_array_equal(counted, whole)
+    assert whole.any()
 
 
 def test_more_entries_than_32_bits_count_are_refused():
@@ -120,8 +120,9 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.M
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
     recorded = Predictor(field, params, RECEIVERS, *SIZE)
     expected = recorded(tx)
-    monkeypatch.setattr(step, "CHUNK_SIZE", 1)
+    monkeypatch.setattr(predictor, "CHUNK_SIZE", 1)
     monkeypatch.setattr(tiles, "RESERVED", 0)
     parts = Predictor(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
-    assert parts._predict.n_recordings == 0 < recorded._predict.n_recordings
+    assert not parts._reports
+    assert recorded._reports[None].n_recordings > 0

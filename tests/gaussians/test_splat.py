@@ -18,9 +18,9 @@ from wrf_mi.gaussians import (
     oracle,
     random_gaussians,
 )
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.training.step import device_pose
 
 pytestmark = pytest.mark.all_threads
 
@@ -42,13 +42,6 @@ Tensor64 = dr.tensor_t(Float64)
 RECEIVER = Receiver(
     "gateway1", np.array([5.0, 0.26, 0.0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
-
-
-def device_pose(receiver: Receiver, float_type: Any) -> Pose:
-    return Pose(
-        [float_type(float(x)) for x in receiver.position_m],
-        [[float_type(float(x)) for x in row] for row in receiver.to_world],
-    )
 
 
 def make(model: str, n: int, tensor: Any, seed: int = 0, **encoding: int) -> tuple[Any, dict[str, Any]]:

@@ -31,7 +31,7 @@ from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compressed import compress_run
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tracing.pose import position_name, receiver_pose, turn_name
+from wrf_mi.tracing.pose import pose_names, receiver_pose
 from wrf_mi.tracing.slab import slab
 from wrf_mi.training.compress import Compression
 from wrf_mi.training.predictor import Predictor
@@ -163,7 +163,7 @@ def test_traced_pose_gradient_matches_splatting_for_small_gaussians() -> None:
 
         return of
 
-    values = {position_name(RECEIVERS[0]): np.full(3, 0.01), turn_name(RECEIVERS[0]): np.array([0.02, -0.01, 0.03])}
+    values = dict(zip(pose_names(RECEIVERS[0]), (np.full(3, 0.01), np.array([0.02, -0.01, 0.03])), strict=True))
     assert_close(*(gradients(values, greys(name), weights) for name in ("traced", "splatted")), PROJECTED)
 
 

@@ -80,7 +80,7 @@ def registered() -> Iterator[None]:
     with pytest.raises(InputError, match="model 'nearest': there is one of that name; choose another"):
         models.register(module.MODEL)
     yield
-    del models._MODELS._known["nearest"], sys.modules[module.__name__]
+    del models.MODELS._known["nearest"], sys.modules[module.__name__]
 
 
 def test_registered_model_is_trained_resumed_evaluated_and_compared(

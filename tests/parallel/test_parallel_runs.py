@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -16,7 +15,6 @@ from made_flat import write_flat
 from made_waves import wave_record
 from small_fits import official, settings
 from worker_tasks import Lossy
-from wrf_mi_bench.bench import BenchFailed, bench, case_folder
 
 from wrf_mi import parallel
 from wrf_mi.core import InputError, Record
@@ -182,23 +180,3 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     assert status == 0
     assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])
     assert_same_bits(stored(run / "predictions.npz"), stored(tmp_path / "again" / "predictions.npz"))
-
-
-def test_bench_on_workers_writes_figures_and_reports_failures(
-    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A check that was measured before, and a run that cannot go on."""
-    runs, out = tmp_path / "runs", tmp_path / "out"
-    folder = case_folder(runs, "flat-plan")
-    folder.mkdir(parents=True)
-    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
-    (folder / "check.json").write_text(json.dumps({"figures": figures}))
-    rows = bench(["flat-plan"], out, runs, two)
-    assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
-    assert rows[0]["figures"] == figures
-    assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
-    assert "cases that share a machine" in capsys.readouterr().err
-    case_folder(runs, "demo").mkdir()
-    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
-    with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
-        bench(["flat-plan", "demo"], out, runs, two)

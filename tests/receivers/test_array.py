@@ -12,7 +12,8 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import pixel_directions, unit_vectors
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load
-from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers import array as module
+from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale, mirror_order
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
@@ -20,6 +21,24 @@ EXACT = 1e-9
 """Sums of 16 terms of size one in float64."""
 ROUNDING_RMS = 0.0013
 """8-bit greys are off by up to 1/510; squared, the real spectra's residual was measured as 0.0012 rms."""
+
+ROUNDING = 1e-12
+"""Sums of some hundred products in double precision, of signals of size 1."""
+SIZE = 14, 31
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "regular": planar_array(4, 4, 0.16),
+    "odd, off the origin": planar_array(3, 5, 0.16) + np.array([0.3, -0.2, 0.1]),
+    "two lines": planar_array(9, 8, 0.16) + np.array([0.1, 0, 0]),
+    "two lines, odd, shuffled": RNG.permutation(planar_array(9, 9, 0.12)) + np.array([0.3, -0.2, 0.1]),
+    "uneven lines": (np.array([[x, y, 0] for x in (0, 0.1, 0.3) for y in range(40)], float) * [1, 0.1, 1]),
+    "a grid with a gap": planar_array(9, 9, 0.1)[:-1],
+    "not planar": RNG.normal(size=(70, 3)),
+    "tilted": planar_array(8, 8, 0.1) @ np.linalg.qr(RNG.normal(size=(3, 3)))[0],
+    "single": np.array([[0.2, 0.1, 0.0]]),
+    "coinciding": np.array([[0.2, 0, 0], [0.2, 0, 0], [-0.2, 0, 0], [-0.2, 0, 0.0]]),
+}
 
 DATA = os.environ.get("WRF_MI_DATA")
 needs_data = pytest.mark.skipif(
@@ -87,3 +106,37 @@ def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, ob
     assert harmonics.shape[1] == 49
     residual = squared - (squared @ harmonics) @ harmonics.T
     assert (np.sqrt(np.mean(residual**2)) < ROUNDING_RMS) == obeys
+
+
+@pytest.mark.parametrize("size", [(14, 31), (9, 24)])
+@pytest.mark.parametrize("name", ARRAYS)
+def test_spectrum_is_the_plain_sum(name: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
+    elements = ARRAYS[name]
+    h = RNG.normal(size=(3, 2, len(elements))) + 1j * RNG.normal(size=(3, 2, len(elements)))
+    expected = np.abs(
+        h @ array_response(elements, pixel_directions(*size), FREQUENCY_HZ).conj().reshape(-1, len(elements)).T
+    )
+    largest = np.abs(h).sum(axis=-1).max()
+    found = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
+    np.testing.assert_allclose(found, expected.reshape(3, 2, *size), rtol=0, atol=ROUNDING * largest)
+    monkeypatch.setattr(module, "TABLE_BYTES", 16 * 50 * len(elements))
+    monkeypatch.setattr(module, "CHUNK_SIZE", 4)
+    blocks = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
+    np.testing.assert_allclose(blocks, found, rtol=0, atol=ROUNDING * largest)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-200, 1e200])
+def test_spectrum_scales_with_signals_of_any_size(factor: float):
+    elements = ARRAYS["regular"]
+    h = RNG.normal(size=16) + 1j * RNG.normal(size=16)
+    expected = factor * bartlett_spectrum(h, elements, FREQUENCY_HZ, *SIZE)
+    np.testing.assert_allclose(bartlett_spectrum(factor * h, elements, FREQUENCY_HZ, *SIZE), expected, rtol=ROUNDING)
+
+
+def test_no_signals_have_no_spectra():
+    assert bartlett_spectrum(np.zeros((0, 16)), ARRAYS["regular"], FREQUENCY_HZ, *SIZE).shape == (0, *SIZE)
+
+
+def test_mirror_order_of_a_line():
+    assert mirror_order([[0], [1], [2.0]]).tolist() == [2, 1, 0]
+    assert mirror_order([[0], [1], [2.1]]) is None

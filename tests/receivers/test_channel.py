@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.receivers import antenna_csi, channel, csi, element_signals, received_power, rssi_dbm
+from wrf_mi.receivers import antenna_csi, channel, csi, received_power, rssi_dbm
 
 EXACT = 1e-12
 
@@ -57,12 +57,12 @@ def test_csi_is_the_coherent_sum_per_subcarrier():
 
 
 @pytest.mark.parametrize("size", [1, 1 << 20])
-def test_antenna_csi_is_element_signals_per_subcarrier(size: int, monkeypatch: pytest.MonkeyPatch):
+def test_antenna_csi_of_subcarriers_is_that_of_each(size: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(channel, "WAVES_PER_CHUNK", size)
     paths, arrays, array_m = made(), receivers(), planar_array(2, 3, 0.06)
     frequencies = 2.4e9 + 1e6 * np.array([0.0, 1.0, 3.0, 4.0, 2.0])  # gaps of several widths
     result = antenna_csi(paths, arrays, array_m, frequencies)
-    expected = np.stack([element_signals(paths, arrays, array_m, f) for f in frequencies], axis=-1)
+    expected = np.stack([antenna_csi(paths, arrays, array_m, f)[..., 0] for f in frequencies], axis=-1)
     assert result.shape == (3, 4, 6, 5)
     # 5e4 rad in float64 leave 1e-11, gone through once for each subcarrier.
     np.testing.assert_allclose(result, expected, atol=1e-9)
@@ -97,16 +97,16 @@ def test_power_over_a_wide_band_is_the_sum_of_powers():
 def test_several_arrays_and_chunks_give_the_same_signals(monkeypatch: pytest.MonkeyPatch):
     paths, arrays = made(), receivers()
     array_m = planar_array(2, 3, 0.1)
-    signals = element_signals(paths, arrays, array_m, 1e9)
+    signals = antenna_csi(paths, arrays, array_m, 1e9)[..., 0]
     assert signals.shape == (3, 4, 6)
     for k, receiver in enumerate(arrays):
         some = paths.select(paths.rx == k)
         alone = replace(some, rx=np.zeros_like(some.rx), n_rx=1)
-        np.testing.assert_allclose(element_signals(alone, receiver, array_m, 1e9)[0], signals[k], rtol=EXACT)
+        np.testing.assert_allclose(antenna_csi(alone, receiver, array_m, 1e9)[0, ..., 0], signals[k], rtol=EXACT)
     # The signal of an element at the origin is the channel.
-    centre = element_signals(paths, arrays, [[0.0, 0, 0]], 1e9)[..., 0]
+    centre = antenna_csi(paths, arrays, [[0.0, 0, 0]], 1e9)[..., 0, 0]
     np.testing.assert_allclose(centre, csi(paths, 1e9)[..., 0], atol=1e-10)
     coefficients = csi(paths, [1e9, 2e9])
     monkeypatch.setattr(channel, "WAVES_PER_CHUNK", 20)
-    np.testing.assert_allclose(element_signals(paths, arrays, array_m, 1e9), signals, rtol=EXACT)
+    np.testing.assert_allclose(antenna_csi(paths, arrays, array_m, 1e9)[..., 0], signals, rtol=EXACT)
     np.testing.assert_allclose(csi(paths, [1e9, 2e9]), coefficients, rtol=EXACT)

@@ -12,7 +12,7 @@ from wrf_mi.core import InputError, unit_vectors
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.receivers import Lags, array_response, bartlett_spectrum, minmax_scale
-from wrf_mi.receivers.beams import mirror_order
+from wrf_mi.receivers.array import mirror_order
 from wrf_mi.receivers.retrieve import align_signals, retrieve_signals, unscale
 
 FREQUENCY_HZ = 920e6

@@ -245,9 +245,6 @@ def test_bad_calls_are_refused(
         (["train", unplaced_folder, "--model", "idw", *out], "positions are not known, from which idw predicts"),
         (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
         ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
-        ([*train, "--n-train", 0], "n_train 0; choose 1 to 24"),
-        ([*train, "--split", "nowhere"], "split 'nowhere'"),
-        ([*train, "--set", "steps=3"], "unknown setting steps"),
         ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
         (
             ["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=0"],
@@ -261,10 +258,6 @@ def test_bad_calls_are_refused(
             [*train, "--preset", "quick"],
             "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
         ),
-        (["train", "--model", "mri", *out], "train needs DATASET and --out RUN"),
-        (["train", tmp_path / "none", "--model", "mri", *out], "none: no such folder"),
-        (["train", flat_folder, "--model", "mri", "--out", flat_folder], "exists and is not empty"),
-        (["train", "--resume", run, "--model", "mri"], "omit data set and settings"),
         (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
     ):
         refused(arguments, message, capsys)

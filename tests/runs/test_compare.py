@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from changed_folders import refusal, remove, write
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -38,7 +39,7 @@ def make_run(
         truth=truth,
         tx_pos=np.zeros((len(rows), 3)),
         reference_idw4=blend.astype(np.float32),
-        **({} if receivers is None else {"receiver_name": [f"gateway{r}" for r in range(receivers)]}),
+        receiver_name=[f"gateway{r}" for r in range(receivers or 1)],
     )
     metrics = {
         "task": "spectrum",
@@ -191,14 +192,6 @@ def test_runs_of_equal_names_get_different_names(tmp_path):
     assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
 
 
-def remove(name):
-    return lambda run: (run / name).unlink()
-
-
-def replace(name, text):
-    return lambda run: (run / name).write_text(text)
-
-
 def edit_metrics(**changes):
     def edit(run):
         metrics = json.loads((run / "metrics.json").read_text()) | changes
@@ -228,13 +221,13 @@ def cut_truth(run):
     [
         (remove("metrics.json"), "no metrics.json, so no finished run"),
         (remove("predictions.npz"), "predictions.npz: missing"),
-        (replace("metrics.json", "{"), "not readable"),
-        (replace("predictions.npz", "not a zip"), "predictions.npz: not readable"),
+        (write("metrics.json", "{"), "not readable"),
+        (write("predictions.npz", "not a zip"), "predictions.npz: not readable"),
         (
-            replace("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
+            write("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
             "line 2 is no log entry",
         ),
-        (replace("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),
+        (write("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),
         (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw4"),
@@ -245,10 +238,7 @@ def cut_truth(run):
 def test_damaged_run_is_named_in_one_line_and_nothing_is_written(tmp_path, damage, message):
     run = make_run(tmp_path / "run")
     damage(run)
-    with pytest.raises(InputError, match=message) as caught:
-        compare([run], tmp_path / "out")
-    assert str(run) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(run) in refusal(lambda run: compare([run], tmp_path / "out"), run, message)
     assert not (tmp_path / "out").exists()
 
 

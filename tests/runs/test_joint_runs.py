@@ -166,7 +166,6 @@ def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--material", "concrete"], "--material and antenna options belong to a scene"),
         (["--rx-polarization", "H"], "--material and antenna options belong to a scene"),
         (["--scene", "nowhere"], "nowhere: no such scene"),
         (["--model", "kriging", "--receiver", "array"], "--receiver belongs to fields of spectra"),

@@ -16,11 +16,11 @@ from small_fits import settings
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.gaussians import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.static_signals import host_signals
+from wrf_mi.gaussians.static_signals import recorded_signals, static_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
 from wrf_mi.training import static_operator as still
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.static_operator import RecordedSignals, StaticOperator, read_weights
+from wrf_mi.training.static_operator import StaticOperator, read_weights
 
 GREYS = 1e-5
 """Largest difference of greys up to about one: float32 sums of some ten terms in another order."""
@@ -84,14 +84,13 @@ def test_networks_in_numpy_equal_those_of_the_field(field: Any, monkeypatch: pyt
     rng = np.random.default_rng(1)
     params = field.init(random_gaussians(RECEIVERS[:1], 30, rng), rng)
     params = {k: v + 0.1 * rng.standard_normal(v.shape).astype(np.float32) for k, v in params.items()}
-    tx = rng.uniform(-3, 3, (7, 3))
-    expected = RecordedSignals(field, params).coefficients(tx)
+    tx = rng.uniform(-3, 3, (7, 3)).astype(np.float32)
+    expected = recorded_signals(field, params)(tx)
     monkeypatch.setattr("wrf_mi.gaussians.static_signals.PAIRS_PER_CHUNK", 100)  # three transmitters at a time
-    signals = host_signals(field, params)
-    assert signals is not None
-    found = signals.coefficients(tx)
-    if signals.factors is not None:
-        found = found @ signals.factors.T
+    factors, coefficients = static_signals(field, params)
+    found = coefficients(tx)
+    if factors is not None:
+        found = found @ factors.T
     assert np.linalg.norm(found - expected) < SIGNALS * np.linalg.norm(expected)
 
 

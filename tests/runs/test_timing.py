@@ -16,7 +16,6 @@ from wrf_mi.runs.timing import (
     exponent,
     interleaved,
     larger_half,
-    measure,
     memory_mb,
     ratio,
     split,
@@ -134,13 +133,6 @@ def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_pa
         del kept
 
     assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
-
-
-def test_measure_has_all_of_it() -> None:
-    found = measure(busy, repeats=3)
-    assert len(found.times_ms) == 3
-    assert found.ms.low >= 1e3 * BUSY_S
-    assert found.plain()["warm"]["tracing"] >= 1e3 * BUSY_S
 
 
 def test_exponent_is_that_of_the_larger_half() -> None:

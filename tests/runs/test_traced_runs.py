@@ -26,7 +26,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, solve
 from wrf_mi.tracing.offsets import fit_offsets
-from wrf_mi.tracing.options import with_kinds
+from wrf_mi.tracing.options import stated_kinds
 from wrf_mi.tracing.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -227,14 +227,6 @@ def test_number_of_rays_is_searched_once_for_a_run(
     assert len(calls) == 1
 
 
-def test_every_block_is_held_out_in_turn(flat_folder: Path, room: Path, tmp_path: Path) -> None:
-    out = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked").folder
-    read = read_run(out)
-    assert sorted(read.row) == list(range(len(load(flat_folder))))
-    assert len(list(out.glob("fold*/split.npz"))) == 5
-    assert evaluate_run(out)["abs_error_db"] == read.metrics["abs_error_db"]
-
-
 def test_command_traces_predicts_and_compares(
     flat_folder: Path, room: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -341,14 +333,10 @@ def test_receiver_that_no_path_reaches_is_named() -> None:
 
 
 def test_kinds_of_path_are_switched_one_by_one() -> None:
-    options = with_kinds(TraceOptions(), "transmission,diffraction", rays="auto", max_depth=2)
-    assert options == TraceOptions(
-        line_of_sight=False, reflection=False, transmission=True, diffraction=True, rays="auto", max_depth=2
-    )
-    assert with_kinds(TraceOptions()) == TraceOptions()
-    assert with_kinds(TraceOptions(), max_reflections=1).max_reflections == 1
+    options = TraceOptions(**stated_kinds("transmission, diffraction"))
+    assert options == TraceOptions(line_of_sight=False, reflection=False, transmission=True, diffraction=True)
     with pytest.raises(InputError, match="max_reflections -1"):
-        with_kinds(TraceOptions(), max_reflections=-1)
+        TraceOptions(max_reflections=-1)
 
 
 def test_reflections_bound_the_paths_of_the_command(

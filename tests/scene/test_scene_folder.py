@@ -49,7 +49,7 @@ def test_a_folder_is_read_as_written(folder: Path) -> None:
     assert (facts["frame"], facts["source"], facts["registration"]) == ("made up", "test", None)
     assert read.counts == {"surfaces": 3, "faces": 6, "points": 7}
     assert read.materials.of("table", "other") == "itu_wood"
-    assert read.thickness_m["itu_concrete"] == THICKNESS_M["itu_concrete"]
+    assert read.materials.thickness_m["itu_concrete"] == THICKNESS_M["itu_concrete"]
 
 
 def test_mitsuba_and_sionna_open_it(folder: Path) -> None:
@@ -177,7 +177,7 @@ def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path: Path) -> None:
     assert made.counts == {"surfaces": 6, "faces": 12, "points": 20_200}
     np.testing.assert_array_equal(yaml.safe_load((made.folder / "scene.yml").read_text())["registration"], quarter)
     assert made.materials.of("wall_01", "wall") == "itu_brick"
-    assert made.thickness_m["itu_brick"] == 0.12
+    assert made.materials.thickness_m["itu_brick"] == 0.12
     scene = open_scene(made.folder, FREQUENCY_HZ)
     box = scene.mi_scene.bbox()
     np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[6, 20, 1], [10, 25, 3.8]], atol=0.01)

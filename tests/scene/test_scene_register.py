@@ -59,7 +59,6 @@ def test_pairs_report_their_residuals():
     noise = np.random.default_rng(0).normal(0, 0.02, source.shape)
     found = register_pairs(source, source + np.array([1, 2, 3]) + noise)
     assert 0 < found.rms_m < 0.05
-    assert found.count == 4
 
 
 @pytest.mark.parametrize(

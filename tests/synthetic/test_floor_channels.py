@@ -16,7 +16,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, read_nerf2_csi
-from wrf_mi.receivers import array_channels, csi, element_signals
+from wrf_mi.receivers import antenna_csi, array_channels, csi
 from wrf_mi.runs.evaluate import evaluate
 from wrf_mi.synthetic import load_record, walked_channels
 from wrf_mi.synthetic.floor_channels import CARRIER_HZ, DOWNLINK_HZ, PLACES, UPLINK_HZ, Walk, users_way, with_noise
@@ -121,7 +121,7 @@ def test_specular_channels_are_reciprocal(tmp_path: Path) -> None:
     frequencies = np.concatenate([UPLINK_HZ[::5], DOWNLINK_HZ[::5]])
     there = trace_paths(scene, users, receiver, OPTIONS).paths
     back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS).paths
-    expected = np.stack([element_signals(there, receiver, array_m, one)[0] for one in frequencies], axis=-1)
+    expected = np.stack([antenna_csi(there, receiver, array_m, one)[0, ..., 0] for one in frequencies], axis=-1)
     found = array_channels(back, receiver, array_m, frequencies)
     assert np.abs(found - expected).max() < FLOAT64 * np.abs(expected).max()
     parts = np.concatenate([array_channels(back, receiver, array_m[k : k + 1], frequencies) for k in range(8)], axis=1)

@@ -13,7 +13,7 @@ import pytest
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import layouts
-from wrf_mi.tasks import TASKS, instrument_of, known_task, require, task_of
+from wrf_mi.tasks import TASKS, instrument_of, require, task_of
 
 PACKAGE = '''
 """A package that measures delay spreads: a task and the layout of its data."""
@@ -147,8 +147,6 @@ def test_names_in_the_registry_are_those_of_the_tasks() -> None:
 def test_unknown_tasks_are_refused() -> None:
     with pytest.raises(InputError, match="made: task 'sound'; known are spectrum, rssi, csi"):
         task_of(record("sound", (1, 2)))
-    with pytest.raises(InputError, match=r"metrics\.json: task 'sound'"):
-        known_task("sound", "metrics.json")
     with pytest.raises(InputError, match="made: holds rssi; spectra are needed"):
         require(record("rssi", (1, 2)), "spectrum", why="spectra are needed")
 

@@ -117,7 +117,8 @@ def test_recomputed_gains_of_dipoles_have_their_pattern(traced: TraceResult, sce
     direct = traced.select(traced.paths.bounces == 0)
     assert len(direct.paths)
     antenna = Antenna("hw_dipole")
-    dipole = recompute(direct, scene, rx_antennas=[antenna] * direct.paths.n_rx, tx_antenna=antenna).paths.gain
+    receivers = tuple(replace(rx, antenna=antenna) for rx in direct.receivers)
+    dipole = recompute(replace(direct, receivers=receivers, tx_antenna=antenna), scene).paths.gain
     cosine = direct.paths.departure[:, 2]
     pattern = 1.643 * (np.cos(np.pi / 2 * cosine) / np.sqrt(1 - cosine**2)) ** 2
     np.testing.assert_allclose(np.abs(dipole / direct.paths.gain), pattern, rtol=1e-3)  # of the rounded 1.643

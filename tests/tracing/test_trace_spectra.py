@@ -18,10 +18,11 @@ from wrf_mi import backend
 from wrf_mi.core import Antenna, InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, registry
-from wrf_mi.receivers import element_signals
+from wrf_mi.receivers import antenna_csi
+from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.synthetic import laboratory_record, load_record
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
-from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths, trace_spectra
+from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
 from wrf_mi.tracing.fields import sionna_orientation
 from wrf_mi.tracing.materials import BELOW_1_GHZ
 
@@ -33,7 +34,7 @@ SINGLE = 2e-4
 LENGTH_M = 1e-5
 """Lengths from Sionna RT's single-precision vertices, ten metres away."""
 ANGLE_OF_ELEMENTS = 0.03
-"""Relative; Sionna RT reflects at each element's own angle, `element_signals` at the array's origin: 0.24 m in 5 m."""
+"""Relative; Sionna RT reflects at each element's own angle, `antenna_csi` at the array's origin: 0.24 m in 5 m."""
 PEAK_DEG = 1.5
 """A peak lies on the nearest pixel, and the array sees a spherical wave."""
 
@@ -84,10 +85,11 @@ def test_paths_and_spectra_in_free_space(empty: Any, turn_deg: float):
     elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
     distance = np.linalg.norm(positions[:, None] - elements, axis=-1)
     expected = WAVELENGTH_M / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / WAVELENGTH_M)
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0]
+    signals = antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
     np.testing.assert_allclose(signals, expected, rtol=SINGLE)
 
-    spectrum = trace_spectra(empty, positions, receiver, ARRAY_M, FREQUENCY_HZ)
+    instrument = SpectrumInstrument((replace(receiver, array_m=ARRAY_M),), np.array([FREQUENCY_HZ]))
+    spectrum = instrument.observe(paths)[0]
     assert spectrum.dtype == np.float32
     assert spectrum.shape == (2, 90, 360)
     azimuth, elevation = np.degrees(azimuth_elevation(np.array([0.2, 0.1, 1.0])))
@@ -110,14 +112,14 @@ def test_signals_over_a_metal_floor_are_those_of_two_paths(ground: Any):
         assert length == pytest.approx(np.linalg.norm(place - receiver.position_m), abs=LENGTH_M)
         distance = np.linalg.norm(place - elements, axis=-1)
         expected += WAVELENGTH_M / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / WAVELENGTH_M)
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0]
+    signals = antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0, :, 0]
     np.testing.assert_allclose(signals, expected, atol=10 * SINGLE * np.abs(expected).max())
 
 
 def test_signals_of_a_transmitter_without_a_path_are_zero(ground: Any):
     paths = trace_paths(ground, [[3.0, 0, -1], [3.0, 0, 1]], upright(0, (0.0, 0, 1))).paths
     assert set(paths.tx.tolist()) == {1}
-    signals = element_signals(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)[0]
+    signals = antenna_csi(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
     assert (signals[0] == 0).all()
     assert (signals[1] != 0).all()
 
@@ -137,7 +139,7 @@ def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path: Path):
     source = np.array([1.3, 2.9, 1.6])
     paths = trace_paths(scene, source[None], receiver).paths
     assert len(paths.gain) == 8  # up to one reflection at each of three mutually perpendicular mirrors
-    signals = element_signals(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0]
+    signals = antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0, :, 0]
 
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     pattern = scene.rx_array.antenna_pattern
@@ -198,8 +200,6 @@ def test_materials_below_their_range_have_constants(tmp_path: Path, caplog: pyte
 
 def test_wrong_arguments_are_refused(empty: Any, tmp_path: Path):
     receiver = upright(0, (0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="the scene is at"):
-        trace_spectra(empty, [[1.0, 0, 1]], receiver, ARRAY_M, 915e6)
     for wrong in ([[1.0, 2]], [[1.0, 2, np.nan]]):
         with pytest.raises(ValueError, match="finite"):
             trace_paths(empty, wrong, receiver)
@@ -242,7 +242,7 @@ def test_laboratory_is_cached_and_reproducible(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("traced although it was kept")
 
-    monkeypatch.setattr("wrf_mi.synthetic.laboratory.trace_spectra", refuse)
+    monkeypatch.setattr("wrf_mi.synthetic.laboratory.RayTracer", refuse)
     monkeypatch.delenv("WRF_MI_DATA", raising=False)
     for module in (registry, __import__("wrf_mi.synthetic.laboratory", fromlist=["user_cache"])):
         monkeypatch.setattr(module, "user_cache", lambda: folder.parent)

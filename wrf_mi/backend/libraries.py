@@ -15,24 +15,17 @@ import sys
 import sysconfig
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
-
-from .cache import file_key, recall, remember
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"
 """Environment variables that name the libraries for Dr.Jit to load."""
 
 READ_TIMEOUT_S = 60
-"""Loading an LLVM takes 0.1 s; a cold network disk may need much longer."""
+"""Reading the linker's cache takes milliseconds; a cold network disk may need much longer."""
 
 _LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
-_READ_VERSION = """
-import ctypes, sys
-numbers = [ctypes.c_uint() for _ in range(3)]
-ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, numbers))
-print(*(number.value for number in numbers))
-"""
 
 
 @dataclass(frozen=True)
@@ -63,26 +56,8 @@ def version_from_name(name: str) -> tuple[int, ...] | None:
     return tuple(int(part) for part in digits.split(".") if part)
 
 
-def read_version(path: Path) -> tuple[int, ...]:
-    """The version that the library reports (LLVM 16 and newer), or ``()``.
-
-    The library is loaded once, in a separate process, as it may end it; the answer is stored in the user's cache.
-    """
-    key = f"version|{file_key(path)}"
-    known = recall(key)
-    if known is None:
-        command = [sys.executable, "-c", _READ_VERSION, str(path)]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=READ_TIMEOUT_S)
-        except (OSError, subprocess.TimeoutExpired):
-            return ()
-        known = {"version": done.stdout.split() if done.returncode == 0 else []}
-        remember(key, known)
-    return tuple(int(part) for part in known["version"])
-
-
 def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
-    """All LLVM libraries of this machine, newest first.
+    """All LLVM libraries of this machine, newest first, those without a version in their names last.
 
     If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file). Neither Dr.Jit nor an
     LLVM is loaded.
@@ -97,7 +72,7 @@ def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
         real = file.resolve()
         names = [version_from_name(name) or () for name in (file.name, real.name)]
         versions[real] = max([versions.get(real, ()), *names], key=len)
-    found = [LlvmLibrary(path, version or read_version(path)) for path, version in versions.items()]
+    found = starmap(LlvmLibrary, versions.items())
     return sorted(found, key=lambda library: (library.version, str(library.path)), reverse=True)
 
 

@@ -51,6 +51,14 @@ class Verdict:
     device: str = ""
 
 
+def installed_version(package: str) -> str | None:
+    """Version of a package; None: not installed, or built without metadata."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
 def try_llvm(library: LlvmLibrary, *, fresh: bool = False) -> Verdict:
     """Whether Dr.Jit works with an LLVM; ``fresh`` ignores the cache."""
     if library.version and library.version[0] < OLDEST_TRIED:
@@ -79,12 +87,7 @@ def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
 
 def _environment(name: str) -> list[str]:
     """Packages, script, machine and devices; several machines may share a home folder."""
-    versions = []
-    for package in ("drjit", "mitsuba"):
-        try:
-            versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:  # built without metadata, or not installed, which `wrf-mi doctor` reports
-            versions.append(f"{package} ?")
+    versions = [f"{package} {installed_version(package) or '?'}" for package in ("drjit", "mitsuba")]
     devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if name == "cuda" else ""
     return [*versions, sha256(_SCRIPT.read_bytes()).hexdigest()[:12], platform.node(), devices]
 

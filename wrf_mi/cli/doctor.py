@@ -7,11 +7,10 @@ import platform
 import shutil
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
-from ..backend.probe import try_cuda, try_llvm
+from ..backend.probe import installed_version, try_cuda, try_llvm
 from ..backend.remedy import install_commands, package_manager
 from .options import Arguments, add_command
 from .output import print_json
@@ -39,7 +38,7 @@ def report() -> dict[str, Any]:
         list of problem, remedy).
     """
     problems: list[dict[str, str]] = []
-    versions = {name: _version(name) for name in _PACKAGES}
+    versions = {name: installed_version(name) for name in _PACKAGES}
     for name, found in versions.items():
         if found is None:
             problems.append({"problem": f"the package {name} is not installed", "remedy": "pip install -e ."})
@@ -131,13 +130,6 @@ def doctor_command(a: Arguments) -> int:
     else:
         print(render(found))
     return 0 if found["ok"] else 1
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _llvm(library: LlvmLibrary) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def _preset(a: Arguments, model: str) -> tuple[str, ...]:
 
 def _tracing_settings(a: Arguments) -> list[str]:
     from ..tracing.convergence import CHOSEN_KINDS
-    from ..tracing.options import DEFAULTS, KINDS, with_kinds
+    from ..tracing.options import stated_kinds
 
     target = getattr(a, "target_error", None)  # an option of trace
     for name in ("depth", "rays"):
@@ -125,10 +125,13 @@ def _tracing_settings(a: Arguments) -> list[str]:
     # Trained paths are searched with the default seed; --seed is that of training and split.
     seed = None if a.calibrate is not None else a.seed
     numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": seed}
-    options = with_kinds(DEFAULTS, a.paths, **numbers)
-    stated: dict[str, Any] = {key: getattr(options, key) for key, given in numbers.items() if given is not None}
+    stated: dict[str, Any] = {key: given for key, given in numbers.items() if given is not None}
+    if a.rays is not None and a.rays != "auto":
+        if not a.rays.isdecimal():
+            raise InputError(f'rays {a.rays!r}: give a whole number, or "auto"')
+        stated["rays"] = int(a.rays)
     if a.paths is not None:
-        stated |= {kind: getattr(options, kind) for kind in (kind.replace("-", "_") for kind in KINDS)}
+        stated |= stated_kinds(a.paths)
     if target is not None:
         # A kind in --paths is permitted, and switched on where it contributes.
         kinds = [kind for kind in CHOSEN_KINDS if a.paths is None or stated[kind]]

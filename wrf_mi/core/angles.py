@@ -21,14 +21,6 @@ def elevation_rad(height: int) -> FloatArray:
     return np.arange(height, dtype=float) * (np.pi / 2 / height)
 
 
-def sphere_elevation_rad(height: int) -> FloatArray:
-    """Elevation of each of ``height`` rows over the full sphere, in radians, shape [height].
-
-    Row r lies at ``-90 + r * 180 / height`` degrees: row 0 points down, and no row at the zenith.
-    """
-    return np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
-
-
 def azimuth_rad(width: int) -> FloatArray:
     """Azimuth of each of ``width`` columns over the full circle, in radians, shape [width]."""
     return np.arange(width, dtype=float) * (2 * np.pi / width)
@@ -56,9 +48,10 @@ def pixel_directions(height: int, width: int) -> FloatArray:
 def equirectangular_sphere(height: int, width: int) -> FloatArray:
     """Unit vector of every pixel of an equirectangular grid over the full sphere, shape [height, width, 3].
 
-    Elevations rise from -90 degrees (row 0), azimuths from 0 (column 0).
+    Row r lies at ``-90 + r * 180 / height`` degrees, so no row at the zenith; azimuths rise from 0 (column 0).
     """
-    return unit_vectors(azimuth_rad(width)[None, :], sphere_elevation_rad(height)[:, None])
+    elevation = np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
+    return unit_vectors(azimuth_rad(width)[None, :], elevation[:, None])
 
 
 def solid_angles(height: int, width: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 """Quaternion of a frame parallel to the world's."""
 POLE = 1e-12
 """Squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does."""
+WIDTH_RAD = math.radians(65)
+"""Half-power width of the directional element."""
 
 
 @dataclass(frozen=True)
@@ -89,29 +92,27 @@ class Antenna:
         TR 38.901, table 7.3-1 and equations 7.3-4 and 7.3-5.
         """
         u = np.asarray(directions, float)
-        x, y, z = np.moveaxis(u, -1, 0)
-        level = np.hypot(x, y)
-        pole = level**2 < POLE
-        divisor = np.where(pole, 1.0, level)
-        cosine, sine = np.where(pole, 1.0, x / divisor), np.where(pole, 0.0, y / divisor)
-        if self.polarization == "V":
-            unit = np.stack([z * cosine, z * sine, -level], axis=-1)
-        else:
-            unit = np.stack([-sine, cosine, np.zeros_like(z)], axis=-1)
-        return unit * self._amplitude(level, z, np.arctan2(sine, cosine), pole)[..., None]
+        return np.stack(self.components(np, *np.moveaxis(u, -1, 0)), axis=-1)
 
-    def _amplitude(self, level: FloatArray, z: FloatArray, azimuth: FloatArray, pole: Any) -> FloatArray:
+    def components(self, arrays: Any, x: Any, y: Any, z: Any) -> list[Any]:
+        """Components of `field` for unit vectors, with derivatives where ``arrays`` is Dr.Jit in place of NumPy."""
+        select = arrays.where if arrays is np else arrays.select
+        square = x * x + y * y
+        pole = square < POLE
+        inverse = 1 / arrays.sqrt(select(pole, 1.0, square))
+        cosine, sine, level = select(pole, 1.0, x * inverse), select(pole, 0.0, y * inverse), square * inverse
+        unit = [z * cosine, z * sine, -level] if self.polarization == "V" else [-sine, cosine, 0 * z]
         if self.pattern == "iso":
-            return np.ones_like(z)
+            return unit
         if self.pattern == "dipole":
-            result: FloatArray = np.sqrt(1.5) * level
-            return result
-        if self.pattern == "hw_dipole":
-            return np.where(pole, 0.0, np.sqrt(1.643) * np.cos(np.pi / 2 * z) / np.where(pole, 1.0, level))
-        width = np.radians(65)
-        vertical = np.minimum(12 * ((np.arctan2(level, z) - np.pi / 2) / width) ** 2, 30)
-        decibel = 8 - np.minimum(vertical + np.minimum(12 * (azimuth / width) ** 2, 30), 30)
-        return np.asarray(10 ** (decibel / 20))
+            amplitude = math.sqrt(1.5) * level
+        elif self.pattern == "hw_dipole":
+            amplitude = select(pole, 0.0, math.sqrt(1.643) * arrays.cos(math.pi / 2 * z) * inverse)
+        else:
+            angles = (arrays.atan2(level, z) - math.pi / 2) / WIDTH_RAD, arrays.atan2(sine, cosine) / WIDTH_RAD
+            vertical, horizontal = (arrays.minimum(12 * angle * angle, 30.0) for angle in angles)
+            amplitude = arrays.exp(math.log(10) / 20 * (8 - arrays.minimum(vertical + horizontal, 30.0)))
+        return [amplitude * part for part in unit]
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ Positive = Annotated[float, Field(gt=0, description="more than 0")]
 Share = Annotated[float, Field(ge=0, le=1, description="0 to 1")]
 ShareBelow1 = Annotated[float, Field(ge=0, lt=1, description="0 or more and less than 1")]
 Inside = Annotated[float, Field(gt=0, lt=1, description="more than 0 and less than 1")]
+Finite = Annotated[float, Field(description="a finite number")]
 NOT_NEGATIVE = Field(ge=0, description="0 or more")
 """Range of numbers for which a class of settings states no other."""
 
@@ -79,6 +80,19 @@ def check(settings: Any, prefix: str = "") -> None:
                 adapter.validate_python(value)
             except ValidationError:
                 raise InputError(f"setting {prefix}{name}: {value} is out of range, choose {words}") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckedSettings:
+    """Base of settings whose numbers are checked (`check`) when they are made."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range.
+
+        Raises:
+            InputError: naming the setting.
+        """
+        check(self)
 
 
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 
-from ..core import InputError, Record
-from ..core.registry import resolve
+from ..core import Record
+from ..core.registry import Registry, resolve
 from .argos import SUFFIXES
 from .ble_folder import ANCHORS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
@@ -62,19 +60,13 @@ BUILT_IN = (
 )
 
 
-@cache
-def layouts() -> tuple[Layout, ...]:
-    """All layouts in the order in which they are tried: those of other packages first.
+LAYOUTS = Registry[Layout]("layout", ENTRY_POINTS, {layout.name: layout for layout in BUILT_IN})
+"""All layouts by name."""
 
-    Raises:
-        InputError: two layouts of the same name.
-    """
-    others = tuple(point.load() for point in entry_points(group=ENTRY_POINTS))
-    names = [layout.name for layout in (*others, *BUILT_IN)]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"layout {name!r}: there are {names.count(name)} of that name; remove a package")
-    return (*others, *BUILT_IN)
+
+def layouts() -> list[Layout]:
+    """All layouts in the order in which they are tried: those of other packages first."""
+    return sorted(LAYOUTS.values(), key=BUILT_IN.__contains__)
 
 
 def layout_of(path: Path) -> Layout:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
-from ..core.files import atomic_folder, one_line
+from ..core.files import atomic_folder, readable
 from .folder_files import (
     AXES,
     POSITIONS,
@@ -104,7 +104,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         truth = _read_channels(folder / TRUTH)[None]
         if truth.shape[1:] != (n, antennas, half):
             text = f"shape {list(truth.shape[1:])}, expected {[n, antennas, half]}"
-            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}")
+            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}; correct it")
     return Record(
         name=name or folder.resolve().name,
         task="csi",
@@ -166,12 +166,9 @@ def write_nerf2_csi(
 
 def _read_channels(path: Path) -> NDArray[np.complex64]:
     """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file, finite in single precision."""
-    try:
+    missing = f"{path}: missing; give a file that exists, or complete its folder"
+    with readable(path, missing, "write it again with numpy.save"):
         values = np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
-    except Exception as error:  # numpy raises several kinds on damaged files
-        raise InputError(f"{path}: not readable as .npy ({one_line(error)}); write it again with numpy.save") from None
     wanted = "give complex numbers [samples, antennas, subcarriers]"
     if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:
         raise InputError(f"{path}: shape {list(getattr(values, 'shape', ()))}; {wanted}")

@@ -11,13 +11,11 @@ The longest period is ``2 * scale_m``: transmitters at that distance along an ax
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
-
-Tensor = TypeVar("Tensor", bound=dr.ArrayBase)
 
 
 def unambiguous_scale(points_m: ArrayLike, least_m: float) -> float:
@@ -42,22 +40,26 @@ def encoded_size(octaves: int) -> int:
     return 6 * octaves
 
 
-def encode(points: Tensor, octaves: int, scale_m: float) -> Tensor:
+def encode(points: Any, octaves: int, scale_m: float) -> Any:
     """Positional encoding of points.
 
     Args:
-        points: tensor [3, n], metres. Differentiable.
+        points: tensor or NumPy array [3, n], metres. Differentiable.
         octaves: number of octaves, L + 1 in the paper.
         scale_m: unit of ``t``, metres.
 
     Returns:
-        Tensor [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
+        Tensor or NumPy array [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
     """
+    host = isinstance(points, np.ndarray)
     if octaves == 0:
-        return dr.zeros(type(points), (0, points.shape[1]))
+        return points[:0] if host else dr.zeros(type(points), (0, points.shape[1]))
     # Whole periods are subtracted in each octave before the sine: exact, because the factors are
     # powers of two, and sin() in float32 loses digits of large arguments.
     octave = [points * (2.0**k / (2.0 * scale_m)) for k in range(octaves)]
+    if host:
+        phase = np.concatenate([t - np.rint(t) for t in octave]) * np.float32(2 * np.pi)
+        return np.concatenate([np.sin(phase), np.cos(phase)])
     turns = dr.concat([t - dr.round(dr.detach(t)) for t in octave], axis=0)
     sine, cosine = dr.sincos(2 * dr.pi * turns)
     return dr.concat([sine, cosine], axis=0)

@@ -107,12 +107,16 @@ class WrfGs:
         weights |= init_layer("signal.1", {"hidden": first}, second, rng)
         return weights | init_layer("signal.out", {"hidden": second}, 2 * self.components, rng, gain=initial.signal)
 
-    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
-        """Gaussians for transmitter positions [3, batch] in metres."""
-        batch = tx_pos.shape[1]
+    def features(self, params: Params) -> dr.ArrayBase:
+        """Feature vectors of the Gaussians, [width, n]."""
         hidden = dense(params, "attenuation.0", self.encoding.position(params["position"]), "position")
         for i in range(1, self.layers):
             hidden = dense(params, f"attenuation.{i}", hidden)
+        return hidden
+
+    def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
+        """Gaussians for transmitter positions [3, batch] in metres."""
+        batch, hidden = tx_pos.shape[1], self.features(params)
         z = linear(params, "attenuation.delta", hidden)
         re, im = rows(z)
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))

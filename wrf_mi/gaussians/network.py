@@ -77,7 +77,9 @@ class _Rectified(dr.CustomOp):
 
 
 def dense(params: Params, name: str, x: dr.ArrayBase, part: str = "hidden") -> dr.ArrayBase:
-    """A hidden layer max(W x + b, 0) of columns: [inputs, n] to [outputs, n]."""
+    """A hidden layer max(W x + b, 0) of columns: [inputs, n] to [outputs, n]; of NumPy's arrays too."""
+    if isinstance(x, np.ndarray):
+        return np.maximum(linear(params, name, x, part), 0)
     rectified: dr.ArrayBase = dr.custom(_Rectified, params[f"{name}.{part}"] @ x, None, params[f"{name}.bias"])
     return rectified
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -127,39 +127,6 @@ def _fill(
     dr.eval(out)
 
 
-def weight_strips(gaussians: Gaussians, pose: Pose, plane: Plane) -> Iterator[tuple[int, csr_array]]:
-    """The weights of the perception plane, one row of tiles after the other.
-
-    Args:
-        gaussians: Gaussians for one transmitter (batch 1); signals are not read.
-        pose: pose of the receiver.
-        plane: perception plane of the receiver, of the Gaussians' float type.
-
-    Yields:
-        First pixel of a row of tiles, and the weights [pixels, n] of its pixels: float32 or float64 under alpha
-        blending, complex under product blending. Entries of a matrix row are ordered from near to far.
-
-    Raises:
-        ValueError: Gaussians for several transmitters.
-        InputError: more entries in one row of tiles than 32 bits count.
-    """
-    if gaussians.batch != 1:
-        raise ValueError(f"weights: Gaussians for {gaussians.batch} transmitters; give those of one")
-    if not gaussians.count:
-        double = type(gaussians.position[0]) is not dr.float32_array_t(type(gaussians.position[0]))
-        real, product = (np.float64, np.complex128) if double else (np.float32, np.complex64)
-        yield 0, csr_array((plane.pixels, 0), dtype=real if gaussians.attenuation is None else product)
-        return
-    with dr.suspend_grad():
-        footprints = project(gaussians, pose)
-        order = depth_order(footprints.depth, gaussians.position)
-        columns = columns_of(footprints, gaussians.blending)
-        table = pack(columns)
-        dr.eval(table, footprints, order)
-        for strip, first, count in _strips(plane):
-            yield first, _weights(table, len(columns), footprints, order, strip, first, count)
-
-
 def _weights(
     table: Any, fields: int, footprints: Footprints, order: Any, strip: Plane, first: int, count: int
 ) -> csr_array:
@@ -188,37 +155,46 @@ def _weights(
 
 
 def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: float = np.inf) -> csr_array:
-    """The weights of the whole perception plane [pixels, n], see `weight_strips`.
+    """The weights of the perception plane, computed one row of tiles after the other.
+
+    Args:
+        gaussians: Gaussians for one transmitter (batch 1); signals are not read.
+        pose: pose of the receiver.
+        plane: perception plane of the receiver, of the Gaussians' float type.
+        most_bytes: largest size of the weights.
+
+    Returns:
+        Matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a row
+        are ordered from near to far.
 
     Raises:
-        MemoryError: they take more than ``most_bytes``; after the strip with which they do.
+        ValueError: Gaussians for several transmitters.
+        InputError: more entries in one row of tiles than 32 bits count.
+        MemoryError: more than ``most_bytes``; after the row of tiles with which they are.
     """
+    if gaussians.batch != 1:
+        raise ValueError(f"weights: Gaussians for {gaussians.batch} transmitters; give those of one")
+    if not gaussians.count:
+        double = type(gaussians.position[0]) is not dr.float32_array_t(type(gaussians.position[0]))
+        real, product = (np.float64, np.complex128) if double else (np.float32, np.complex64)
+        return csr_array((plane.pixels, 0), dtype=real if gaussians.attenuation is None else product)
     parts, size = [], 0
-    for _, part in weight_strips(gaussians, pose, plane):
-        parts.append(part)
-        size += part.data.nbytes + part.nnz * np.dtype(np.int32).itemsize
-        if size > most_bytes:
-            raise MemoryError(f"weights of {gaussians.count} Gaussians take more than {most_bytes / 1e6:.0f} MB")
+    with dr.suspend_grad():
+        footprints = project(gaussians, pose)
+        order = depth_order(footprints.depth, gaussians.position)
+        columns = columns_of(footprints, gaussians.blending)
+        table = pack(columns)
+        dr.eval(table, footprints, order)
+        for strip, first, count in _strips(plane):
+            parts.append(_weights(table, len(columns), footprints, order, strip, first, count))
+            size += parts[-1].data.nbytes + parts[-1].nnz * np.dtype(np.int32).itemsize
+            if size > most_bytes:
+                raise MemoryError(f"weights of {gaussians.count} Gaussians take more than {most_bytes / 1e6:.0f} MB")
     whole = csr_array(vstack(parts, format="csr"))
     if whole.nnz < 2**31:
         # SciPy keeps indices of 64 bits where it is given those: twice the memory and time.
         whole.indices, whole.indptr = whole.indices.astype(np.int32), whole.indptr.astype(np.int32)
     return whole
-
-
-def in_blocks(function: Callable[[NDArray[Any], NDArray[Any]], object], rows: NDArray[Any], out: NDArray[Any]) -> None:
-    """Call ``function(block of rows, block of out)`` for `BLOCK` rows at a time, on all processors.
-
-    Products run on one thread each: threads of the BLAS wait for each other by spinning, and where a processor is busy
-    otherwise a product of 0.1 ms then takes 16 ms.
-    """
-    blocks = [slice(i, i + BLOCK) for i in range(0, len(rows), BLOCK)]
-    with _blas().limit(limits=1, user_api="blas"):
-        if len(blocks) > 1 and _workers() > 1:
-            list(_pool().map(lambda block: function(rows[block], out[block]), blocks))
-        else:
-            for block in blocks:
-                function(rows[block], out[block])
 
 
 @lru_cache(maxsize=1)
@@ -230,9 +206,7 @@ def _workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_workers(), "wrf-mi-operator")
+_POOL = ThreadPoolExecutor(_workers(), "wrf-mi-operator")  # without a thread until its first use
 
 
 class _Operator(ABC):
@@ -247,30 +221,26 @@ class _Operator(ABC):
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
 
-    def magnitude(self, signals: ArrayLike, dark: float = 0.0, scale: bool = False) -> NDArray[Any]:
-        """Spectra sqrt(|R|^2 + dark), [batch, height, width].
+    def magnitude(self, signals: ArrayLike, dark: float = 0.0) -> NDArray[Any]:
+        """Spectra sqrt(|R|^2 + dark), [batch, height, width], of complex numbers [batch, K].
 
-        Args:
-            signals: complex numbers [batch, K].
-            dark: constant added to squares.
-            scale: each spectrum to its own minimum and maximum, as `wrf_mi.receivers.minmax_scale`.
+        Blocks of `BLOCK` spectra are computed on all processors, their products on one thread each: threads of the BLAS
+        wait for each other by spinning, and where a processor is busy otherwise a product of 0.1 ms then takes 16 ms.
         """
         rows = np.asarray(signals)
         single = self.kind == np.complex64
         out = np.empty((len(rows), self.height * self.width), np.float32 if single else np.float64)
 
-        def block(part: NDArray[Any], to: NDArray[Any]) -> None:
-            self.power(part, to)
+        def compute(first: int) -> None:
+            to = out[first : first + BLOCK]
+            self.power(rows[first : first + BLOCK], to)
             if dark:
                 to += to.dtype.type(dark)
             np.sqrt(to, out=to)
-            if scale:
-                low = to.min(axis=1, keepdims=True)
-                span = to.max(axis=1, keepdims=True) - low
-                to -= low
-                to *= np.divide(1, span, out=np.zeros_like(span), where=span > 0)
 
-        in_blocks(block, rows, out)
+        blocks = range(0, len(rows), BLOCK)
+        with _blas().limit(limits=1, user_api="blas"):
+            list(_POOL.map(compute, blocks) if len(blocks) > 1 and _workers() > 1 else map(compute, blocks))
         return out.reshape(len(rows), self.height, self.width)
 
 
@@ -290,14 +260,11 @@ class Images(_Operator):
         self.table: NDArray[Any] = np.concatenate([values.real, values.imag])
         self.kind, self.height, self.width = np.result_type(self.table.dtype, np.complex64), height, width
 
-    def rows(self, coefficients: NDArray[Any]) -> NDArray[Any]:
-        """Rows whose product with ``table`` are the real parts of R, then the imaginary ones, [2 * batch, ...]."""
-        re, im = coefficients.real, coefficients.imag
-        return np.block([[re, -im], [im, re]])
-
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
-        rows = self.rows(np.asarray(signals, self.kind))
+        c = np.asarray(signals, self.kind)
+        # The product of these rows are the real parts of R, then the imaginary ones.
+        rows = np.block([[c.real, -c.imag], [c.imag, c.real]])
         # For one transmitter two products with a vector: OpenBLAS takes 1.7 times as long for a matrix of two rows.
         both: NDArray[Any] = np.stack([row @ self.table for row in rows]) if len(rows) == 2 else rows @ self.table
         np.multiply(both, both, out=both)
@@ -319,7 +286,7 @@ class PixelOperator(_Operator):
 
     @classmethod
     def of(cls, gaussians: Gaussians, pose: Pose, plane: Plane) -> PixelOperator:
-        """The operator of Gaussians of static geometry and one receiver; see `weight_strips`."""
+        """The operator of Gaussians of static geometry and one receiver; see `pixel_weights`."""
         return cls(pixel_weights(gaussians, pose, plane), plane.height, plane.width)
 
     @property

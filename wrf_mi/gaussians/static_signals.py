@@ -1,116 +1,82 @@
-"""Signals of fields of static geometry in NumPy, for a prediction by operator.
+"""Signals of fields of static geometry, for a prediction by operator.
 
-Parts that depend on the Gaussians alone are computed once. The arithmetic is that of the fields; the start of a
-recorded Dr.Jit function takes longer than these small products.
+Those of `Factorised` and `WrfGs` are computed in NumPy, and parts that depend on the Gaussians alone once: the start of
+a recorded Dr.Jit function takes longer than these small products.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from ..backend.device import to_tensor
+from ..backend.recorded import Recorded
 from .factorised import Factorised
 from .fields import WrfGs
+from .network import dense, linear
 
-Array = NDArray[np.float32]
 ComplexArray = NDArray[np.complex64]
+Coefficients = Callable[[NDArray[np.float32]], ComplexArray]
+"""Coefficients c of transmitters [m, 3] in metres: [m, K], or signals [m, n]."""
 
 PAIRS_PER_CHUNK = 1 << 15
 """Pairs of Gaussian and transmitter at once: 16 MB of a layer of 128."""
 
 
-class Signals(Protocol):
-    """Signals S = C c(tx) of a field.
+def static_signals(field: Any, params: Mapping[str, Any]) -> tuple[ComplexArray | None, Coefficients]:
+    """Signals S = C c of a field: factors C [n, K], or None where the coefficients are the signals, and c.
 
-    Attributes:
-        factors: C, [n, K]; None: c are the signals.
-    """
-
-    factors: ComplexArray | None
-
-    def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """Coefficients c of transmitters [m, 3] in metres: [m, K], or [m, n] without factors."""
-        ...
-
-
-def encode(points: ArrayLike, octaves: int, scale_m: float) -> Array:
-    """`wrf_mi.gaussians.encoding.encode` of points [3, n]: [6 * octaves, n]."""
-    t = np.asarray(points, np.float32)
-    if octaves == 0:
-        return np.zeros((0, t.shape[1]), np.float32)
-    octave = [t * np.float32(2.0**k / (2.0 * scale_m)) for k in range(octaves)]
-    turns = np.concatenate([o - np.rint(o) for o in octave]) * np.float32(2 * np.pi)
-    return np.concatenate([np.sin(turns), np.cos(turns)])
-
-
-def _layer(params: Mapping[str, Array], name: str, x: Any, part: str = "hidden") -> Any:
-    return params[f"{name}.{part}"] @ x + params[f"{name}.bias"]
-
-
-def _relu(x: Any) -> Any:
-    return np.maximum(x, 0, out=x)
-
-
-class FactorisedSignals:
-    """Signals of a `Factorised` field with its parameters: c are its functions phi."""
-
-    def __init__(self, field: Factorised, params: Mapping[str, Array]) -> None:
-        self._field, self._params = field, params
-        re, im = params["signal"].reshape(2, field.terms, -1)
-        self.factors: ComplexArray | None = (re + 1j * im).T.astype(np.complex64)
-
-    def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """Coefficients of `Signals`."""
-        field, e = self._field, self._field.encoding
-        encoded = encode(np.asarray(tx_pos_m, np.float32).T, e.tx_octaves, e.tx_scale_m)
-        hidden = _relu(_layer(self._params, "terms.0", encoded, "transmitter"))
-        for i in range(1, field.layers):
-            hidden = _relu(_layer(self._params, f"terms.{i}", hidden))
-        re, im = _layer(self._params, "terms.out", hidden).reshape(2, field.terms, -1)
-        return (re + np.complex64(1j) * im).T
-
-
-class WrfGsSignals:
-    """Signals of a `WrfGs` field with its parameters; the products of the Gaussians' features are computed once."""
-
-    factors: ComplexArray | None = None
-
-    def __init__(self, field: WrfGs, params: Mapping[str, Array]) -> None:
-        e = field.encoding
-        encoded = encode(params["position"], e.position_octaves, e.position_scale_m)
-        hidden = _relu(_layer(params, "attenuation.0", encoded, "position"))
-        for i in range(1, field.layers):
-            hidden = _relu(_layer(params, f"attenuation.{i}", hidden))
-        self._encoding, self._params = e, params
-        self._products = _layer(params, "signal.0", hidden, "feature")
-
-    def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """Coefficients of `Signals`."""
-        tx = np.asarray(tx_pos_m, np.float32)
-        count = self._products.shape[1]
-        out = np.empty((len(tx), count), np.complex64)
-        step = max(1, PAIRS_PER_CHUNK // count)
-        for first in range(0, len(tx), step):
-            part = slice(first, first + step)
-            encoded = encode(tx[part].T, self._encoding.tx_octaves, self._encoding.tx_scale_m)
-            seen = self._products[None]
-            if len(encoded):
-                seen = seen + (self._params["signal.0.transmitter"] @ encoded).T[:, :, None]
-            hidden = _relu(_layer(self._params, "signal.1", np.maximum(seen, 0)))
-            pair = _layer(self._params, "signal.out", hidden)
-            out[part] = pair[:, 0] + np.complex64(1j) * pair[:, 1]
-        return out
-
-
-def host_signals(field: Any, params: Mapping[str, Array]) -> Signals | None:
-    """The signals of a field in NumPy; None for other classes, subclasses included, which may compute them
-    otherwise.
+    Other classes, subclasses included, may compute signals otherwise; theirs are `recorded_signals`.
     """
     if type(field) is Factorised:
-        return FactorisedSignals(field, params)
-    if type(field) is WrfGs:
-        return WrfGsSignals(field, params)
-    return None
+        return _complex(params["signal"].reshape(2, field.terms, -1)).T, _functions(field, params)
+    return None, (_wrf_gs_signals if type(field) is WrfGs else recorded_signals)(field, params)
+
+
+def _complex(pair: Any) -> Any:
+    return pair[0] + np.complex64(1j) * pair[1]
+
+
+def _functions(field: Any, params: Mapping[str, Any]) -> Coefficients:
+    def coefficients(tx_pos_m: Any) -> ComplexArray:
+        return _complex(field.functions(params, tx_pos_m.T).reshape(2, field.terms, -1)).T
+
+    return coefficients
+
+
+def _wrf_gs_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
+    products: Any = linear(params, "signal.0", field.features(params), "feature")
+    count = products.shape[1]
+
+    def coefficients(tx_pos_m: Any) -> ComplexArray:
+        out, step = np.empty((len(tx_pos_m), count), np.complex64), max(1, PAIRS_PER_CHUNK // count)
+        for first in range(0, len(tx_pos_m), step):
+            encoded = field.encoding.transmitter(tx_pos_m[first : first + step].T)
+            seen = products[None]
+            if len(encoded):
+                seen = seen + (params["signal.0.transmitter"] @ encoded).T[:, :, None]
+            pair: Any = linear(params, "signal.out", dense(params, "signal.1", np.maximum(seen, 0)))
+            out[first : first + step] = _complex(pair.swapaxes(0, 1))
+        return out
+
+    return coefficients
+
+
+def recorded_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
+    """Signals [m, n] of transmitters [m, 3] by the field's Dr.Jit function, recorded, one transmitter at a time."""
+    tensors = {name: to_tensor(values) for name, values in params.items()}
+
+    @Recorded
+    def signals(params: Mapping[str, Any], tx_pos: Any) -> Any:
+        with dr.suspend_grad():
+            return field.gaussians(params, tx_pos).signal
+
+    def coefficients(tx_pos_m: Any) -> ComplexArray:
+        found = (signals(tensors, to_tensor(position[:, None])) for position in tx_pos_m)
+        return np.stack([_complex([part.numpy() for part in pair]) for pair in found])
+
+    return coefficients

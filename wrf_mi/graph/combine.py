@@ -250,11 +250,8 @@ class CsiReceiver:
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
-        return float(np.log(_mean_square(observed) / _mean_square(report)) / 2)
-
-
-def _mean_square(values: NDArray[Any]) -> float:
-    return float(np.nanmean(np.square(np.asarray(values, float))))
+        there, here = (np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report))
+        return float(np.log(there / here) / 2)
 
 
 @dataclass(frozen=True)
@@ -276,19 +273,15 @@ class PowerReceiver(CsiReceiver):
         """Shape of a report."""
         return ()
 
-    def _mean_field(self, traced: TracedPaths, float_type: Any) -> Complex:
-        """Root of the sum of paths' powers, equal at all frequencies, as a complex signal of phase zero."""
-        re, im = traced.gain
-        amplitude = float_type(dr.sqrt(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, traced.each) + LEAST_POWER))
-        wide = dr.repeat(amplitude, self._ports.count)
-        return wide, dr.zeros(float_type, dr.width(wide))
-
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
         count = self._ports.count
         here, there = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
-            here = self._mean_field(traced, _float_type(learned))
+            # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
+            power_of_paths = dr.block_reduce(dr.ReduceOp.Add, sum(part * part for part in traced.gain), traced.each)
+            mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
+            here = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
         return 10 * dr.log2(received + LEAST_POWER) / math.log2(10)
 

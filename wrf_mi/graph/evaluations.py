@@ -1,12 +1,11 @@
 """Evaluation of the Gaussians of a graph on a receiver's directions, by name.
 
-`Splatted` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
+``splatted`` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
 `wrf_traced`; the plugins import this package, so they are imported on request.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,14 +24,18 @@ from ..tracing.field_calculator import Complex
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {
-    SPLATTED: "wrf_mi.graph.evaluations:Splatted",
+    SPLATTED: "wrf_mi.graph.evaluations:Evaluation",
     TRACED: "wrf_mi_plugins.evaluation:Traced",
 }
-"""Addresses of subclasses of `Evaluation`, with arguments (scene or None, `TracedConfig`)."""
+"""Addresses of `Evaluation` and its subclasses."""
 
 
-class Evaluation(ABC):
-    """Complex signal of Gaussians on a receiver's directions.
+class Evaluation:
+    """Complex signal of Gaussians on a receiver's directions, here splatted: walls of a scene have no effect.
+
+    Args:
+        scene: scene from `wrf_mi.tracing.open_scene`; None: no scene.
+        traced: parameters of the scene that are trained.
 
     Attributes:
         recordable: whether Dr.Jit can record a call (`dr.freeze`).
@@ -40,7 +43,9 @@ class Evaluation(ABC):
 
     recordable = True
 
-    @abstractmethod
+    def __init__(self, scene: Any | None, traced: TracedConfig) -> None:
+        pass
+
     def __call__(
         self,
         gaussians: Gaussians,
@@ -60,28 +65,10 @@ class Evaluation(ABC):
             params: parameters of the graph by name, those of the scene's materials among them.
             skip: parts that are not evaluated; ``traced`` evaluates all.
         """
-
-    def release(self) -> None:  # noqa: B027
-        """Drop the references that the last call kept for its reverse pass."""
-
-
-class Splatted(Evaluation):
-    """Gaussians splatted on the plane of directions (`wrf_mi.gaussians`); walls of a scene have no effect."""
-
-    def __init__(self, scene: Any | None, traced: TracedConfig) -> None:
-        pass
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        pose: Pose,
-        plane: Plane,
-        sphere: bool,
-        params: Mapping[str, Any],
-        skip: Skip = NOTHING,
-    ) -> Complex:
-        """Signal of `learned_field`."""
         return learned_field(gaussians, pose, plane, sphere, skip)
+
+    def release(self) -> None:
+        """Drop the references that the last call kept for its reverse pass."""
 
 
 def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluation:

@@ -6,16 +6,16 @@
 
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
-``receiver.*`` and ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`). Without a scene the tracer is not
-imported.
+``receiver.*`` and ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`). Without a scene Sionna RT is
+not imported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,17 +26,19 @@ from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
+from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
+from ..tracing.options import TraceOptions
+from ..tracing.polarization import check_polarization
 from ..tracing.pose import receiver_pose
+from ..tracing.solve import Prepared
+from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
 from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form, ReceiverModel
 from .settings import DEFAULT, SPLATTED, TracedConfig
-
-if TYPE_CHECKING:
-    from ..tracing.traced_field import TracedField, TracedPaths
 
 Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
@@ -127,9 +129,7 @@ class Graph:
         )
 
     @cached_property
-    def _prepared(self) -> Any:
-        from ..tracing.solve import Prepared
-
+    def _prepared(self) -> Prepared:
         return Prepared(self.scene)
 
     def check(self, tx_pos_m: FloatArray) -> None:
@@ -144,30 +144,16 @@ class Graph:
     def check_polarization(self, tx_pos_m: FloatArray) -> None:
         """Warn of receivers polarised orthogonally to the waves of transmitters [n, 3]."""
         if self.scene is not None:
-            from ..tracing.polarization import check_polarization
-
             check_polarization(self.scene, tx_pos_m, self.receivers, self.tx_antenna)
 
     def trace(self, tx_pos_m: ArrayLike, number: int, tx_heading_rad: ArrayLike | None = None) -> TracedField | None:
         """The traced side of transmitters [n, 3], turned by [n], at one receiver; None without a scene."""
         if self.scene is None:
             return None
-        from ..tracing import TraceOptions
-        from ..tracing.traced_field import TracedField, TracedOptions
-
         t = self.traced
-        trace = TraceOptions(
-            transmission=t.transmission,
-            max_depth=t.depth,
-            max_reflections=min(t.reflections, t.depth),
-            reflection=t.reflections > 0,
-            rays=t.rays,
-        )
-        antenna, materials, planes = self.tx_antenna, t.materials, t.moves_planes
-        options = TracedOptions(
-            trace, t.pattern_degree, faint=t.faint, tx_antenna=antenna, materials=materials, planes=planes
-        )
-        receiver = self.receivers[number]
+        trace = TraceOptions(transmission=t.transmission, max_depth=t.depth, max_reflections=t.reflections, rays=t.rays)
+        antenna, receiver = self.tx_antenna, self.receivers[number]
+        options = TracedOptions(trace, t.pattern_degree, 1.0, antenna, t.materials, t.moves_planes, t.faint)
         return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
@@ -188,19 +174,17 @@ class Graph:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
 
-    @property
-    def moves_receivers(self) -> bool:
-        """Whether training moves receivers."""
-        return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
-
-    def gaussians(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Gaussians:
-        """Gaussians of a batch in the receiver's unit, one signal each.
+    def gaussians(
+        self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None, chunked: bool = False
+    ) -> Gaussians:
+        """Gaussians of a batch in the receiver's unit, one signal each; ``chunked`` as in `report`.
 
         Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
         error of a mesh scales with its paths, near and far.
         """
         assert self.field is not None
-        gaussians = by_component(self.field.gaussians(params, batch.condition), self.form.components)
+        made = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
+        gaussians = by_component(made(params, batch.condition), self.form.components)
         if LEVEL not in params and batch.weight is None:
             return gaussians
         kind: Any = type(gaussians.signal[0])
@@ -218,7 +202,14 @@ class Graph:
             unit = dr.gather(kind, unit, dr.arange(mi.UInt32, count * each) // each)
         return replace(gaussians, signal=[part * unit for part in gaussians.signal])
 
-    def report(self, number: int, side: TracedField | None, learned: bool = True, skip: Skip = NOTHING) -> Report:
+    def report(
+        self,
+        number: int,
+        side: TracedField | None,
+        learned: bool = True,
+        skip: Skip = NOTHING,
+        chunked: bool = False,
+    ) -> Report:
         """Reports of a receiver as a function of parameters, for transmitters of a traced side.
 
         Args:
@@ -226,15 +217,17 @@ class Graph:
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
             skip: parts of the Gaussians that are not evaluated.
+            chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
         """
         model, receiver = self.models[number], self.receivers[number]
+        moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             paths = None if side is None else side(params, batch.slots)
             if self.field is None or not learned:
                 return model(paths, None)
-            here = receiver_pose(receiver, params, mi.Float) if self.moves_receivers else batch.pose
-            gaussians = self.gaussians(params, batch, paths)
+            here = receiver_pose(receiver, params, mi.Float) if moves else batch.pose
+            gaussians = self.gaussians(params, batch, paths, chunked)
             return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
 
         return report

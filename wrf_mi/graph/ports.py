@@ -16,13 +16,9 @@ from scipy.constants import speed_of_light
 
 from ..backend.device import on_device
 from ..core.angles import FloatArray, solid_angles
+from ..receivers.array import array_response
 from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import Float64, TracedPaths
-
-
-def wavenumber(frequency_hz: Any) -> Any:
-    """2 pi f / c, rad/m."""
-    return 2 * np.pi * frequency_hz / speed_of_light
 
 
 @lru_cache(maxsize=16)
@@ -42,7 +38,7 @@ class Ports:
     def __init__(self, offset_m: FloatArray, frequency_hz: FloatArray) -> None:
         self.count = len(frequency_hz)
         self.offset_m = [on_device(c, Float64) for c in np.transpose(np.asarray(offset_m, float))]
-        self.wavenumber = on_device(wavenumber(np.asarray(frequency_hz, float)), Float64)
+        self.wavenumber = on_device(2 * np.pi / speed_of_light * np.asarray(frequency_hz, float), Float64)
 
     @property
     def arrays(self) -> list[Any]:
@@ -126,8 +122,7 @@ def steering(offset_m: FloatArray, directions: FloatArray, frequency_hz: float) 
         directions: unit vectors [n, 3] in that frame.
         frequency_hz: carrier.
     """
-    phase = wavenumber(frequency_hz) * np.asarray(offset_m, float) @ np.asarray(directions, float).T
-    return ComplexMatrix(np.cos(phase) - 1j * np.sin(phase))
+    return ComplexMatrix(array_response(offset_m, directions, frequency_hz).conj().T)
 
 
 def matrix(flat: Any, columns: int) -> Any:

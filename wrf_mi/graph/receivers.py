@@ -78,15 +78,9 @@ class Form:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for a file."""
         hz = np.array([np.nan]) if self.frequencies_hz is None else np.asarray(self.frequencies_hz, float)
-        return {
-            "form/receiver": np.asarray(self.receiver),
-            "form/size": np.asarray(self.size),
-            "form/frequencies_hz": hz,
-            "form/outputs": np.asarray(self.outputs, np.int64),
-            "form/basis": np.zeros((0, 0), complex) if self.basis is None else self.basis,
-            "form/features": np.asarray(self.features),
-            "form/headings": np.asarray(self.headings),
-        }
+        basis = np.zeros((0, 0), complex) if self.basis is None else self.basis
+        values = vars(self) | {"frequencies_hz": hz, "outputs": np.asarray(self.outputs, np.int64), "basis": basis}
+        return {f"form/{name}": np.asarray(value) for name, value in values.items()}
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Form:

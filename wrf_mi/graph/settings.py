@@ -62,14 +62,9 @@ class TracedConfig:
 
     def rate(self, name: str) -> float:
         """Learning rate of a parameter of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
-        kind, last = name.partition(".")[0], name.rpartition(".")[2]
-        if kind == "material":
-            return self.material
-        if kind == "pattern":
-            return self.pattern
-        if kind == "plane":
-            return {"shift": self.shift, "tilt": self.tilt}[last]
-        return {"gain": self.gain, "position": self.position, "turn": self.turn, "pattern": self.pattern}[last]
+        first, last = name.partition(".")[0], name.rpartition(".")[2]
+        rate: float = getattr(self, first if first in ("material", "pattern") else last)
+        return rate
 
     @property
     def moves_planes(self) -> bool:

@@ -11,7 +11,7 @@ from ..core import InputError, Record
 from ..core.carriers import carriers_text
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
-from .method import Inputs
+from .model import Inputs
 
 if TYPE_CHECKING:
     from .model import Model
@@ -36,7 +36,7 @@ def check_record(method: Model, record: Record, others: Iterable[Model] = ()) ->
         named = f": {', '.join(able)}" if able else ""
         text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
         raise InputError(f"{place_of(record)}: {text}")
-    if method.needs_uplink and record.uplink is None:
+    if method.uplink == "required" and record.uplink is None:
         raise InputError(
             f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         )
@@ -95,7 +95,7 @@ def check_inputs(inputs: Inputs, record: Record, method: Model) -> None:
     if record.uplink is None and inputs.uplink is not None:
         raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; omit uplink")
     if inputs.uplink is None:
-        if method.needs_uplink:
+        if method.uplink == "required":
             form = "uplink [m, antennas, subcarriers], in the file of `predict --input`"
             raise InputError(f"{method.name}: predicts from the uplink; give {form}")
         return

@@ -1,29 +1,69 @@
-"""A model as an entry of the registry, the problem that it is fitted to, and a fitted model."""
+"""A model as an entry of the registry, the problem that it is fitted to, inputs of predictions, and a fitted model."""
 
 from __future__ import annotations
 
-import time
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import AntennaOptions, Prediction, Receiver, Record, Split
+from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
+from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
+from ..core.settings import settings_from
 from ..core.types import IntArray
 from ..parallel import Scheduler
-from ..training.checkpoint import checkpoint_seconds
 from ..training.session import FitSession
-from .method import FittedRows, Inputs, Method
 
+Kind = TypeVar("Kind")
 Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
 UNUSED_UPLINK = "its model does not predict from the uplink; omit uplink"
+PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
+"""Attributes that `Inputs` and `wrf_mi.core.Record` share."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Known quantities of m rows to predict; never their observations.
+
+    Attributes:
+        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
+        tx_heading_rad: headings of the transmitter [m], or None.
+        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
+        first_row: number of the first row, for messages.
+        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
+    """
+
+    tx_pos_m: FloatArray
+    tx_heading_rad: FloatArray | None = None
+    uplink: NDArray[Any] | None = None
+    first_row: int = 0
+    carriers_hz: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.tx_pos_m)
+
+    def rows(self, chosen: slice) -> Inputs:
+        """Inputs of some rows."""
+        return Inputs(**_chosen(self, chosen), first_row=self.first_row + (chosen.start or 0))
+
+
+def inputs_of(record: Record, rows: IntArray) -> Inputs:
+    """Inputs of some rows of a record."""
+    return Inputs(**_chosen(record, rows))
+
+
+def _chosen(source: Inputs | Record, rows: slice | IntArray) -> dict[str, Any]:
+    every = {name: getattr(source, name) for name in PER_ROW}
+    return {name: None if values is None else values[rows] for name, values in every.items()}
 
 
 @dataclass
@@ -140,15 +180,15 @@ class Fitted(ABC):
 class Model:
     """An entry of the registry.
 
-    A model of another package is a `Model`, or a `wrf_mi.models.method.Method`, that an entry point of the group
-    ``wrf_mi.models`` names.
+    A model of another package is a `Model` that an entry point of the group ``wrf_mi.models`` names.
 
     Attributes:
         name: name as in ``wrf-mi train --model``.
         tasks: tasks that it serves; None: all.
         settings: frozen dataclass of its settings, all with defaults; or several by purpose (`by_data`).
         fit: ``fit(problem, split, session)``. ``split.validation`` may choose settings; the result uses no row but
-            ``problem.rows(split)``. It may continue from its files in ``session.folder``.
+            ``problem.rows(split)``. Training step by step keeps a checkpoint in ``session.folder`` and continues from
+            it; all other fits call ``session.report``.
         load: ``load(arrays, problem, folder)``, from `Fitted.arrays`; ``folder`` holds the fitted model.
         source: publication.
         scene: whether it takes a scene.
@@ -188,11 +228,6 @@ class Model:
     prepare: Callable[[Problem, Sequence[Split], Session], Any] | None = None
     by_data: Callable[[str, bool], Model] | None = None
 
-    @property
-    def needs_uplink(self) -> bool:
-        """Whether it predicts from the uplink alone."""
-        return self.uplink == "required"
-
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks
@@ -202,37 +237,64 @@ class Model:
         return self if self.by_data is None or not self.serves(task) else self.by_data(task, with_scene)
 
 
-class FittedMethod(Fitted):
-    """A fitted `Method` as a fitted model, without standard deviations."""
+def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
+    """Rows that a receiver received: those that train at first, and those that choose settings.
 
-    def __init__(self, fitted: FittedRows, train_seconds: float | None = None) -> None:
-        self.fitted, self.train_seconds = fitted, train_seconds
+    Without the former, the latter train.
 
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Observations of the receiver of that index, [m, ...]."""
-        return Prediction(self.fitted.predict(inputs, receiver))
+    Raises:
+        InputError: fewer than two rows.
+    """
+    received = np.isfinite(record.observation[receiver]).reshape(len(record), -1).all(axis=1)
+    train, validation = (rows[received[rows]] for rows in (split.train, split.validation))
+    count = len(train) + len(validation)
+    if count < 2:
+        who = record.receivers[receiver].name
+        raise InputError(f"{record.name}: receiver {who} received {count} training row; {name} needs two at least")
+    return (train, validation) if len(train) else (validation, train)
 
-    def arrays(self) -> Arrays:
-        """All that `Method.load` needs."""
-        return self.fitted.arrays()
+
+def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
+    """Positions of the transmitter in some rows [n, 3], metres.
+
+    Raises:
+        InputError: unknown positions.
+    """
+    unknown = rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)]
+    if len(unknown):
+        text = f"no position in row {unknown[0]}: positions are not known, from which {name} predicts"
+        raise InputError(f"{record.name} has {text}; choose another model")
+    return record.tx_pos_m[rows]
 
 
-def model_of(method: Method) -> Model:
-    """The entry of a model that is fitted to a record's rows alone."""
+def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays with a prefix before their names."""
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
 
-    def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-        before, start = checkpoint_seconds(session.folder), time.perf_counter()
-        fitted = method.fit(problem.record, split, problem.settings, problem.seed, session)
-        return FittedMethod(fitted, before + time.perf_counter() - start)
 
-    return Model(
-        method.name,
-        method.tasks,
-        method.settings,
-        fit,
-        lambda arrays, problem, folder: FittedMethod(method.load(arrays, problem.record)),
-        method.source,
-        uplink="required" if method.needs_uplink else "optional",
-        several_carriers=method.several_carriers,
-        headings=True,
-    )
+def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
+    named = ((one.name, getattr(value, one.name)) for one in fields(value))
+    return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
+
+
+def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
+    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
+    names = (one.name for one in fields(cast(Any, kind)) if f"{prefix}{one.name}" in arrays)
+    stored = {name: arrays[f"{prefix}{name}"] for name in names}
+    return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
+
+
+def settings_array(settings: Any) -> NDArray[Any]:
+    """Settings as an array of a run file."""
+    return np.asarray(json.dumps(asdict(settings)))
+
+
+def stored_settings(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], name: str) -> Kind:
+    """Settings of a run file, from `settings_array`."""
+    return settings_from(kind, json.loads(str(arrays["settings"])), name)

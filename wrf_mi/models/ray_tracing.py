@@ -29,7 +29,7 @@ from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
 from ..datasets.observations import place_of
-from ..parallel import Scheduler, row_parts
+from ..parallel import row_parts
 from ..receivers.instruments import Instrument
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
@@ -45,8 +45,7 @@ from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField
 from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field
-from .method import Inputs
-from .model import Arrays, Fitted, Model, Problem, Session
+from .model import Arrays, Fitted, Inputs, Model, Problem, Session
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
@@ -144,8 +143,7 @@ class FittedTracing(Fitted):
 
 
 def _same(left: Inputs, right: Inputs) -> bool:
-    pairs = [(getattr(left, name), getattr(right, name)) for name in ("tx_pos_m", "carriers_hz")]
-    return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+    return all(np.array_equal(getattr(left, name), getattr(right, name)) for name in ("tx_pos_m", "carriers_hz"))
 
 
 def _instrument(record: Record) -> Instrument:
@@ -240,20 +238,16 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     if scheduler is None:
         return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
     assert problem.scene is not None
-    rays = tracer.rays(tx_pos_m)
-    parts = row_parts(len(tx_pos_m), scheduler.workers, _least(tracer, tx_pos_m, scheduler), TARGETS_PER_CHUNK)
+    rays, least = tracer.rays(tx_pos_m), TRACED_AT_LEAST
+    if not tracer.options.sampled:
+        least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
+    parts = row_parts(len(tx_pos_m), scheduler.workers, least, TARGETS_PER_CHUNK)
     given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
     sizes = [len(positions) for positions, *_ in given]
     options = replace(tracer.options, rays=rays)
     opener = partial(RayTracer, problem.scene, tracer.instrument, options, problem.material)
     found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
     return replace(join_traces(found), options=tracer.options)
-
-
-def _least(tracer: RayTracer, tx_pos_m: FloatArray, scheduler: Scheduler) -> int:
-    if tracer.options.sampled:
-        return TRACED_AT_LEAST
-    return max(TRACED_AT_LEAST, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
 
 
 def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None]) -> TraceResult:

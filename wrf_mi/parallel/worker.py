@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
 import signal
@@ -14,6 +13,7 @@ from functools import cache
 from typing import Any
 
 from ..backend import choose, init
+from ..backend.probe import installed_version
 from ..core import InputError
 
 VARIABLES = "WRF_MI_"
@@ -55,13 +55,8 @@ def worker_environment() -> WorkerEnvironment:
 
 @cache
 def _versions() -> tuple[tuple[str, str], ...]:
-    found = [("python", ".".join(platform.python_version_tuple()[:2]))]
-    for package in PACKAGES:
-        try:
-            found.append((package, importlib.metadata.version(package)))
-        except importlib.metadata.PackageNotFoundError:
-            found.append((package, "none"))
-    return tuple(found)
+    python = ("python", ".".join(platform.python_version_tuple()[:2]))
+    return (python, *((package, installed_version(package) or "none") for package in PACKAGES))
 
 
 _one_at_a_time = threading.Lock()

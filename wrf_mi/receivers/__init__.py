@@ -1,7 +1,7 @@
 """Receiver models in NumPy: from traced paths to spectra, channel coefficients and signal strengths, and back."""
 
 from .array import array_response, bartlett_spectrum, minmax_scale
-from .channel import antenna_csi, array_channels, csi, element_signals, received_power, rssi_dbm
+from .channel import antenna_csi, array_channels, csi, received_power, rssi_dbm
 from .lags import Lags
 
 __all__ = [
@@ -11,7 +11,6 @@ __all__ = [
     "array_response",
     "bartlett_spectrum",
     "csi",
-    "element_signals",
     "minmax_scale",
     "received_power",
     "rssi_dbm",

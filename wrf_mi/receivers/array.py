@@ -7,14 +7,40 @@ relative to the array's origin.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
+from scipy.spatial.distance import cdist
 
-from ..core.angles import FloatArray
-from .beams import beams
+from ..core.angles import FloatArray, pixel_directions
+from ..core.types import IntArray
 
 ComplexArray = NDArray[np.complex128]
+
+TABLE_BYTES = 1 << 25
+"""Largest table of responses; 360 x 90 directions of a 4 x 4 array take 8 MB. `KEPT_TABLES` are kept between calls."""
+KEPT_TABLES = 4
+CHUNK_SIZE = 16
+"""Signals whose spectra are computed together."""
+LINES_FROM = 64
+"""Number of elements from which a planar grid is summed line by line."""
+MIRRORED, ALIGNED = 1e-6, 1e-9
+"""Distances within which positions are opposite or on one line, as shares of the array's extent."""
+
+
+def mirror_order(elements_m: ArrayLike) -> IntArray | None:
+    """Index of the element opposite to each through the array's centre, [m]; None where an element has no opposite.
+
+    Args:
+        elements_m: [m, 3], or [m, 1] on a line.
+    """
+    elements = np.asarray(elements_m, float)
+    centre = elements.mean(axis=0)
+    distance = cdist(2 * centre - elements, elements)
+    extent = max(float(np.ptp(elements, axis=0).max()), np.finfo(float).tiny)
+    return distance.argmin(axis=1) if distance.min(axis=1).max() < MIRRORED * extent else None
 
 
 def array_response(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
@@ -50,13 +76,46 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
 
     Source: Van Trees, "Optimum Array Processing" (2002), section 6.2.
     """
-    signals = np.asarray(h, dtype=complex)
-    # A power of two keeps squares within the range of double precision, without rounding.
-    exponent = np.clip(np.frexp(np.abs(signals).max(initial=0))[1], -1000, 1000)
-    flat = signals.reshape(-1, signals.shape[-1]) * np.ldexp(1.0, -exponent)
-    images = beams(positions_m, frequency_hz, height, width).magnitude(flat)
-    images *= np.ldexp(1.0, exponent)
+    signals, elements = np.asarray(h, dtype=complex), np.asarray(positions_m, float)
+    first, second, order = _lines(elements)
+    grids = signals[..., order].reshape(-1, len(first), len(second))
+    images = np.empty((len(grids), height * width))
+    step = max(1, TABLE_BYTES // (16 * (len(first) + len(second))))
+    together = max(1, CHUNK_SIZE // len(first))
+    for begin in range(0, height * width, step):
+        block = float(frequency_hz), height, width, begin, begin + step
+        outer, inner = (_beams(line.tobytes(), *block) for line in (first, second))
+        for start in range(0, len(grids), together):
+            some = slice(start, start + together)
+            waves = grids[some] @ inner
+            total = waves[:, 0] if len(first) == 1 else np.einsum("nxd,xd->nd", waves, outer)
+            images[some, begin : begin + step] = np.abs(total)
     return images.reshape(*signals.shape[:-1], height, width)
+
+
+def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Two lines whose sums are the elements of a large planar grid, and the elements' order in the grid.
+
+    The first line of other arrays is the origin alone: one sum is faster for few elements, and tables of lines are
+    smaller for many.
+    """
+    whole = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
+    grain = ALIGNED * float(np.ptp(elements_m, axis=0).max())
+    if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:
+        return whole
+    (x, column), (y, row) = (np.unique(np.round(part / grain), return_inverse=True) for part in elements_m.T[:2])
+    order = np.lexsort((row, column))
+    if len(x) * len(y) != len(elements_m) or (np.diff(column[order] * len(y) + row[order]) != 1).any():
+        return whole
+    grid = elements_m[order].reshape(len(x), len(y), 3)
+    return grid[:, 0], grid[0] - grid[0, 0], order
+
+
+@lru_cache(KEPT_TABLES)
+def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin: int, end: int) -> ComplexArray:
+    """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
+    directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
+    return array_response(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).conj().T.copy()
 
 
 def minmax_scale(spectrum: ArrayLike) -> FloatArray:

@@ -20,23 +20,6 @@ SPECULAR_KINDS = (0, 1, 4)
 """Kinds of interaction (`wrf_mi.core.Paths`) that keep a wave spherical: none, reflection, transmission."""
 
 
-def element_signals(
-    paths: Paths, receivers: Receiver | Sequence[Receiver], positions_m: ArrayLike, frequency_hz: float
-) -> ComplexArray:
-    """Coherent sum of all paths at each element of an array at one frequency, see `antenna_csi`.
-
-    Args:
-        paths: traced to the arrays' origins.
-        receivers: poses of the ``n_rx`` arrays.
-        positions_m: elements [m, 3] in the array's frame, metres.
-        frequency_hz: carrier frequency.
-
-    Returns:
-        Complex signals [n_rx, n_tx, m], 0 where no path arrives.
-    """
-    return antenna_csi(paths, receivers, positions_m, frequency_hz)[..., 0]
-
-
 def antenna_csi(
     paths: Paths, receivers: Receiver | Sequence[Receiver], positions_m: ArrayLike, frequencies_hz: ArrayLike
 ) -> ComplexArray:

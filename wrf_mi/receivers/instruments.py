@@ -15,7 +15,10 @@ from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
 from .array import bartlett_spectrum, minmax_scale
-from .channel import antenna_csi, csi, element_signals, rssi_dbm
+from .channel import antenna_csi, csi, rssi_dbm
+
+CHUNK_SIZE = 64
+"""Transmitters whose spectra are computed together."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +105,10 @@ class SpectrumInstrument(Instrument):
         images = np.empty((len(self.receivers), paths.n_tx, *self.size), np.float32)
         for index, (receiver, some) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
-            signals = element_signals(some, receiver, receiver.array_m, self.carrier_hz)[0]
-            # One transmitter at a time: float64 spectra of all would take several times the memory of the result.
-            for row, signal in enumerate(signals):
-                image = bartlett_spectrum(signal, receiver.array_m, self.carrier_hz, *self.size)
-                images[index, row] = minmax_scale(image)
+            signals = antenna_csi(some, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
+            # Float64 spectra of all would take several times the memory of the result.
+            for start in range(0, len(signals), CHUNK_SIZE):
+                rows = slice(start, start + CHUNK_SIZE)
+                spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
+                images[index, rows] = minmax_scale(spectra)
         return images

@@ -75,11 +75,9 @@ class Lags:
         """Matrices [2, m * m, count] that add real and imaginary parts of products h_m conj(h_n) up to lags."""
         half, lag_of, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
         matrices = np.zeros((2, len(lag_of), self.count))
-        for pair in np.flatnonzero(side > 0):
-            lag = lag_of[pair]
-            matrices[0, pair, lag] = np.sqrt(2) if lag else 1
-            if lag:
-                matrices[1, pair, half + lag] = np.sqrt(2)
+        same, first = np.flatnonzero((side > 0) & (lag_of == 0)), np.flatnonzero((side > 0) & (lag_of > 0))
+        matrices[0, same, 0] = 1
+        matrices[0, first, lag_of[first]] = matrices[1, first, half + lag_of[first]] = np.sqrt(2)
         return matrices
 
     def coordinates(self, squared: ArrayLike) -> FloatArray:
@@ -87,25 +85,17 @@ class Lags:
         values = np.asarray(squared, float)
         if values.shape[-2:] != self.shape:
             raise InputError(f"lags: image {values.shape[-2:]}, not {self.shape}; build the lags for its grid")
-        coordinates: FloatArray = values.reshape(*values.shape[:-2], -1) @ self._orthonormal
+        coordinates: FloatArray = values.reshape(*values.shape[:-2], -1) @ self._factors[0]
         return coordinates
 
     def to_coordinates(self, lags: ArrayLike) -> FloatArray:
         """`coordinates` of the squared spectra of lags [..., count], without computing them."""
-        return np.asarray(lags, float) @ self._triangle.T
+        return np.asarray(lags, float) @ self._factors[1].T
 
     def residual(self, image: ArrayLike) -> FloatArray:
         """Part of images [..., height, width] outside the span of this array's squared spectra; the same shape."""
         values = np.asarray(image, float)
-        return values - (self.coordinates(values) @ self._orthonormal.T).reshape(values.shape)
-
-    @property
-    def _orthonormal(self) -> FloatArray:
-        return self._factors[0]
-
-    @property
-    def _triangle(self) -> FloatArray:
-        return self._factors[1]
+        return values - (self.coordinates(values) @ self._factors[0].T).reshape(values.shape)
 
     @cached_property
     def _factors(self) -> tuple[FloatArray, FloatArray]:

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .beams import mirror_order
+from .array import mirror_order
 from .lags import Lags
 
 ComplexArray = NDArray[np.complex128]

@@ -54,7 +54,7 @@ from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.checks import check_record
 from ..parallel import Scheduler
 from ..synthetic import load_record
-from ..training.checkpoint import CHECKPOINT
+from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
 from ..training.trainer import check_rows
 from .evaluate import Part, score_other, score_part, score_run
@@ -247,12 +247,12 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     parts, scores = [], []
     for part, rows in zip(folders, splits, strict=True):
         if not (part / FITTED).exists():
-            start = time.perf_counter()
+            before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
                 fitted = config.entry.fit(problem, rows, replace(session, folder=part))
             spent = fitted.train_seconds
-            write_fitted(part, fitted.arrays(), time.perf_counter() - start if spent is None else spent)
+            write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             (part / CHECKPOINT).unlink(missing_ok=True)
         parts.append(Part(part, rows, *load_fitted(config, problem, part)))
         scores.append(score_part(folder, config, problem, parts[-1]))

@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
-from ..core.carriers import FREQUENCY, by_carrier
+from ..core.carriers import FREQUENCY
 from ..core.files import write_arrays, write_atomically
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
-from ..models import Fitted, Problem
-from ..models.interpolation.idw import InverseDistance
-from ..models.method import inputs_of
-from ..tasks import TASKS, UPLINK, Task
+from ..models import Fitted, Problem, Session
+from ..models.interpolation.idw import MODEL as IDW
+from ..models.interpolation.idw import IdwSettings
+from ..models.model import inputs_of
+from ..tasks import TASKS, UPLINK
 from ..tasks.scores import inside_interval, summary
 from ..training.trainer import peak_memory_mb
 from .folder import METRICS, PREDICTIONS, RunConfig
@@ -89,7 +90,8 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     truth, broken = scorable(record.scored[:, rows])
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    found = [_prediction(predict(rows, receiver)) for receiver in range(len(truth))]
+    given = [predict(rows, receiver) for receiver in range(len(truth))]
+    found = [one if isinstance(one, Prediction) else Prediction(one) for one in given]
     arrays = {
         "row": rows,
         "prediction": np.stack([prediction.mean for prediction in found]).astype(truth.dtype),
@@ -107,10 +109,6 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "ms_per_sample": _milliseconds_per_sample(single or predict, rows),
     }
     return metrics, arrays
-
-
-def _prediction(found: NDArray[Any] | Prediction) -> Prediction:
-    return found if isinstance(found, Prediction) else Prediction(found)
 
 
 def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
@@ -258,7 +256,10 @@ def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> di
     if record.uplink is not None and task.from_uplink:
         found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
     if np.isfinite(record.tx_pos_m[np.concatenate([known, rows])]).all():
-        found[task.reference] = _interpolate(task, record, known, rows).astype(kind)
+        split, inputs = Split("reference", 0, known, known[:0], rows), inputs_of(record, rows)
+        fitted = IDW.fit(Problem(record, IdwSettings()), split, Session(Path(), Path()))  # writes no file
+        means = [fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))]
+        found[task.reference] = np.stack(means).astype(kind)
     if not found:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
@@ -278,22 +279,3 @@ def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:
         )
     nearest = np.round(np.linspace(0, uplink.shape[2] - 1, shape[-1])).astype(int)
     return uplink[:, :, nearest].reshape(len(uplink), *shape)
-
-
-def _interpolate(task: Task, record: Record, known: IntArray, rows: IntArray) -> Observations:
-    carriers = record.carriers_hz
-    if carriers is not None:  # neighbours are rows of the same carrier
-
-        def of_carrier(carrier_hz: float, which: IntArray) -> Observations:
-            same = record.at_carrier(carrier_hz)
-            return _interpolate(task, same, known[carriers[known] == carrier_hz], rows[which])
-
-        return by_carrier(carriers[rows], of_carrier, axis=1)
-    found = []
-    for receiver, observed in zip(record.receivers, record.observation, strict=True):
-        idw = InverseDistance(task.neighbours, softening_m=task.softening_m)
-        try:
-            found.append(idw.fit(record.tx_pos_m[known], observed[known]).predict(record.tx_pos_m[rows]))
-        except InputError as error:
-            raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-    return np.stack(found)

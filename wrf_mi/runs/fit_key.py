@@ -7,10 +7,8 @@ key, and so another folder.
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
-import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,9 +20,7 @@ import numpy as np
 from ..core import InputError
 from ..core.files import one_line
 from ..datasets.registry import locate
-from .folder import METRICS, versions
-
-logger = logging.getLogger(__name__)
+from .folder import versions
 
 PACKAGES, COMPILED = ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"), "__pycache__"
 DIGITS = 16
@@ -128,18 +124,3 @@ def scene_files(scene: str | Path) -> list[Path]:
     except (ElementTree.ParseError, OSError) as error:
         raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
     return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]
-
-
-def fit_once(folder: Path, fit: Callable[[], object]) -> Path:
-    """Write a run by ``fit`` into a folder whose name holds the fit's key, unless it holds a finished run (logged).
-
-    A stopped run in the folder is removed. Returns the folder.
-    """
-    if (folder / METRICS).exists():
-        logger.info("%s: the same fit was finished before; used again", folder)
-        return folder
-    if folder.exists():
-        logger.info("%s: was stopped; fitted from the start", folder)
-        shutil.rmtree(folder)
-    fit()
-    return folder

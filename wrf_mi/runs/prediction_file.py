@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import numpy as np
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, text_lines, write_atomically
-from ..models.method import Inputs
+from ..core.files import one_line, write_atomically
+from ..datasets.folder_files import read_csv
+from ..models.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
@@ -69,24 +71,11 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
 
 
 def _from_csv(path: Path) -> Inputs:
-    try:
-        rows = [row for row in csv.reader(text_lines(path)) if row]
-    except csv.Error as error:
-        raise InputError(f"{path}: not a CSV file ({one_line(error)}); give x, y, z in metres") from None
-    header = [name.strip().lower() for name in rows[0]] if rows else []
-    if not {"x", "y", "z"} <= set(header):
-        raise InputError(f"{path}: header {','.join(header)[:40]!r} lacks x, y, z; make it the first line")
-    optional = [name for name in (HEADING, FREQUENCY) if name in header]
-    columns, values = [header.index(name) for name in ("x", "y", "z", *optional)], []
-    for number, row in enumerate(rows[1:], start=1):
-        try:
-            values.append([float(row[c]) for c in columns])
-        except (ValueError, IndexError):
-            wanted = f"{len(columns)} numbers" if optional else "three numbers"
-            raise InputError(f"{path}, row {number}: {','.join(row)[:60]!r} is not {wanted}; correct it") from None
-    table = np.asarray(values, float).reshape(-1, len(columns))
-    found = dict(zip(optional, table[:, 3:].T, strict=True))
-    return Inputs(table[:, :3], found.get(HEADING), carriers_hz=found.get(FREQUENCY))
+    table = read_csv(path, skip_blank=True)
+    table = replace(table, header=[name.lower() for name in table.header])
+    positions = np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
+    heading, hz = (table.numbers(name) if name in table.header else None for name in (HEADING, FREQUENCY))
+    return Inputs(positions, heading, carriers_hz=hz)
 
 
 def _from_npz(path: Path) -> Inputs:

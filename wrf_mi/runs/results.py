@@ -169,17 +169,15 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     observed = ("prediction", "truth", *map(reference_key, references))
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
-    absent = [key for key in ("row", "tx_pos", *observed) if key not in stored]
+    absent = [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]
     if absent:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
-    names = stored.get("receiver_name")
+    names = stored["receiver_name"]
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
-    single = arrays["truth"].ndim == 1 + task.axes if names is None else len(names) == 1
-    if single:
+    if len(names) == 1:
         arrays |= {key: arrays[key][None] for key in observed}
     shape, rows = arrays["truth"].shape, len(arrays["row"])
-    names = np.arange(shape[0] if shape else 0) if names is None else names
     fits = 0 <= len(shape) - 2 - task.axes <= task.more_axes
     fits = fits and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
     if not fits or any(arrays[key].shape != shape for key in observed):

@@ -171,7 +171,7 @@ class Run:
         if model.uplink == "none":
             if inputs.uplink is not None:
                 raise InputError(f"{self.folder}: {UNUSED_UPLINK}")
-        elif inputs.uplink is not None or model.needs_uplink:
+        elif inputs.uplink is not None or model.uplink == "required":
             check_inputs(inputs, self.problem.record, model)
 
     def _check_numbers(

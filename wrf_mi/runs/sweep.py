@@ -122,7 +122,8 @@ def plan_sweep(
     runs: dict[str, SweepRun] = {}
     for chosen in itertools.product(*choices.values()):
         varied = dict(zip(choices, chosen, strict=True))
-        name = ",".join(f"{key}={_in_name(value)}" for key, value in varied.items())
+        words = {key: re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-" for key, value in varied.items()}
+        name = ",".join(f"{key}={word}" for key, word in words.items())
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
         given = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
@@ -133,10 +134,6 @@ def plan_sweep(
         runs[name] = SweepRun(Path(out) / name, varied, ("train", *dataset, *arguments, *flags, *set_all))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
     return Sweep(Path(out), shared, tuple(runs.values()))
-
-
-def _in_name(value: str) -> str:
-    return re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-"
 
 
 def check_run(dataset: str, arguments: Mapping[str, Any]) -> None:

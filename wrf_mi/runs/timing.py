@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,29 +73,6 @@ class Split:
     execution: float
     kernels: int
     compiled: int
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Times and memory of a call.
-
-    Attributes:
-        ms: time of a warm call.
-        times_ms: times of all warm calls.
-        first: shares of the first call, which compiles kernels that are not on disk.
-        warm: shares of a later call.
-        memory_mb: largest resident memory during a call less that before it.
-    """
-
-    ms: Interval
-    times_ms: tuple[float, ...]
-    first: Split
-    warm: Split
-    memory_mb: float
-
-    def plain(self) -> dict[str, Any]:
-        """Dictionary for JSON."""
-        return asdict(self)
 
 
 def bootstrap(samples: ArrayLike, statistic: Callable[..., Any] = np.median, seed: int = 0) -> Interval:
@@ -221,7 +198,7 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
 def split(call: Call) -> Split:
     """Shares of the time of a call, from Dr.Jit's kernel history.
 
-    A frozen function that was recorded without the history is recorded again; `typical_split` has its warm state.
+    A frozen function that was recorded without the history is recorded again by the first call.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.sync_thread()
@@ -233,12 +210,6 @@ def split(call: Call) -> Split:
     executed = min(sum(entry["execution_time"] for entry in history), max(whole - generated, 0.0))
     compiled = sum(not entry.get("cache_hit", 1) for entry in history)
     return Split(max(whole - generated - executed, 0.0), generated, executed, len(history), compiled)
-
-
-def typical_split(call: Call, calls: int = 5) -> Split:
-    """Shares of the call with the median time among several."""
-    found = sorted((split(call) for _ in range(calls)), key=lambda s: s.tracing + s.code_generation + s.execution)
-    return found[calls // 2]
 
 
 def memory_mb(call: Call) -> float:
@@ -280,20 +251,6 @@ def _watched(call: Call) -> int:
         thread.join()
     result: int = max(peak[0], process.memory_info().rss)
     return result
-
-
-def measure(call: Call, repeats: int = REPEATS, most_s: float = np.inf) -> Measured:
-    """Time, shares and memory of a call.
-
-    Args:
-        call: measured call, whose result is evaluated.
-        repeats: number of timed calls.
-        most_s: seconds after which no further call begins; three are timed in any case.
-    """
-    first, warm = split(call), typical_split(call)
-    memory = memory_mb(call)
-    times = interleaved({"call": call}, repeats, 1, most_s)["call"]
-    return Measured(bootstrap(times), tuple(float(t) for t in times), first, warm, memory)
 
 
 def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) -> Interval:

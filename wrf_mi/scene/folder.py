@@ -41,11 +41,6 @@ class SceneFolder:
     materials: Materials
     counts: Mapping[str, int]
 
-    @property
-    def thickness_m(self) -> Mapping[str, float]:
-        """Slab thickness of each radio material (``itu_*``), metres; ``scene.xml`` cannot hold it."""
-        return self.materials.thickness_m
-
 
 def write_scene(
     folder: str | Path,

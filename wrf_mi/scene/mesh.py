@@ -11,24 +11,20 @@ from typing import Any
 import numpy as np
 import shapely
 import trimesh
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line
 from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
 from .planes import THICKEST_M, Plane, with_axes
 from .points import UNITS_M, check_extent, source_file
-from .surfaces import KINDS, Kind, Surface, number_names
+from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names
+from .surfaces import bodies as connected_bodies
 
 logger = logging.getLogger(__name__)
 
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
 SMALLEST_FACE_M2 = 1e-10
 """Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
-SAME_VERTEX_M = 1e-4
-"""Nearer vertices are the same: STL has no shared vertices."""
 FLAT_M = 0.01
 """Largest distance of the vertices of a facet's triangles from its plane."""
 PARALLEL = np.cos(np.radians(2))
@@ -45,10 +41,7 @@ LAYERS_M = 0.5
 
 @dataclass(frozen=True)
 class _Body:
-    """Triangles [f, 3, 3] that are connected by their edges; a closed body has two faces at every edge.
-
-    The volume is positive where the normals of a closed body point outwards, 0 where they disagree.
-    """
+    """Triangles [f, 3, 3] that are connected by their edges, see `wrf_mi.scene.surfaces.bodies`."""
 
     corners_m: FloatArray
     closed: bool
@@ -85,11 +78,7 @@ def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
             finite, or units that look like others.
     """
     file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    try:
-        parts: list[Any] = trimesh.load_scene(str(file), process=False).dump()
-    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
-        raise InputError(f"{file}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    parts = [part for part in parts if len(getattr(part, "faces", ()))]
+    parts = mesh_parts(file)
     if not parts:
         raise InputError(f"{file}: has no faces, so no surface; make a scene of points with wrf-mi mesh")
     surfaces = []
@@ -130,7 +119,10 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     Returns:
         Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.
     """
-    bodies = [body for surface in surfaces for body in _bodies(surface)]
+    bodies = []
+    for surface in surfaces:
+        corners = surface.vertices_m[surface.faces]
+        bodies += [_Body(corners[faces], closed, volume) for faces, closed, volume in connected_bodies(corners)]
     sheets = [sheet for index, body in enumerate(bodies) if (sheet := _slab(body, index)) is not None]
     slabs = {sheet.body for sheet in sheets}
     facets = [sheet for sheet in sheets if _large(sheet)]
@@ -165,29 +157,6 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
         vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
         found.append(Surface(name, kind, vertices, faces.reshape(-1, 3)))
     return found
-
-
-def _bodies(surface: Surface) -> Iterator[_Body]:
-    corners = surface.vertices_m[surface.faces]
-    grid = np.round(surface.vertices_m / SAME_VERTEX_M)
-    _, first, same = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    faces = same.reshape(-1)[surface.faces]
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, edge = np.unique(edges, axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
-    count = np.bincount(edge)
-    face = np.repeat(np.arange(len(faces)), 3)
-    incidence = sparse.csr_array((np.ones(len(edge)), (face, edge)), shape=(len(faces), len(count)))
-    _, label = connected_components(incidence @ incidence.T, directed=False)
-    unpaired = np.bincount(label, weights=(count[edge] != 2).reshape(-1, 3).any(axis=1))
-    order = np.argsort(label, kind="stable")
-    for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        closed = bool(unpaired[label[members[0]]] == 0)
-        volume = 0.0
-        if closed:
-            mesh = trimesh.Trimesh(surface.vertices_m[first], faces[members], process=False)
-            volume = float(mesh.volume) if mesh.is_winding_consistent else 0.0
-        yield _Body(corners[members], closed, volume)
 
 
 def _slab(body: _Body, index: int) -> _Facet | None:

@@ -94,28 +94,22 @@ class _Canvas:
     ) -> tuple[FloatArray, float]:
         """The pose near a first one that lays points best on a field, and the mean of the field there."""
         mean = 0.0
-        for step in steps:
-            pose, mean = self._searched(field, points, middle, pose, step, weight)
+        for reach, pitch, turn, turn_pitch in steps:
+            start, best = pose, -np.inf
+            shifts = np.arange(-reach, reach + 1e-9, pitch)
+            shift = np.stack(np.meshgrid(shifts, shifts, indexing="ij"), axis=-1).reshape(-1, 2)
+            for angle in start[2] + np.radians(np.arange(-turn, turn + 1e-9, turn_pitch)):
+                turned = _moved(points, np.array([start[0], start[1], angle]), middle)
+                at = (turned[None] + shift[:, None] - self.low) / POINT_CELL_M - 0.5
+                values = ndimage.map_coordinates(field, at.reshape(-1, 2).T, order=1)
+                value = values.reshape(len(shift), -1).mean(axis=1)
+                off = ((start[:2] + shift) ** 2).sum(axis=1) / POSE_DEVIATION_M**2 + (angle / POSE_DEVIATION_RAD) ** 2
+                score = value - weight * off
+                i = int(np.argmax(score))
+                if score[i] > best:
+                    best, mean = float(score[i]), float(value[i])
+                    pose = np.array([*(start[:2] + shift[i]), angle])
         return pose, mean
-
-    def _searched(
-        self, field: FloatArray, points: FloatArray, middle: FloatArray, start: FloatArray, step: Step, weight: float
-    ) -> tuple[FloatArray, float]:
-        reach, pitch, turn, turn_pitch = step
-        shifts = np.arange(-reach, reach + 1e-9, pitch)
-        shift = np.stack(np.meshgrid(shifts, shifts, indexing="ij"), axis=-1).reshape(-1, 2)
-        best, found, mean = -np.inf, start, 0.0
-        for angle in start[2] + np.radians(np.arange(-turn, turn + 1e-9, turn_pitch)):
-            turned = _moved(points, np.array([start[0], start[1], angle]), middle)
-            at = (turned[None] + shift[:, None] - self.low) / POINT_CELL_M - 0.5
-            value = ndimage.map_coordinates(field, at.reshape(-1, 2).T, order=1).reshape(len(shift), -1).mean(axis=1)
-            off = ((start[:2] + shift) ** 2).sum(axis=1) / POSE_DEVIATION_M**2 + (angle / POSE_DEVIATION_RAD) ** 2
-            score = value - weight * off
-            i = int(np.argmax(score))
-            if score[i] > best:
-                best, mean = float(score[i]), float(value[i])
-                found = np.array([*(start[:2] + shift[i]), angle])
-        return found, mean
 
 
 def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -> PlanGrid:

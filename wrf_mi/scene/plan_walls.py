@@ -92,8 +92,8 @@ def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
     return walls_m[np.argsort(-np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=-1), kind="stable")]
 
 
-def joined(walls_m: FloatArray, reach_m: float = REACH_M) -> FloatArray:
-    """Walls [n, 2, 2] whose ends are moved, along the wall, to where it meets another wall within ``reach_m``."""
+def joined(walls_m: FloatArray) -> FloatArray:
+    """Walls [n, 2, 2] whose ends are moved, along the wall, to where it meets another wall within `REACH_M`."""
     result = walls_m.copy()
     along = walls_m[:, 1] - walls_m[:, 0]
     length = np.linalg.norm(along, axis=-1)
@@ -108,9 +108,9 @@ def joined(walls_m: FloatArray, reach_m: float = REACH_M) -> FloatArray:
         other = _cross(between, unit[i]) / safe
         beyond = np.maximum(np.maximum(-other, other - length), 0)
         for end, at in enumerate((0.0, length[i])):
-            way = np.where(corner & (beyond <= reach_m), np.abs(here - at), np.inf)
+            way = np.where(corner & (beyond <= REACH_M), np.abs(here - at), np.inf)
             nearest = int(np.argmin(way))
-            if way[nearest] <= reach_m:
+            if way[nearest] <= REACH_M:
                 result[i, end] = walls_m[i, 0] + here[nearest] * unit[i]
     return result[np.linalg.norm(result[:, 1] - result[:, 0], axis=-1) > TOUCHING_M]
 

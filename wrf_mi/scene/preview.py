@@ -25,7 +25,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
-from ..core.angles import FloatArray, rotation_matrix
+from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.files import write_atomically
 from ..core.paths import Paths
 from .surfaces import Surface
@@ -40,6 +40,8 @@ ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
 """Name, marker and colour of each end of paths."""
 ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0
 """Direction of the viewer of the slanted view."""
+EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))
+"""Unit vector from the scene to the viewer."""
 LIGHT = np.array([0.35, -0.5, 0.79])
 CUT = 0.45
 """Share of the height at which the plan is cut."""
@@ -148,19 +150,11 @@ def draw_scene(
     return figure
 
 
-def _toward_viewer() -> FloatArray:
-    """Unit vector from the scene to the eye of the slanted view."""
-    elevation, azimuth = np.radians([ELEVATION_DEG, AZIMUTH_DEG])
-    flat = np.cos(elevation)
-    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-
-
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
     """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
     rgba = _coloured(figure, cloud.strength_db, "viridis", cloud.label, 0.4)
-    eye = _toward_viewer()
-    right = np.cross([0, 0, 1], eye) / np.linalg.norm(np.cross([0, 0, 1], eye))
-    screen = np.stack([right, np.cross(eye, right)])
+    right = np.cross([0, 0, 1], EYE) / np.linalg.norm(np.cross([0, 0, 1], EYE))
+    screen = np.stack([right, np.cross(EYE, right)])
     outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen
     slant.add_collection3d(Poly3DCollection(outlines, facecolors=rgba, edgecolors="none", zorder=5))
     flat = cloud.position_m[:, None, :2] + cloud.silhouettes(np.eye(3)[:2])
@@ -194,9 +188,9 @@ def _draw_slant(
     axes: Any, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
 ) -> None:
     """Faces without the ceiling, lit from the side; walls in front are transparent."""
-    middle, eye = (low + high) / 2, _toward_viewer()
-    # The empty parts serve scenes that have ceilings only.
-    faces, rgba, floor = [np.empty((0, 3, 3))], [np.empty((0, 4))], [np.empty(0, bool)]
+    middle = (low + high) / 2
+    # Floors, then all else. The empty parts serve scenes that have ceilings only.
+    drawn = [([np.empty((0, 3, 3))], [np.empty((0, 4))]) for _ in range(2)]
     for surface, colour in zip(surfaces, colours, strict=True):
         if surface.kind == "ceiling":
             continue
@@ -212,28 +206,21 @@ def _draw_slant(
         else:
             # A wall fades as a whole; a large body that holds a whole room fades face by face.
             place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
-            front = (place - middle)[:, :2] @ eye[:2] > 0.05 * np.linalg.norm(high - low)
+            front = (place - middle)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
         shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
+        faces, rgba = drawn[surface.kind != "floor"]
         faces.append(corners[kept])
         rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[kept])
-        floor.append(np.full(np.count_nonzero(kept), surface.kind == "floor"))
-    corners, shades, is_floor = np.concatenate(faces), np.concatenate(rgba), np.concatenate(floor)
-    largest = np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]
-    for part, order in ((is_floor[largest], 1), (~is_floor[largest], 2)):
-        chosen = largest[part]
-        if len(chosen):
-            axes.add_collection3d(
-                Poly3DCollection(
-                    corners[chosen], facecolors=shades[chosen], edgecolors="none", antialiaseds=False, zorder=order
-                )
-            )
+    for order, (corners, shades) in enumerate(([np.concatenate(part) for part in pair] for pair in drawn), start=1):
+        if len(largest := np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]):
+            flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}
+            axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
     rims = [np.empty((0, 2, 3))]
     for surface in surfaces:
         if surface.kind != "ceiling" and len(surface.faces) <= 500:
-            edges = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-            edge, count = np.unique(edges, axis=0, return_counts=True)
-            rims.append(surface.vertices_m[edge[count == 1]])
+            edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
+            rims.append(surface.vertices_m[edges[trimesh.grouping.group_rows(edges, require_count=1)]])
     if len(lines := np.concatenate(rims)):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
     axes.set_proj_type("ortho")

@@ -53,9 +53,6 @@ class Registration:
         matrix: shape [4, 4], applied to columns (x, y, z, 1) in metres.
         rms_m: rms residual; of a fit to walls, over the points that agree.
         share: share of the points within `NEAR_M` of a wall; 1 for pairs.
-        agreement: mean of the share of the scene that lies at walls and the share of the walls that it shows, each
-            point weighted by exp(-(d / 0.1 m)^2 / 2); 1 for pairs.
-        count: number of pairs, or points.
         scale: factor on the source's lengths that would fit best; far from 1, the units or the resolution are wrong.
             It is not in the matrix.
     """
@@ -63,8 +60,6 @@ class Registration:
     matrix: FloatArray
     rms_m: float
     share: float
-    agreement: float
-    count: int
     scale: float
 
     def apply(self, points_m: ArrayLike) -> FloatArray:
@@ -123,7 +118,7 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
     matrix = _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
-    return Registration(matrix, rms, 1.0, 1.0, n, float(similar.scale))
+    return Registration(matrix, rms, 1.0, float(similar.scale))
 
 
 def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
@@ -134,7 +129,7 @@ def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
     return matrix
 
 
-def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatArray:
+def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
     """Points [n, 2] along the walls of surfaces seen from above, in equal steps.
 
     Raises:
@@ -151,7 +146,7 @@ def wall_points(surfaces: Sequence[Surface], step_m: float = SAMPLE_M) -> FloatA
         pieces.append(np.stack([middle + reach.min() * along, middle + reach.max() * along]))
     if not pieces:
         raise InputError("registration to walls: the scene has no wall; register by pairs of points")
-    return sample_walls(np.array(pieces), step_m)
+    return sample_walls(np.array(pieces))
 
 
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
@@ -207,7 +202,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
                 f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
             )
     matrix, rms = _motion(rotation_2d(pose[2]), pose[:2]), float(np.sqrt(np.mean(near**2)))
-    return Registration(matrix, rms, share, score, len(points), scale)
+    return Registration(matrix, rms, share, scale)
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
@@ -219,19 +214,13 @@ def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
     return np.concatenate(parts)
 
 
-def _from_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
-    """Vector [n, 2] to each point [n, 2] from the nearest point on walls [m, 2, 2]."""
+def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
+    """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
     begin, along = walls_m[:, 0], walls_m[:, 1] - walls_m[:, 0]
     offset = points_m[:, None] - begin
     part = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
     away = offset - part[..., None] * along
-    nearest = np.argmin((away**2).sum(axis=-1), axis=1)
-    return np.asarray(away[np.arange(len(away)), nearest])
-
-
-def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
-    """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
-    return np.asarray(np.linalg.norm(_from_walls(points_m, walls_m), axis=-1))
+    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))
 
 
 def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -251,18 +240,11 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
     def misfit(pose: FloatArray) -> FloatArray:
         return distance_to_walls(_moved(centred, pose), walls)
 
-    def gradient(pose: FloatArray) -> FloatArray:
-        # A distance grows along its direction; a turn moves a point across its radius.
-        turned = _moved(centred, np.array([0.0, 0.0, pose[2]]))
-        away = _from_walls(turned + pose[:2], walls)
-        unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)
-        return np.column_stack([unit, unit[:, 1] * turned[:, 0] - unit[:, 0] * turned[:, 1]])
-
     fits = []
     for pose in _starts(centred, targets, cell):
         # A start is off by half a cell and half a turn's step.
         for width in (cell + radius * np.pi / TURNS, NEAR_M / 2):
-            pose = optimize.least_squares(misfit, pose, gradient, loss="cauchy", f_scale=width, max_nfev=30).x
+            pose = optimize.least_squares(misfit, pose, loss="cauchy", f_scale=width, max_nfev=30).x
         # The pose for the points themselves: R (x - middle) + t = R x + (t - R middle).
         whole = np.append(pose[:2] - rotation_2d(pose[2]) @ middle, pose[2])
         fits.append((whole, _agreement(_moved(centred, pose), targets, walls)))
@@ -270,7 +252,9 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
 
 
 def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> float:
-    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows."""
+    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows, each point
+    weighted by exp(-(d / 0.1 m)^2 / 2).
+    """
     there = np.exp(-0.5 * (distance_to_walls(placed, walls) / (NEAR_M / 2)) ** 2)
     back = np.exp(-0.5 * (cKDTree(placed).query(targets)[0] / (NEAR_M / 2)) ** 2)
     return float((there.mean() + back.mean()) / 2)

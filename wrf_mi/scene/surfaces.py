@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
 
+import numpy as np
 import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import one_line
 from ..core.types import IntArray
 
 Kind = Literal["floor", "ceiling", "wall", "other"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+SAME_CORNER_M = 1e-4
+"""Distance within which corners of faces coincide: STL has no shared vertices, and meshes that meet leave a gap."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,19 @@ class Surface:
         return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
 
 
+def mesh_parts(path: str | Path) -> list[Any]:
+    """The parts of a mesh file that have faces, as trimesh reads them.
+
+    Raises:
+        InputError: a file that cannot be read as a mesh.
+    """
+    try:
+        parts: list[Any] = trimesh.load_scene(str(path), process=False).dump()
+    except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
+        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
+    return [part for part in parts if len(getattr(part, "faces", ()))]
+
+
 def number_names(kinds: Sequence[Kind]) -> list[str]:
     """A unique name for each surface: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
     names, seen = [], dict.fromkeys(KINDS, 0)
@@ -51,3 +72,30 @@ def number_names(kinds: Sequence[Kind]) -> list[str]:
 def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     """Surfaces moved by a matrix [4, 4]."""
     return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]
+
+
+def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
+    """Bodies of triangles [f, 3, 3] that are connected by their edges.
+
+    Returns:
+        Of each body its faces [n], whether it is closed (two faces at every edge), and the volume in m^3 of a closed
+        body: positive where the normals point outwards, 0 where they disagree.
+    """
+    count = len(corners_m)
+    if not count:
+        return []
+    _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1, 3)
+    ends = np.stack([vertex, np.roll(vertex, -1, axis=1)], axis=-1).reshape(-1, 2)
+    _, edge, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    edge, face = edge.reshape(-1), np.repeat(np.arange(count), 3)
+    # Faces and edges are the nodes of one graph, so that an edge of many faces costs no more.
+    incidence = coo_array((np.ones(3 * count), (face, count + edge)), shape=(count + len(uses),) * 2)
+    body = connected_components(incidence, directed=False)[1][:count]
+    # Neighbours of the same orientation run along their common edge in opposite directions.
+    turned = np.bincount(edge, np.sign(ends[:, 1] - ends[:, 0]))
+    unpaired, crossed = (np.bincount(body[face], wrong[edge]) for wrong in (uses != 2, turned != 0))
+    a, b, c = (corners_m - corners_m[0, 0]).transpose(1, 0, 2)
+    volume = np.bincount(body, (a * np.cross(b, c)).sum(axis=1) / 6) * (crossed == 0)
+    members = np.split(np.argsort(body, kind="stable"), np.cumsum(np.bincount(body))[:-1])
+    return list(zip(members, (unpaired == 0).tolist(), volume.tolist(), strict=True))

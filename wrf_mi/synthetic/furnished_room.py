@@ -38,7 +38,7 @@ from ..core.arrays import planar_array
 from ..datasets import read_spectrum_folder, user_cache, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum, minmax_scale
 from ..receivers.channel import array_channels
-from ..tracing.devices import solids, winding_number
+from ..tracing.devices import solid_around
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
 from ..tracing.solve import trace_paths
@@ -136,8 +136,7 @@ def transmitters(scene: Any, room: TracedRoom) -> FloatArray:
         drawn = np.round(rng.uniform([0, 0, room.low_m], [LENGTH, WIDTH, room.high_m], (count, 3)), 4)
         free = tree.query(drawn)[0] > room.clear_m
         free &= np.linalg.norm(drawn - RECEIVER.position_m, axis=1) > room.from_array_m
-        for face in solids(surfaces):
-            free &= winding_number(surfaces.triangles[face], drawn) < 0.5
+        free &= solid_around(surfaces, drawn) < 0
         found = np.concatenate([found, drawn[free]])
     return found[:count]
 

@@ -22,10 +22,10 @@ from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import load, make_splits, read_spectrum_folder, user_cache, write_spectrum_folder
 from ..datasets.registry import locate
+from ..receivers.instruments import SpectrumInstrument
 from ..scene.scan import simulate_scan
 from ..tracing.options import TraceOptions
-from ..tracing.scenes import open_scene
-from ..tracing.tracer import trace_spectra
+from ..tracing.tracer import RayTracer
 
 logger = logging.getLogger(__name__)
 
@@ -97,11 +97,11 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
     recipe = yaml.safe_dump(facts, sort_keys=False)
     if not is_made(folder, recipe):
         logger.info("tracing %d spectra in the scene %s into %s", POSITIONS, NAME, folder)
-        positions, array_m = transmitter_path(), planar_array(4, 4, SPACING_M)
-        receiver, frequency_hz = replace(RECEIVER, array_m=array_m), np.array([FREQUENCY_HZ])
-        scene = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
-        spectra = trace_spectra(scene, positions, RECEIVER, array_m, FREQUENCY_HZ, options=OPTIONS, progress=progress)
-        record = Record(NAME, "spectrum", positions, (receiver,), spectra[None], frequencies_hz=frequency_hz)
+        positions, frequency_hz = transmitter_path(), np.array([FREQUENCY_HZ])
+        receiver = replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M))
+        tracer = RayTracer(info.folder, SpectrumInstrument((receiver,), frequency_hz), OPTIONS)
+        spectra = tracer.observe(tracer.trace(positions, progress))
+        record = Record(NAME, "spectrum", positions, (receiver,), spectra, frequencies_hz=frequency_hz)
         split = make_splits(record, "random", seed=OPTIONS.seed)[0]
         record = replace(record, official=(split.all_train, split.test))
         extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: scan_file(info.xml, OPTIONS.seed)}

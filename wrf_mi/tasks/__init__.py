@@ -34,7 +34,9 @@ def task_of(record: Record) -> Task:
     Raises:
         InputError: an unknown task.
     """
-    return known_task(record.task, record.source or record.name)
+    if record.task not in TASKS:
+        raise InputError(f"{record.source or record.name}: task {record.task!r}; known are {', '.join(TASKS)}")
+    return TASKS[record.task]
 
 
 def instrument_of(record: Record) -> Instrument:
@@ -44,17 +46,6 @@ def instrument_of(record: Record) -> Instrument:
         InputError: an unknown task, or data without positions, carrier or array.
     """
     return task_of(record).instrument(record)
-
-
-def known_task(name: str, place: str) -> Task:
-    """The task of a name; ``place`` names its source in the message.
-
-    Raises:
-        InputError: an unknown task.
-    """
-    if name not in TASKS:
-        raise InputError(f"{place}: task {name!r}; known are {', '.join(TASKS)}")
-    return TASKS[name]
 
 
 def require(record: Record, *names: str, why: str) -> None:
@@ -67,4 +58,4 @@ def require(record: Record, *names: str, why: str) -> None:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = ["ENTRY_POINTS", "TASKS", "UPLINK", "Task", "instrument_of", "known_task", "register", "require", "task_of"]
+__all__ = ["ENTRY_POINTS", "TASKS", "UPLINK", "Task", "instrument_of", "register", "require", "task_of"]

@@ -7,7 +7,7 @@ from .options import TraceOptions
 from .result import TraceResult, load_trace, recompute, save_trace
 from .scenes import open_scene
 from .solve import trace_paths
-from .tracer import RayTracer, trace_spectra
+from .tracer import RayTracer
 
 __all__ = [
     "RayTracer",
@@ -19,5 +19,4 @@ __all__ = [
     "save_trace",
     "set_frequency",
     "trace_paths",
-    "trace_spectra",
 ]

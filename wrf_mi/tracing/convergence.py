@@ -31,6 +31,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..receivers import rssi_dbm
 from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
+from .result import TraceResult
 from .solve import FIRST_RAYS, Prepared, spread, trace_paths
 
 logger = logging.getLogger(__name__)
@@ -124,42 +125,36 @@ def remainder(changes: Sequence[float]) -> float:
 
 
 class _Sampled:
-    """Received power, and spectra, of sampled transmitters under several settings."""
+    """Received power, and spectra, of sampled transmitters under several settings; ``trials`` lists what was tried."""
 
-    def __init__(
-        self,
-        scene: Any,
-        positions: FloatArray,
-        receivers: Sequence[Receiver],
-        tx_antenna: Antenna,
-        spectra: Spectra | None,
-    ) -> None:
-        self._trace = partial(trace_paths, scene, receivers=receivers, tx_antenna=tx_antenna, prepared=Prepared(scene))
-        self._spectra = spectra
-        self._known: dict[TraceOptions, tuple[FloatArray, FloatArray | None]] = {}
+    def __init__(self, trace: Callable[..., TraceResult], positions: FloatArray, spectra: Spectra | None) -> None:
+        self._trace, self._spectra = trace, spectra
+        self._known: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = {}
         self._positions = positions[spread(len(positions), SAMPLE)]
-        self._few = spread(len(self._positions), SAMPLED_KINDS)
+        self.trials = [Trial("depth", 1, None, True)]
 
     def _reports(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
-        if options not in self._known:
-            here = self._positions[self._few] if options.sampled else self._positions
-            paths = self._trace(here, options=options).paths
-            self._known[options] = rssi_dbm(paths), None if self._spectra is None else np.asarray(self._spectra(paths))
-        power, spectra = self._known[options]
-        if few and not options.sampled:
-            return power[:, self._few], None if spectra is None else spectra[:, self._few]
-        return power, spectra
+        if (options, few) not in self._known:
+            here = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
+            paths = self._trace(tx_pos_m=here, options=options).paths
+            spectra = None if self._spectra is None else np.asarray(self._spectra(paths))
+            self._known[options, few] = rssi_dbm(paths), spectra
+        return self._known[options, few]
 
-    def change(self, options: TraceOptions, other: TraceOptions) -> tuple[float, float | None]:
-        """Largest change between two settings in dB, and that of spectra (relative L2), on the smaller sample."""
+    def change(
+        self, part: str, value: int | bool, options: TraceOptions, other: TraceOptions, share: float = -1.0
+    ) -> float:
+        """Largest change in dB from some settings to others, kept where it is above a share, on the smaller sample."""
         few = options.sampled or other.sampled
         (a, before), (b, after) = self._reports(options, few), self._reports(other, few)
         spectrum = None if before is None or after is None else _relative(before, after)
-        if (np.isnan(a) != np.isnan(b)).any():
-            return float("inf"), spectrum
-        power = float(np.nanmax(np.abs(a - b), initial=0.0))
-        return max(power, float(20 * np.log10(1 + (spectrum or 0.0)))), spectrum
+        change = float("inf")
+        if (np.isnan(a) == np.isnan(b)).all():
+            power = float(np.nanmax(np.abs(a - b), initial=0.0))
+            change = max(power, float(20 * np.log10(1 + (spectrum or 0.0))))
+        self.trials.append(Trial(part, value, change, change > share, spectrum))
+        return change
 
 
 def _relative(a: FloatArray, b: FloatArray) -> float:
@@ -200,60 +195,53 @@ def choose_options(
     """
     if not (np.isfinite(target_db) and target_db > 0):
         raise InputError(f"target-error {target_db}: give a number of dB above 0")
-    devices = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
-    sample = _Sampled(scene, np.atleast_2d(np.asarray(tx_pos_m, float)), devices, tx_antenna, spectra)
-    share, trials = target_db / PARTS, list[Trial]()
-    now, error = _depth(sample, replace(options, diffraction=False, scattering=False), share, trials)
-    now, more = _rays(sample, now, share, trials)
+    trace = partial(trace_paths, scene, receivers=receivers, tx_antenna=tx_antenna, prepared=Prepared(scene))
+    sample = _Sampled(trace, np.atleast_2d(np.asarray(tx_pos_m, float)), spectra)
+    share = target_db / PARTS
+    now, error = _depth(sample, replace(options, diffraction=False, scattering=False), share)
+    now, more = _rays(sample, now, share)
     error += more
     now = replace(now, diffraction=options.diffraction, scattering=options.scattering)
     for kind in CHOSEN_KINDS:
         if kind not in kinds or getattr(options, kind):
             continue
         switched = replace(now, **{kind: True})
-        change, spectrum = sample.change(now, switched)
-        trials.append(Trial(kind, True, change, change > share, spectrum))
+        change = sample.change(kind, True, now, switched, share)
         if change > share:
             now = switched
         else:
             error += change
     if now.sampled:
         # Paths that are drawn at random, or along edges, need more rays.
-        now, more = _rays(sample, now, share, trials, MOST_SAMPLED_RAYS)
+        now, more = _rays(sample, now, share, MOST_SAMPLED_RAYS)
         error += more
     judged = ("power",) if spectra is None else ("power", "spectrum")
-    choice = Choice(now, target_db, error, tuple(trials), judged)
+    choice = Choice(now, target_db, error, tuple(sample.trials), judged)
     if not choice.reached:
         what = "received power is" if spectra is None else "power and spectra are"
         logger.warning("%s converged to %.2g dB, not to the %.2g dB asked for", what, error, target_db)
     return choice
 
 
-def _depth(sample: _Sampled, options: TraceOptions, share: float, trials: list[Trial]) -> tuple[TraceOptions, float]:
+def _depth(sample: _Sampled, options: TraceOptions, share: float) -> tuple[TraceOptions, float]:
     """Options with the converged depth, and the remainder in dB."""
     now, changes = replace(options, max_depth=1, rays=FIRST_RAYS), list[float]()
-    trials.append(Trial("depth", 1, None, True))
     while now.max_depth < MAX_DEPTH:
         deeper = replace(now, max_depth=now.max_depth + 1)
-        change, spectrum = sample.change(now, deeper)
-        changes.append(change)
-        trials.append(Trial("depth", deeper.max_depth, change, True, spectrum))
+        changes.append(sample.change("depth", deeper.max_depth, now, deeper))
         now = deeper
         if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:
             break
     return now, remainder(changes)
 
 
-def _rays(
-    sample: _Sampled, options: TraceOptions, share: float, trials: list[Trial], most: int = MAX_RAYS
-) -> tuple[TraceOptions, float]:
+def _rays(sample: _Sampled, options: TraceOptions, share: float, most: int = MAX_RAYS) -> tuple[TraceOptions, float]:
     """Options with the converged number of rays, and the last change in dB."""
     assert isinstance(options.rays, int)
     now, rays, calm, change = options, options.rays, 0, float("inf")
     while calm < 2 and rays < most:
         rays *= 2
-        change, spectrum = sample.change(now, replace(now, rays=rays))
+        change = sample.change("rays", rays, now, replace(now, rays=rays))
         now = replace(now, rays=rays)
-        trials.append(Trial("rays", rays, change, True, spectrum))
         calm = calm + 1 if change <= share else 0
     return now, change

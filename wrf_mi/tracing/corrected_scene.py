@@ -16,14 +16,12 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..scene.folder import write_scene
 from ..scene.materials import THICKNESS_M, Materials
-from ..scene.surfaces import Kind, Surface
+from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
 from .material_parameters import SURFACE, MaterialGrouping, SlabMaterials, name_of, read_materials, slabs_of_faces
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
 
-SAME_CORNER_M = 1e-4
-"""Distance within which corners of faces coincide and move together: the gap between meshes that meet."""
 FLAT = 0.1
 """Share of the largest singular value below which planes at a corner count as parallel: those within 11 degrees do not
 determine the corner's position along them."""

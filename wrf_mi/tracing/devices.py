@@ -6,14 +6,14 @@ import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from trimesh.triangles import closest_point
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..scene.surfaces import bodies
 from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
@@ -80,14 +80,6 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     return moved
 
 
-def warn_of_moved(positions_m: FloatArray, moved_m: FloatArray, names: Sequence[str]) -> None:
-    """Warn of named antennas that `before_walls` moved from positions [n, 3] to others."""
-    changed = np.flatnonzero((moved_m != positions_m).any(axis=1))
-    if len(changed):
-        text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
-        logger.warning(text, len(changed), len(moved_m), names[changed[0]])
-
-
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `solids`."""
     thing = np.full(len(positions_m), -1)
@@ -98,27 +90,9 @@ def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
 
 def solids(surfaces: Surfaces) -> list[IntArray]:
     """Faces of each closed, consistently oriented body that is an object rather than a room."""
-    count = len(surfaces.triangles)
-    if not count:
-        return []
-    _, corner = np.unique(np.round(surfaces.triangles.reshape(-1, 3), 5), axis=0, return_inverse=True)
-    corner = corner.reshape(-1, 3)
-    ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
-    _, edge, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    # Neighbours of the same orientation run along their common edge in opposite directions.
-    turned = np.bincount(edge.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]))
-    face = np.repeat(np.arange(count), 3)
-    joint = coo_array((np.ones(3 * count), (face, count + edge.reshape(-1))), shape=(count + len(uses),) * 2)
-    _, body = connected_components(joint, directed=False)
-    body = np.unique(body[:count], return_inverse=True)[1].reshape(-1)
-    a, b, c = surfaces.triangles.transpose(1, 0, 2)
-    volume = np.abs(np.bincount(body, (a * np.cross(b, c)).sum(axis=1) / 6))
-    area = np.bincount(body, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-    open_edges = np.bincount(body[face], ((uses != 2) | (turned != 0))[edge.reshape(-1)])
-    thin = (open_edges == 0) & (volume > 0) & (2 * volume < SOLID_M * area)
-    order = np.argsort(body, kind="stable")
-    starts = np.searchsorted(body[order], np.arange(len(thin) + 1))
-    return [order[starts[k] : starts[k + 1]] for k in np.flatnonzero(thin)]
+    area = trimesh.triangles.area(surfaces.triangles)
+    found = bodies(surfaces.triangles)
+    return [face for face, closed, volume in found if closed and 0 < 2 * abs(volume) < SOLID_M * area[face].sum()]
 
 
 def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
@@ -141,12 +115,14 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
-    """Mask of points with a surface within `NEAREST_M`."""
+    """Mask of points with a surface within `NEAREST_M`; bounds of planes include doorways, their triangles do not."""
     close = np.zeros(len(points), bool)
     for point, plane in _pairs_near(surfaces, points):
         for index in np.unique(plane):
-            candidates = point[plane == index]
-            close[candidates] |= _touches(surfaces.triangles[surfaces.plane == index], points[candidates])
+            faces = surfaces.triangles[surfaces.plane == index]
+            for row in point[plane == index]:
+                away = closest_point(faces, np.broadcast_to(points[row], (len(faces), 3))) - points[row]
+                close[row] |= np.linalg.norm(away, axis=1).min() < NEAREST_M
     return close
 
 
@@ -159,15 +135,3 @@ def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArr
         along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
         within = ((along > surfaces.low[plane] - NEAREST_M) & (along < surfaces.high[plane] + NEAREST_M)).all(axis=1)
         yield start + point[within], plane[within]
-
-
-def _touches(triangles: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """Mask of points with a triangle within `NEAREST_M`; bounds of planes include doorways."""
-    nearest = np.full(len(points), np.inf)
-    step = max(1, PAIRS_PER_CHUNK // len(triangles))
-    for start in range(0, len(points), step):
-        part = np.repeat(points[start : start + step], len(triangles), axis=0)
-        every = np.tile(triangles, (len(part) // len(triangles), 1, 1))
-        away = np.linalg.norm(closest_point(every, part) - part, axis=1)
-        nearest[start : start + step] = away.reshape(-1, len(triangles)).min(axis=1)
-    return nearest < NEAREST_M

@@ -10,7 +10,6 @@ Vectors are lists of three Dr.Jit arrays, complex numbers pairs (re, im).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +18,8 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from ..core import Antenna
-from ..core.antenna import ANTENNA, POLE
-from ..gaussians.footprint import Pose
+from ..core.antenna import ANTENNA
+from ..gaussians.footprint import Pose, dot, tangent_basis
 from .slab import slab
 
 ALONG = 1e-12
@@ -28,6 +27,8 @@ ALONG = 1e-12
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
+Tables = tuple[Any, Any, Any, Any]
+"""Permittivity, conductivity, thickness and reflected share [n] of materials, as `SlabMaterials.constants`."""
 
 
 @dataclass
@@ -73,16 +74,6 @@ class Chains:
 
 
 @dataclass
-class Tables:
-    """Tables [n] of materials: relative permittivity, conductivity (S/m), thickness (m), see `SlabMaterials`."""
-
-    permittivity: Any
-    conductivity: Any
-    thickness_m: Any
-    reflected: Any
-
-
-@dataclass
 class EvaluatedPaths:
     """Geometry and gain of q paths.
 
@@ -122,15 +113,15 @@ def evaluate_paths(
     """
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
-        height = dr.select(level.reflects, _dot(image, level.normal) - level.offset_m, 0)
+        height = dr.select(level.reflects, dot(image, level.normal) - level.offset_m, 0)
         image = [x - 2 * height * n for x, n in zip(image, level.normal, strict=True)]
     towards = [x - p for x, p in zip(image, pose.position, strict=True)]
-    length = dr.sqrt(_dot(towards, towards))
+    length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 
     directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
-        back = dr.select(level.reflects, _dot(directions[0], level.normal), 0)
+        back = dr.select(level.reflects, dot(directions[0], level.normal), 0)
         directions.insert(0, [k - 2 * back * n for k, n in zip(directions[0], level.normal, strict=True)])
 
     float_type = type(length)
@@ -150,7 +141,7 @@ def evaluate_paths(
     taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
     return EvaluatedPaths(
-        (_dot(taken, real) * loss, _dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
+        (dot(taken, real) * loss, dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
     )
 
 
@@ -159,19 +150,19 @@ def _interact(
 ) -> tuple[Vector, Vector]:
     """Field (re, im), three arrays [q] each, after a reflection, a transmission, or a place holder."""
     met = level.reflects | level.transmits
-
-    def of(table: Any) -> Any:
-        return dr.gather(type(table), table, level.material)
-
+    permittivity, conductivity, thickness_m, share = (dr.gather(type(t), t, level.material) for t in tables)
     # At place holders the wave comes straight, so that no unused denominator vanishes.
-    cosine = dr.select(met, dr.abs(_dot(before, level.normal)), 1)
-    c = slab(cosine, of(tables.permittivity), of(tables.conductivity), of(tables.thickness_m), frequency_hz)
-    share = of(tables.reflected)
+    cosine = dr.select(met, dr.abs(dot(before, level.normal)), 1)
+    c = slab(cosine, permittivity, conductivity, thickness_m, frequency_hz)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
-    across = _unit_or(_cross(before, level.normal), _any_across(before))
+    across = _cross(before, level.normal)
+    square = dot(across, across)
+    oblique: Any = square > ALONG
+    scale = dr.rsqrt(dr.select(oblique, square, 1))
+    across = [dr.select(oblique, c * scale, a) for c, a in zip(across, tangent_basis(before)[0], strict=True)]
     along_before, along_after = _cross(across, before), _cross(across, after)
-    (s_re, p_re), (s_im, p_im) = ((_dot(part, across), _dot(part, along_before)) for part in field)
+    (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
     s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
     p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
     out = []
@@ -192,55 +183,8 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     Returns:
         Three arrays [q], world frame.
     """
-    x, y, z = (_dot(direction, axis) for axis in axes)
-    square = x * x + y * y
-    pole: Any = square < POLE
-    inverse = dr.rsqrt(dr.select(pole, 1, square))
-    cosine, sine = dr.select(pole, 1, x * inverse), dr.select(pole, 0, y * inverse)
-    level = square * inverse
-    if antenna.polarization == "V":
-        local = [z * cosine, z * sine, -level]
-    else:
-        local = [-sine, cosine, dr.zeros(type(z), dr.width(z))]
-    amplitude = _amplitude(antenna.pattern, level, z, (cosine, sine), pole, inverse)
-    return [sum(amplitude * c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
-
-
-def _amplitude(pattern: str, level: Any, z: Any, azimuth: Complex, pole: Any, inverse: Any) -> Any:
-    """Amplitude [q] of a pattern; ``level`` and ``z``: sine and cosine of the zenith angle, ``inverse``: 1 / level."""
-    if pattern == "iso":
-        return type(z)(1)
-    if pattern == "dipole":
-        return math.sqrt(1.5) * level
-    if pattern == "hw_dipole":
-        return dr.select(pole, 0, math.sqrt(1.643) * dr.cos(np.pi / 2 * z) * inverse)
-    width = math.radians(65)
-    vertical = dr.minimum(12 * dr.square((dr.atan2(level, z) - np.pi / 2) / width), 30)
-    level_db = dr.minimum(12 * dr.square(dr.atan2(azimuth[1], azimuth[0]) / width), 30)
-    return dr.exp(math.log(10) / 20 * (8 - dr.minimum(vertical + level_db, 30)))
-
-
-def _any_across(direction: Vector) -> Vector:
-    """Unit vector across a direction: the part across it of x, or of y near x (as Sionna RT)."""
-    zero, one = (type(direction[0])(value) for value in (0, 1))
-    steep = dr.abs(direction[0]) >= 0.9 * one
-    reference = [dr.select(steep, zero, one), dr.select(steep, one, zero), 0]
-    along = _dot(direction, reference)
-    across = [r - along * k for r, k in zip(reference, direction, strict=True)]
-    scale = dr.rsqrt(_dot(across, across))
-    return [scale * r for r in across]
-
-
-def _unit_or(vector: Vector, other: Vector) -> Vector:
-    """Normalised vector, or ``other`` where it vanishes."""
-    square = _dot(vector, vector)
-    usable: Any = square > ALONG
-    scale = dr.rsqrt(dr.select(usable, square, 1))
-    return [dr.select(usable, v * scale, o) for v, o in zip(vector, other, strict=True)]
-
-
-def _dot(a: Vector, b: Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
+    return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

@@ -38,7 +38,7 @@ class Devices:
     @property
     def angles(self) -> FloatArray:
         """Sionna RT's orientation of each device [n, 3] (alpha, beta, gamma; rad)."""
-        angles = np.array([sionna_orientation(antenna.to_world) for antenna in self.antennas])
+        angles = sionna_orientation([antenna.to_world for antenna in self.antennas])
         return np.broadcast_to(angles, (len(self.position_m), 3))
 
 
@@ -46,18 +46,17 @@ Ends = tuple[Devices, Devices]
 """Sources and targets of a search, or transmitters and receivers."""
 
 
-def sionna_orientation(to_world: ArrayLike) -> tuple[float, float, float]:
-    """Sionna RT's orientation (alpha, beta, gamma; rad) of a device.
+def sionna_orientation(to_world: ArrayLike) -> FloatArray:
+    """Sionna RT's orientation (alpha, beta, gamma; rad) of a device, or of several [n, 3].
 
     Args:
-        to_world: rotation [3, 3] from the device's frame, whose boresight is +x, to the world's; see
-            `wrf_mi.core.Antenna.to_world`.
+        to_world: rotation [3, 3], or rotations [n, 3, 3], from the device's frame, whose boresight is +x, to the
+            world's; see `wrf_mi.core.Antenna.to_world`.
     """
     with warnings.catch_warnings():
         # A device that looks straight up or down has many equivalent angles.
         warnings.filterwarnings("ignore", "Gimbal lock")
-        alpha, beta, gamma = Rotation.from_matrix(to_world).as_euler("ZYX")
-    return float(alpha), float(beta), float(gamma)
+        return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
 
 
 def point_array(points: FloatArray) -> Any:

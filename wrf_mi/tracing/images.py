@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -46,8 +45,13 @@ def specular_paths(
     """
     depth = max(options.max_depth, 1)
     ends = point_array(source_m[None]), point_array(targets_m)
+    direct = np.arange(len(targets_m) if options.line_of_sight else 0)
+    # Chains (-1: none) and targets to test.
+    pairs = [(np.full(len(direct), -1), direct), *possible(surfaces, chains, targets_m)]
+    candidates = [np.concatenate(column) for column in zip(*pairs, strict=True)]
     parts = []
-    for chain, target in _in_parts(surfaces, chains, targets_m, options):
+    for start in range(0, len(candidates[0]), CANDIDATES_PER_CHUNK):
+        chain, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         through = np.zeros((len(chain), chains.plane.shape[1] + 1), np.int64)
         if options.transmission:
             through = _transmissions(scene, surfaces, chains, chain, target, source_m, targets_m, depth)
@@ -60,28 +64,6 @@ def specular_paths(
         same = ((expected < 0) | (np.append(surfaces.plane, -1)[found.face] == expected)).all(axis=1)
         parts.append(_exact(surfaces, chains, chain[kept[same]], found.select(same), source_m, targets_m))
     return join(parts, depth)
-
-
-def _in_parts(
-    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray, options: TraceOptions
-) -> Iterator[tuple[IntArray, IntArray]]:
-    """Chains (-1: none) and targets to test, in chunks."""
-    direct = np.arange(len(targets_m) if options.line_of_sight else 0)
-    waiting = [(np.full(len(direct), -1), direct)]
-    for pairs in possible(surfaces, chains, targets_m):
-        waiting.append(pairs)
-        if sum(len(chain) for chain, _ in waiting) >= CANDIDATES_PER_CHUNK:
-            yield from _split(waiting)
-            waiting = []
-    yield from _split(waiting)
-
-
-def _split(pairs: list[tuple[IntArray, IntArray]]) -> Iterator[tuple[IntArray, IntArray]]:
-    if not pairs:
-        return
-    chain, target = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    for start in range(0, len(chain), CANDIDATES_PER_CHUNK):
-        yield chain[start : start + CANDIDATES_PER_CHUNK], target[start : start + CANDIDATES_PER_CHUNK]
 
 
 def _lengths(chains: ReflectionChains, chain: IntArray) -> IntArray:

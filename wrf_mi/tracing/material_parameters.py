@@ -148,18 +148,3 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
     permittivity, conductivity = named.permittivity[which], named.conductivity[which]
     constants = permittivity, conductivity, named.thickness_m[which], named.reflected[which]
     return SlabMaterials(names, *constants, grouping), slab_of_face
-
-
-def physical(parameters: Mapping[str, NDArray[Any]]) -> dict[str, float]:
-    """Relative permittivities, conductivities (S/m) and thicknesses (m) of ``material.*`` parameters, by these names.
-
-    Names of surfaces end with their number: ``material.surface.permittivity[3]``.
-    """
-    values = {}
-    for name, value in parameters.items():
-        if name.startswith(PREFIX):
-            least = 1.0 if name.endswith(".permittivity") else 0.0
-            several = name.startswith(name_of(SURFACE, ""))
-            for k, exp in enumerate(np.exp(np.ravel(np.asarray(value, float)))):
-                values[f"{name}[{k}]" if several else name] = least + float(exp)
-    return values

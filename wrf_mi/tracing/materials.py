@@ -8,8 +8,7 @@ material, outside of which Sionna RT raises an error. Most building materials be
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -92,34 +91,6 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
             ", ".join(sorted(constant)),
         )
     scene.frequency = frequency_hz
-
-
-@contextmanager
-def with_materials(scene: Any, materials: Mapping[str, tuple[Any, Any]]) -> Iterator[None]:
-    """Set other constants of materials of a ``sionna.rt.Scene`` while the block lasts.
-
-    Args:
-        scene: ``sionna.rt.Scene``.
-        materials: relative permittivity and conductivity (S/m) by name, numbers or Dr.Jit arrays with derivatives.
-
-    Raises:
-        InputError: the scene has no such material.
-    """
-    if unknown := [name for name in materials if name not in scene.radio_materials]:
-        raise InputError(f"scene: no radio material {unknown[0]!r}; it has {', '.join(scene.radio_materials)}")
-    before = []
-    for name, (permittivity, conductivity) in materials.items():
-        material = scene.radio_materials[name]
-        constants = material.relative_permittivity, material.conductivity
-        before.append((material, material.frequency_update_callback, constants))
-        material.frequency_update_callback = None
-        material.relative_permittivity, material.conductivity = permittivity, conductivity
-    try:
-        yield
-    finally:
-        for material, callback, constants in before:
-            material.relative_permittivity, material.conductivity = constants
-            material.frequency_update_callback = callback
 
 
 def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:

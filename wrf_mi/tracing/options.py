@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 from ..core import InputError
 
@@ -78,38 +78,13 @@ KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scatteri
 """Kinds of path in the command's terms."""
 
 
-def with_kinds(
-    options: TraceOptions,
-    kinds: str | None = None,
-    *,
-    max_depth: int | None = None,
-    max_reflections: int | None = None,
-    rays: int | str | None = None,
-    seed: int | None = None,
-) -> TraceOptions:
-    """Options with the command's changes; None keeps the value of ``options``.
-
-    Args:
-        options: options to change.
-        kinds: kinds of path to trace, of `KINDS`, separated by commas; all others are off.
-        max_depth: largest number of interactions per path.
-        max_reflections: largest number of reflections per path.
-        rays: a number, as text or not, or ``"auto"``.
-        seed: seed of the rays.
+def stated_kinds(text: str) -> dict[str, bool]:
+    """Fields of `TraceOptions` that trace the kinds of path, of `KINDS`, in a list separated by commas, and no others.
 
     Raises:
-        InputError: an unknown kind, or a number out of range.
+        InputError: an unknown kind.
     """
-    changes: dict[str, Any] = {}
-    if kinds is not None:
-        asked = [kind.strip() for kind in kinds.split(",")]
-        unknown = [kind for kind in asked if kind not in KINDS]
-        if unknown:
-            raise InputError(f"kind of path {unknown[0]!r}: unknown; choose from {', '.join(KINDS)}")
-        changes |= {kind.replace("-", "_"): kind in asked for kind in KINDS}
-    if rays is not None and rays != "auto":
-        if not str(rays).isdecimal():
-            raise InputError(f'rays {rays!r}: give a whole number, or "auto"')
-        rays = int(rays)
-    given: dict[str, Any] = {"max_depth": max_depth, "max_reflections": max_reflections, "rays": rays, "seed": seed}
-    return replace(options, **changes, **{key: value for key, value in given.items() if value is not None})
+    asked = [kind.strip() for kind in text.split(",")]
+    if unknown := [kind for kind in asked if kind not in KINDS]:
+        raise InputError(f"kind of path {unknown[0]!r}: unknown; choose from {', '.join(KINDS)}")
+    return {kind.replace("-", "_"): kind in asked for kind in KINDS}

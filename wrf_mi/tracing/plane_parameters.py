@@ -88,11 +88,7 @@ class PlaneTables:
         normal, offset = self.moved(parameters)
         result = []
         for level in levels:
-            met = level.reflects | level.transmits
-
-            def of(table: Any, level: Level = level, met: Any = met) -> Any:
-                return dr.gather(Float64, table, level.plane, met)
-
-            tilted = [of(c) for c in normal] if TILT in parameters else level.normal
-            result.append(replace(level, normal=tilted, offset_m=of(offset)))
+            at = level.plane, level.reflects | level.transmits
+            tilted = [dr.gather(Float64, c, *at) for c in normal] if TILT in parameters else level.normal
+            result.append(replace(level, normal=tilted, offset_m=dr.gather(Float64, offset, *at)))
         return result

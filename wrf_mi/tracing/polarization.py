@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,8 @@ def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
     if sample.carriers_hz is not None:  # both at the scene's carrier
         sample = recompute(sample, scene)
     stated = _median_power(sample)
-    turned = _median_power(recompute(sample, scene, rx_antennas=[rx.antenna.turned for rx in traced.receivers]))
+    receivers = tuple(replace(rx, antenna=rx.antenna.turned) for rx in traced.receivers)
+    turned = _median_power(recompute(replace(sample, receivers=receivers), scene))
     tiny = np.finfo(np.float32).tiny
     gain_db = 10 * np.log10(np.maximum(turned, tiny) / np.maximum(stated, tiny))
     return {rx.name: float(g) for rx, g in zip(traced.receivers, gain_db, strict=True) if g >= GAIN_DB}

@@ -20,19 +20,14 @@ from ..core.angles import FloatArray
 from ..gaussians.footprint import Pose, principal_axes
 
 
-def position_name(receiver: Receiver) -> str:
-    """Name of the position parameter [3], metres."""
-    return f"receiver.{receiver.name}.position"
-
-
-def turn_name(receiver: Receiver) -> str:
-    """Name of the rotation parameter [3], rad."""
-    return f"receiver.{receiver.name}.turn"
+def pose_names(receiver: Receiver) -> tuple[str, str]:
+    """Names of the parameters of position [3] in metres and of rotation [3] in rad."""
+    return f"receiver.{receiver.name}.position", f"receiver.{receiver.name}.turn"
 
 
 def pose_parameters(receiver: Receiver) -> dict[str, NDArray[np.float32]]:
     """Parameters of the stated pose: zeros [3] for position and rotation."""
-    return {name: np.zeros(3, np.float32) for name in (position_name(receiver), turn_name(receiver))}
+    return {name: np.zeros(3, np.float32) for name in pose_names(receiver)}
 
 
 def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type: Any) -> Pose:
@@ -49,7 +44,7 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
             return [float_type(0)] * 3
         return [float_type(component(parameters[name], i)) for i in range(3)]
 
-    moved, turned = correction(position_name(receiver)), correction(turn_name(receiver))
+    moved, turned = (correction(name) for name in pose_names(receiver))
     position = [float(x) + t for x, t in zip(receiver.position_m, moved, strict=True)]
     columns = principal_axes([*(0.5 * r for r in turned), float_type(1)])
     stated = receiver.to_world
@@ -59,7 +54,7 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
 
 def moved_m(receiver: Receiver, parameters: Mapping[str, Any]) -> FloatArray:
     """Corrected position of the receiver on the host, [3], metres."""
-    name = position_name(receiver)
+    name = pose_names(receiver)[0]
     shift = dr.detach(parameters[name]).numpy() if name in parameters else np.zeros(3)
     return receiver.position_m + np.asarray(shift, float).reshape(3)
 

@@ -109,20 +109,12 @@ def device_ends(tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], tx_antenn
     return Devices(tx_pos_m, (tx_antenna.mounted(),)), Devices(rx, antennas)
 
 
-def recompute(
-    traced: TraceResult,
-    scene: Any,
-    *,
-    rx_antennas: Sequence[Antenna] | None = None,
-    tx_antenna: Antenna | None = None,
-) -> TraceResult:
+def recompute(traced: TraceResult, scene: Any) -> TraceResult:
     """Recompute the gains of paths with the scene's present materials and frequency, without tracing again.
 
     Args:
-        traced: from `wrf_mi.tracing.trace_paths` or `load_trace`.
+        traced: from `wrf_mi.tracing.trace_paths` or `load_trace`, perhaps with other antennas.
         scene: a ``sionna.rt.Scene`` of the same geometry.
-        rx_antennas: new antennas of the receivers; None: the traced ones.
-        tx_antenna: new antenna of the transmitters; None: the traced one.
 
     Returns:
         The paths with the new gains.
@@ -130,11 +122,6 @@ def recompute(
     Raises:
         InputError: the scene lacks an object that a path meets.
     """
-    if rx_antennas is not None:
-        pairs = zip(traced.receivers, rx_antennas, strict=True)
-        traced = replace(traced, receivers=tuple(replace(receiver, antenna=antenna) for receiver, antenna in pairs))
-    if tx_antenna is not None:
-        traced = replace(traced, tx_antenna=tx_antenna)
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
         gain = path_gains(scene, surfaces, traced.legs(surfaces), traced.ends(), traced.rays)

@@ -17,6 +17,7 @@ from ..core import InputError
 from ..core.files import one_line
 from ..scene.folder import FACTS_FILE, read_scene_folder
 from ..scene.materials import FILE as MATERIALS_FILE
+from ..scene.surfaces import mesh_parts
 from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
@@ -63,7 +64,12 @@ def open_scene(
     if not mesh and material is not None:
         raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
     scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
-    _check_size(scene, source)
+    if not scene.objects:
+        raise InputError(f"{source}: holds no surface; give a scene with triangles")
+    bounds = scene.mi_scene.bbox()
+    if (height := float(bounds.max.z - bounds.min.z)) > HIGHEST_M:
+        text = f"{height:.0f} m high, as if in millimetres"
+        raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
     set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})})
     return scene
 
@@ -72,7 +78,7 @@ def _folder(folder: Path) -> tuple[Path, Mapping[str, float]]:
     """Scene file and thicknesses of a scene folder, from a scan or like those that come with the package."""
     if (folder / MATERIALS_FILE).is_file():
         read = read_scene_folder(folder)
-        return read.xml, read.thickness_m
+        return read.xml, read.materials.thickness_m
     try:
         facts = yaml.safe_load((folder / FACTS_FILE).read_text(encoding="utf-8"))
         return folder / facts["xml"], facts.get("thickness_m", {})
@@ -109,12 +115,7 @@ def _from_mesh(path: Path, material: str) -> Any:
             raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {known}")
         kind = name.removeprefix("itu_")
         radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
-    try:
-        loaded: list[Any] = trimesh.load_scene(str(path)).dump()
-        parts = [part for part in loaded if len(getattr(part, "faces", ()))]
-    except Exception as error:  # trimesh's readers raise a dozen types on damaged files
-        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    scene = rt.load_scene()
+    parts, scene = mesh_parts(path), rt.load_scene()
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
@@ -126,12 +127,3 @@ def _from_mesh(path: Path, material: str) -> Any:
         if objects:
             scene.edit(add=objects)
     return scene
-
-
-def _check_size(scene: Any, source: str | Path) -> None:
-    if not scene.objects:
-        raise InputError(f"{source}: holds no surface; give a scene with triangles")
-    height = float(scene.mi_scene.bbox().max.z - scene.mi_scene.bbox().min.z)
-    if height > HIGHEST_M:
-        text = f"{height:.0f} m high, as if in millimetres"
-        raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")

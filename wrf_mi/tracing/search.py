@@ -21,6 +21,9 @@ RAYS_PER_CHUNK = 1 << 20
 END_M = 1e-4
 """Distance from the end of a segment within which a hit is the surface that reflects there."""
 
+MARGIN_M = 1e-3
+"""Slack of the bounds of planes."""
+
 
 @dataclass(frozen=True)
 class ReflectionChains:
@@ -142,17 +145,14 @@ def unique_chains(sequence: IntArray) -> IntArray:
 
 
 def _unique_rows(rows: IntArray) -> IntArray:
-    """Distinct rows in lexical order, coded as numbers: ten times faster than `numpy.unique(axis=0)`."""
-    code, width = np.zeros(len(rows), np.int64), int(rows.max(initial=-1)) + 2
-    for level in range(rows.shape[1]):
-        if int(code.max(initial=0)) >= np.iinfo(np.int64).max // width - 1:
-            code = np.unique(code, return_inverse=True)[1].reshape(-1)
-        code = code * width + rows[:, level] + 1
-    return rows[np.unique(code, return_index=True)[1]]
+    """Distinct rows in lexical order, several times faster than `numpy.unique(axis=0)`."""
+    ordered = rows[np.lexsort(rows.T[::-1])]
+    repeated = (ordered[1:] == ordered[:-1]).all(axis=1)
+    return ordered[np.flatnonzero(~np.append(len(rows) == 0, repeated))]
 
 
 def possible(
-    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray, margin_m: float = 1e-3
+    surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
 
@@ -162,7 +162,6 @@ def possible(
         surfaces: surfaces of the scene.
         chains: chains from one source.
         targets_m: positions [n, 3], metres.
-        margin_m: slack of the bounds.
 
     Yields:
         Indices of chains and of targets, in chunks.
@@ -179,8 +178,8 @@ def possible(
         to_float(surfaces.offset),
         to_vectors(surfaces.axes[:, 0], mi.Vector3f),
         to_vectors(surfaces.axes[:, 1], mi.Vector3f),
-        to_vectors(surfaces.low - margin_m, mi.Point2f),
-        to_vectors(surfaces.high + margin_m, mi.Point2f),
+        to_vectors(surfaces.low - MARGIN_M, mi.Point2f),
+        to_vectors(surfaces.high + MARGIN_M, mi.Point2f),
     )
     step = max(1, PAIRS_PER_CHUNK // count)
     for reflections in range(1, chains.plane.shape[1] + 1):

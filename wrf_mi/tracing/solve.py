@@ -17,7 +17,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from .buffer import Legs, join
-from .devices import before_walls, check_devices, warn_of_moved
+from .devices import before_walls, check_devices
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
@@ -66,14 +66,13 @@ class Prepared:
         """
         names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
         names += [f"receiver {receiver.name}" for receiver in receivers]
-        traced_tx, traced_rx = self.placed(tx_pos_m, receivers)
-        stated, traced = (
-            np.concatenate([tx, [receiver.position_m for receiver in rx]])
-            for tx, rx in ((tx_pos_m, receivers), (traced_tx, traced_rx))
-        )
+        stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
+        traced = before_walls(self.surfaces, stated)
         for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
             new = [row for row in side if stated[row].tobytes() not in self._checked]
-            warn_of_moved(stated[new], traced[new], [names[row] for row in new])
+            if moved := [row for row in new if (stated[row] != traced[row]).any()]:
+                text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
+                logger.warning(text, len(moved), len(new), names[moved[0]])
             check_devices(self.surfaces, traced[new], [names[row] for row in new])
             self._checked.update(stated[row].tobytes() for row in side)
 

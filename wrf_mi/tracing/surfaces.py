@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
@@ -95,13 +96,10 @@ def find_planes(
 
     The second step joins a wall with its slivers, whose normals are inexact.
     """
-    corner, centre = triangles[:, 0], triangles.mean(axis=1)
-    cross = np.cross(triangles[:, 1] - corner, triangles[:, 2] - corner)
-    double_area = np.linalg.norm(cross, axis=1)
-    area = double_area / 2
-    normal = np.divide(
-        cross, double_area[:, None], out=np.tile([0.0, 0.0, 1.0], (len(cross), 1)), where=area[:, None] > 0
-    )
+    centre, cross = triangles.mean(axis=1), trimesh.triangles.cross(triangles)
+    area = np.linalg.norm(cross, axis=1)[:, None] / 2
+    normal = np.divide(cross, 2 * area, out=np.tile([0.0, 0.0, 1.0], (len(cross), 1)), where=area > 0)
+    area = area[:, 0]
     largest = np.abs(normal).argmax(axis=1)[:, None]
     normal *= np.sign(np.take_along_axis(normal, largest, axis=1))  # both sides of a sheet have one normal
     offset = (normal * centre).sum(axis=1)

@@ -8,7 +8,7 @@ Everything is float64 over planes in float64, so that phases k d are exact to 1e
 float32 corners of its files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
-further than ``search_again_m`` (a quarter of a wavelength) from the position of the search; `TracedField.refresh` then
+further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
 searches again. Planes that move keep their paths (see `wrf_mi.tracing.plane_parameters`).
 """
 
@@ -32,7 +32,7 @@ from ..core.types import IntArray
 from ..gaussians.footprint import Pose
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
-from .field_calculator import Chains, Complex, Level, Tables, Vector, evaluate_paths
+from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .material_parameters import MaterialGrouping, slabs_of_faces
 from .pattern_parameters import pattern_coefficients, pattern_factor
 from .plane_parameters import PlaneTables
@@ -53,8 +53,6 @@ class TracedOptions:
         pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
             `wrf_mi.tracing.pattern_parameters`).
         gain: initial amplitude factor of all paths, from the channel's units to the instrument's.
-        search_again_m: distance of the receiver from the last search beyond which paths are searched again; None: a
-            quarter of a wavelength.
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
@@ -67,7 +65,6 @@ class TracedOptions:
     trace: TraceOptions = field(default_factory=TraceOptions)
     pattern_degree: int = 0
     gain: float = 1.0
-    search_again_m: float | None = None
     tx_antenna: Antenna = ANTENNA
     materials: MaterialGrouping = "named"
     thickness: bool = False
@@ -158,8 +155,6 @@ class TracedField:
         self._prepared = prepared
         self.frequency_hz = float(scene.frequency[0])
         self.searches = 0
-        quarter_m = speed_of_light / self.frequency_hz / 4
-        self._again_m = quarter_m if options.search_again_m is None else options.search_again_m
         self.surfaces: Surfaces = scene_surfaces(scene)
         self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
         self._constants = self.slabs.constants(Float64)
@@ -218,7 +213,7 @@ class TracedField:
             Whether paths were searched.
         """
         here = moved_m(self.receiver, parameters)
-        if np.linalg.norm(here - self.searched_at_m) <= self._again_m:
+        if np.linalg.norm(here - self.searched_at_m) <= speed_of_light / self.frequency_hz / 4:
             return False
         self.search(here)
         return True
@@ -237,8 +232,7 @@ class TracedField:
             row = dr.gather(mi.UInt32, rows, slot // self._each)
             chains = chains.select(row * self._each + slot % self._each)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        stated, reflected = self._constants[:3], self._constants[3]
-        tables = Tables(*self.slabs.tables(parameters, stated), reflected)
+        tables = (*self.slabs.tables(parameters, self._constants[:3]), self._constants[3])
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
@@ -283,7 +277,7 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         tx, used = traced.paths.tx, types != 0
-        material = self._slab(face, used)
+        material = self._slab(face)
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
         count = len(self) * each
@@ -299,7 +293,7 @@ class TracedField:
 
         levels = []
         for k in range(types.shape[1] if used.any() else 0):
-            plane = np.where(used[:, k], surfaces.plane[np.where(used[:, k], face[:, k], 0)], 0)
+            plane = np.append(surfaces.plane, 0)[face[:, k]]
             normal = surfaces.normal[plane] * used[:, k, None]
             levels.append(
                 Level(
@@ -319,11 +313,9 @@ class TracedField:
             levels,
         )
 
-    def _slab(self, face: IntArray, used: NDArray[np.bool_]) -> IntArray:
-        """Index of the material at each interaction, 0 for none."""
-        if not used.any():
-            return np.zeros(face.shape, np.int64)
-        number = np.where(used, self._slab_of_face[np.where(used, face, 0)], 0)
+    def _slab(self, face: IntArray) -> IntArray:
+        """Index of the material at each interaction, 0 for none (face -1)."""
+        number = np.append(self._slab_of_face, 0)[face]
         if (number < 0).any():
             index = self.surfaces.object_of(face[number < 0][:1])[0]
             name = self.surfaces.names[index]

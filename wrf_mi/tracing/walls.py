@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import trimesh
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -98,8 +99,7 @@ def plane_centres(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
     """Centroids of the planes' faces, [q, 3] in metres, and the faces' areas [q] in square metres."""
     triangles, plane = surfaces.triangles, surfaces.plane
     count = len(surfaces.normal)
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = np.linalg.norm(cross, axis=1) / 2
+    area = trimesh.triangles.area(triangles)
     total = np.asarray(np.bincount(plane, area, minlength=count), float)
     centre = (
         np.stack([np.bincount(plane, area * c, minlength=count) for c in triangles.mean(axis=1).T], axis=1)

@@ -69,11 +69,6 @@ class Compression:
         if self.precision not in PRECISIONS:
             raise InputError(f"precision {self.precision!r}: unknown; choose from {', '.join(PRECISIONS)}")
 
-    @property
-    def other_network(self) -> bool:
-        """Whether the network is replaced."""
-        return bool(self.width or self.layers or self.terms)
-
 
 def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, split: Split) -> NDArray[np.float64]:
     """Mean |change| of a pixel over training views when a Gaussian is removed, [n].
@@ -89,7 +84,7 @@ def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, s
         pose = device_pose(receiver)
         for row in rows:
             gaussians = field.gaussians(tensors, to_tensor(record.tx_pos_m[row][:, None]))
-            total += removal(gaussians, pose, plane).numpy().astype(float)
+            total += removal(gaussians, pose, plane)
     return total / (len(rows) * len(record.receivers) * plane.pixels)
 
 
@@ -180,7 +175,7 @@ def compress(
     if how.budget:
         score = importance(config, params, record, split)
         params = prune(params, make_field(config).per_gaussian, score, how.budget)
-    if how.other_network:
+    if how.width or how.layers or how.terms:  # the network is replaced
         config, params = _exchanged(config, params, how)
         if how.distil:
             taught = _taught(*teacher, record, split)

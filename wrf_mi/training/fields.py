@@ -21,33 +21,25 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
     Raises:
         InputError: no trainable model of that name, unsuitable settings, or an unresolved scale of transmitters.
     """
-    if config.model not in FIELDS:
-        raise InputError(f"model {config.model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
-    e = config.encoding
+    model, e, n = config.model, config.encoding, config.network
+    if model not in FIELDS:
+        raise InputError(f"model {model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
     if not e.tx_scale_m:
         raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
+    plus = model == "wrf-gs+"
+    for wrong, text in (
+        (n.static_geometry and not plus, f"static_geometry: {model} always moves signals alone"),
+        (n.phase_hz and not plus, f"phase_hz: {model} has no such phase"),
+        (n.phase_hz and (components > 1 or features), "phase_hz: needs one signal a Gaussian and positions"),
+        (n.terms and model != "factorised", f"terms: {model} has none"),
+    ):
+        if wrong:
+            raise InputError(f"setting network.{text}; omit it")
+    sizes: dict[str, Any] = {name: getattr(n, name) for name in ("width", "layers", "terms") if getattr(n, name)}
+    if model == "wrf-gs" and n.width:
+        sizes["signal_widths"] = (n.width, max(1, n.width // 2))
+    if plus:
+        sizes |= {"static_geometry": n.static_geometry, "phase_hz": n.phase_hz}
+        sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features)
-    n = config.network
-    sizes: dict[str, Any] = {"components": components}
-    if n.width:
-        sizes["width"] = n.width
-    if n.layers:
-        sizes["layers"] = n.layers
-    if n.static_geometry and config.model != "wrf-gs+":
-        raise InputError(f"setting network.static_geometry: {config.model} always moves signals alone; omit it")
-    if config.model == "wrf-gs":
-        if n.width:
-            sizes["signal_widths"] = (n.width, max(1, n.width // 2))
-    elif config.model == "wrf-gs+":
-        if n.layers:
-            sizes["skip"] = n.layers // 2
-        sizes["static_geometry"], sizes["phase_hz"] = n.static_geometry, n.phase_hz
-    if n.phase_hz and config.model != "wrf-gs+":
-        raise InputError(f"setting network.phase_hz: {config.model} has no such phase; omit it")
-    if n.phase_hz and (components > 1 or features):
-        raise InputError("setting network.phase_hz: needs one signal a Gaussian and positions; omit it")
-    if n.terms:
-        if config.model != "factorised":
-            raise InputError(f"setting network.terms: {config.model} has none; omit it")
-        sizes["terms"] = n.terms
-    return FIELDS[config.model](encoding=encoding, **sizes)
+    return FIELDS[model](encoding=encoding, components=components, **sizes)

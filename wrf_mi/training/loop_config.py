@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-from ..core.settings import Count, Share, ShareBelow1, check
+from ..core.settings import CheckedSettings, Count, Share, ShareBelow1
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class AdamConfig:
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(CheckedSettings):
     """Settings of `wrf_mi.training.loop.TrainingLoop`.
 
     Attributes:
@@ -52,14 +52,6 @@ class LoopConfig:
     log_every: Count = 100
     validate_every: Count = 1000
     optimiser: AdamConfig = field(default_factory=AdamConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse values that no fit can use.
-
-        Raises:
-            InputError: naming the setting.
-        """
-        check(self)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..gaussians.chunks import CHUNK_SIZE
 from ..gaussians.parameters import Gaussians
 from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import perception_plane
@@ -27,8 +28,8 @@ from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
-from .static_operator import StaticOperator, stands_still
-from .step import CompiledPredictor, Params, device_pose, evaluated
+from .static_operator import StaticOperator
+from .step import Params, device_pose, evaluated
 
 if TYPE_CHECKING:
     from ..tracing.traced_field import TracedField
@@ -77,8 +78,9 @@ class Predictor:
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._skip, self._count = field, skip, -1
-        self._by_operator, self._store = operator and self._pixels and stands_still(field), store
-        self._reports: dict[int, Recorded] = {}
+        self._by_operator, self._store = operator and self._pixels and getattr(field, "static_geometry", False), store
+        self._reports: dict[int | None, Recorded] = {}
+        self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
 
@@ -87,7 +89,6 @@ class Predictor:
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
             # A recording is valid for one number of Gaussians.
-            self._predict = None if self._field is None else CompiledPredictor(self._field, self._skip)
             self._count, self._reports = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
@@ -95,55 +96,37 @@ class Predictor:
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
-        return self._gaussians.gaussians(self._params, to_tensor(columns)).spread()
-
-    @property
-    def _gaussians(self) -> Field:
         if self._field is None:
             raise ValueError("paths alone: there are no Gaussians")
-        return self._field
+        return self._field.gaussians(self._params, to_tensor(columns)).spread()
 
     def static_geometry(self) -> StaticOperator:
         """The field as operators; rebuilt when parameters change."""
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
+            assert self._field is not None, "an operator needs Gaussians"
             size = self._plane.height, self._plane.width
-            self._still = StaticOperator(self._gaussians, params, self.receivers, *size, self._store)
+            self._still = StaticOperator(self._field, params, self.receivers, *size, self._store)
         return self._still
-
-    @property
-    def uses_heading(self) -> bool:
-        """Whether predictions depend on the transmitters' headings: a trained pattern turns with them."""
-        return self.graph.form.headings
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
         """Predictions [m, ...] for rows of a record at one receiver (`__call__`)."""
         uplink = None if record.uplink is None else record.uplink[rows]
-        heading = record.tx_heading_rad[rows] if self.uses_heading and record.tx_heading_rad is not None else None
-        return self(record.tx_pos_m[rows], receiver, uplink, heading)
+        turned = record.tx_heading_rad if self.graph.form.headings else None
+        return self(record.tx_pos_m[rows], receiver, uplink, None if turned is None else turned[rows])
 
     def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
         """Checked headings, or None where they are not used."""
-        if (tx_heading_rad is not None) != self.uses_heading:
-            text = "needs headings; give heading_rad"
-            if not self.uses_heading:
-                text = "does not know how the transmitter is turned; omit heading_rad"
-            raise InputError(f"transmitter: the model {text}")
+        used = self.graph.form.headings  # a trained pattern turns with them
+        if (tx_heading_rad is not None) != used:
+            unused = "does not know how the transmitter is turned; omit heading_rad"
+            raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")
         if tx_heading_rad is None:
             return None
         heading = np.asarray(tx_heading_rad, float)
         if heading.shape != (count,) or not np.isfinite(heading).all():
             raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
         return heading
-
-    def _traced(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, weight: NDArray[Any] | None
-    ) -> Any:
-        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
-        side = self.graph.trace(tx_pos_m, receiver, heading_rad)
-        if side is not None:
-            side.refresh(self._params)
-        return self._evaluated(tx_pos_m, receiver, side, None, weight)
 
     def _evaluated(
         self,
@@ -153,6 +136,7 @@ class Predictor:
         slots: IntArray | None,
         weight: NDArray[Any] | None,
     ) -> Any:
+        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         learned = side is None or weight is None or bool(np.any(weight))
         report, pose = self.graph.report(receiver, side, learned, self._skip), self._poses[receiver]
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
@@ -179,8 +163,17 @@ class Predictor:
         return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """Report for conditions [3 or features, at most `TOGETHER`], recorded, flat."""
-        if receiver not in self._reports:
+        """Report for conditions [3 or features, at most `TOGETHER`], flat.
+
+        It is recorded, except for so many Gaussians that networks run in chunks: recording saves nothing there, and
+        lists of tiles, which a recorded function cannot count, have room for all.
+        """
+        pose, count = self._poses[receiver], condition.shape[1]
+        if self._count * self._together > CHUNK_SIZE:
+            report = self.graph.report(receiver, None, skip=self._skip, chunked=True)
+            return evaluated(report, self._params, condition, receiver, pose, self._plane, weight=weight)
+        key = None if self._pixels else receiver  # one recording serves the pixels of all receivers
+        if key not in self._reports:
             report = self.graph.report(receiver, None, skip=self._skip)
 
             def predicted(params: Params, batch: Batch) -> Any:
@@ -188,17 +181,19 @@ class Predictor:
                     return report(params, batch)
 
             # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(report, self._params, condition[:, :1], receiver, self._poses[receiver], self._plane)
-            self._reports[receiver] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
+            evaluated(report, self._params, condition[:, :1], receiver, pose, self._plane)
+            self._reports[key] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
         # The batch size is a constant of the recorded kernels: copies fill the last batch.
-        count = condition.shape[1]
-        filled = np.minimum(np.arange(TOGETHER), count - 1)
-        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, TOGETHER)
+        filled = np.minimum(np.arange(self._together), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, self._together)
         dr.make_opaque(slots)
         weights = None if weight is None else to_float(weight[filled])
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, receiver), self._poses[receiver], self._plane, weights)
-        found = self._reports[receiver](self._params, batch)
-        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // TOGETHER)))
+        found = self._reports[key](
+            self._params, Batch(tx, slots, dr.opaque(mi.UInt32, receiver), pose, self._plane, weights)
+        )
+        if count == self._together:
+            return found
+        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // self._together)))
 
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Reports for positions [m, 3] or features [m, features], complex numbers as such."""
@@ -217,7 +212,10 @@ class Predictor:
             weights = None if weight is None else weight[part]
             if self._recordable:
                 return self._learned(given[part].T, receiver, weights)
-            return self._traced(given[part], receiver, None if heading_rad is None else heading_rad[part], weights)
+            side = self.graph.trace(given[part], receiver, None if heading_rad is None else heading_rad[part])
+            if side is not None:
+                side.refresh(self._params)
+            return self._evaluated(given[part], receiver, side, None, weights)
 
         return self._in_parts(len(given), receiver, evaluate)
 
@@ -227,7 +225,7 @@ class Predictor:
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
         out = np.empty((count, *shape), np.float32)
-        together = TOGETHER if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
+        together = self._together if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
         for start in range(0, count, together):
             part = slice(start, min(start + together, count))
             out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
@@ -253,7 +251,7 @@ class Predictor:
             receiver: name, or number from 0, of one of ``receivers``.
             uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them instead of
                 positions.
-            tx_heading_rad: yaw of each transmitter [m], radians, if and only if ``uses_heading``.
+            tx_heading_rad: yaw of each transmitter [m], radians, if and only if the form has ``headings``.
 
         Returns:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
@@ -277,15 +275,7 @@ class Predictor:
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
-        if not self._pixels:
-            given = np.asarray(tx_pos_m, float)
-            turned = self._headings(tx_heading_rad, len(given))
-            self.graph.check(given)
-            return self._reported(given, index, turned)
-        height, width = self._plane.height, self._plane.width
-        out = np.empty((len(positions), height, width), np.float32)
-        assert self._predict is not None, "a field of pixels"
-        for image, position in zip(out, positions, strict=True):
-            tx = to_tensor(position[:, None])
-            image[:] = self._predict(self._params, tx, self._poses[index], self._plane).numpy().reshape(height, width)
-        return out
+        given = np.asarray(tx_pos_m, float)
+        turned = self._headings(tx_heading_rad, len(given))
+        self.graph.check(given)
+        return self._reported(given, index, turned)

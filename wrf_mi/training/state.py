@@ -15,6 +15,8 @@ from ..backend.device import to_float, to_tensor
 from ..gaussians.density import DensityChange
 
 Arrays = dict[str, NDArray[Any]]
+KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m")
+"""Attributes that a checkpoint stores under their names."""
 
 
 class FitState:
@@ -128,15 +130,8 @@ class FitState:
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        scalars = {
-            "step": self.step,
-            "chosen": self.chosen,
-            "adam_step": count,
-            "view_gradient_steps": self.view_gradient_steps,
-        }
-        flat |= {"view_gradient_norm": self.view_gradient_norm.numpy().copy(), "reach_m": np.asarray(self.reach_m)}
-        flat |= {"searched_m": self.searched_m.copy()}
-        return flat | {name: np.asarray(value) for name, value in scalars.items()}
+        own = {name: np.array(getattr(self, name)) for name in KEPT}
+        return flat | own | {"adam_step": np.asarray(count)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
@@ -150,10 +145,8 @@ class FitState:
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
         state.view_gradient_steps, state.reach_m = int(arrays["view_gradient_steps"]), float(arrays["reach_m"])
-        state.view_gradient_norm, state.searched_m = (
-            to_float(arrays["view_gradient_norm"]),
-            np.array(arrays["searched_m"]),
-        )
+        state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
+        state.searched_m = np.array(arrays["searched_m"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

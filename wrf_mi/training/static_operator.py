@@ -15,18 +15,17 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .. import __version__
 from ..backend.device import to_tensor
-from ..backend.recorded import Recorded
 from ..core import Receiver
 from ..core.files import write_arrays
 from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights
-from ..gaussians.static_signals import ComplexArray, Signals, host_signals
+from ..gaussians.static_signals import static_signals
 from ..gaussians.tiles import perception_plane
 from .step import Field, device_pose
 
@@ -34,35 +33,6 @@ FORMAT = 1
 """Version of the file."""
 MOST_BYTES = 1 << 30
 """Largest size of one receiver's weights; larger fields are evaluated directly."""
-
-
-def stands_still(field: Any) -> bool:
-    """Whether geometry and attenuation of a field are the same for all transmitters."""
-    return bool(getattr(field, "static_geometry", False))
-
-
-class RecordedSignals:
-    """Signals of a field with static geometry, by its Dr.Jit function (`wrf_mi.gaussians.static_signals.Signals`)."""
-
-    factors: ComplexArray | None = None
-
-    def __init__(self, field: Field, params: Mapping[str, NDArray[np.float32]]) -> None:
-        self._params = {name: to_tensor(values) for name, values in params.items()}
-
-        @Recorded
-        def signals(params: Mapping[str, Any], tx_pos: Any) -> Any:
-            with dr.suspend_grad():
-                return field.gaussians(params, tx_pos).signal
-
-        self._signals = signals
-
-    def coefficients(self, tx_pos_m: ArrayLike) -> ComplexArray:
-        """Signals [m, n] of transmitters [m, 3] in metres."""
-        rows = []
-        for position in np.asarray(tx_pos_m, np.float32):
-            re, im = self._signals(self._params, to_tensor(position[:, None]))
-            rows.append(re.numpy() + np.complex64(1j) * im.numpy())
-        return np.stack(rows)
 
 
 class StaticOperator:
@@ -79,18 +49,15 @@ class StaticOperator:
     ) -> None:
         self._field, self._params, self._receivers = field, params, tuple(receivers)
         self._size, self._folder = (height, width), folder
-        self._signals: Signals = host_signals(field, params) or RecordedSignals(field, params)
+        self._factors, self._coefficients = static_signals(field, params)
         self._ready: dict[int, Images | PixelOperator] = {}
 
     def __call__(self, tx_pos_m: NDArray[np.float32], receiver: int) -> NDArray[np.float32]:
         """Greys [m, height, width] of transmitters [m, 3]."""
         if receiver not in self._ready:
-            weights = self.weights(receiver)
-            operator: Images | PixelOperator = PixelOperator(weights, *self._size)
-            if self._signals.factors is not None:
-                operator = PixelOperator(weights, *self._size).composed(self._signals.factors)
-            self._ready[receiver] = operator
-        return self._ready[receiver].magnitude(self._signals.coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
+            operator = PixelOperator(self.weights(receiver), *self._size)
+            self._ready[receiver] = operator if self._factors is None else operator.composed(self._factors)
+        return self._ready[receiver].magnitude(self._coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
 
     def key(self, receiver: int) -> str:
         """Digest of everything that the weights at a receiver depend on."""

@@ -21,7 +21,6 @@ from ..backend.device import on_device, to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core import Receiver
 from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..gaussians.chunks import CHUNK_SIZE, gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
 from ..gaussians.skip import NOTHING, Skip
@@ -37,11 +36,11 @@ CENTRES = "position"
 """Parameter [3, n] of every field with Gaussians."""
 
 
-def device_pose(receiver: Receiver) -> Pose:
-    """A receiver's pose as opaque device arrays."""
+def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
+    """A receiver's pose as opaque device arrays of ``float_type``, by default ``mi.Float``."""
 
     def number(x: float) -> Any:
-        return dr.opaque(mi.Float, float(x))
+        return dr.opaque(float_type or mi.Float, float(x))
 
     return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
 
@@ -190,34 +189,3 @@ def evaluated(
         found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights))
         dr.eval(found)
     return found
-
-
-class CompiledPredictor:
-    """A prediction ``predict(params, tx_pos, pose, plane) -> greys`` of a field, without gradients.
-
-    It is recorded, except for fields whose number of Gaussians needs chunks (`gaussians_in_parts`): recording saves
-    nothing there, and lists of tiles, which a recorded function cannot count, have room for all.
-    """
-
-    def __init__(self, field: Field, skip: Skip = NOTHING) -> None:
-        self._field, self._skip = field, skip
-
-        @Recorded
-        def recorded(params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
-            with dr.suspend_grad():
-                return grey(field, params, tx_pos, pose, plane, skip)
-
-        self._recorded = recorded
-
-    def __call__(self, params: Params, tx_pos: Any, pose: Pose, plane: Plane) -> Any:
-        """Greys [batch * height * width]."""
-        if params["position"].shape[1] * tx_pos.shape[1] <= CHUNK_SIZE:
-            return self._recorded(params, tx_pos, pose, plane)
-        with dr.suspend_grad():
-            re, im = splat(gaussians_in_parts(self._field, params, tx_pos), pose, plane, self._skip)
-            return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
-
-    @property
-    def n_recordings(self) -> int:
-        """Number of recordings."""
-        return self._recorded.n_recordings

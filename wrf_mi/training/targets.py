@@ -70,7 +70,8 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
     channels = seen[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
     truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
     known = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
-    return Targets(np.asarray(features.T, float), truth, np.array([_rms(truth[0, known])]), outputs.antennas)
+    unit = float(np.sqrt(2 * np.mean(np.square(truth[0, known], dtype=float)))) or 1.0
+    return Targets(np.asarray(features.T, float), truth, np.array([unit]), outputs.antennas)
 
 
 def _weights(record: Record, rows: IntArray) -> FloatArray | None:
@@ -85,10 +86,6 @@ def _weights(record: Record, rows: IntArray) -> FloatArray | None:
     inverse = np.sqrt(precision)
     weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
     return weight
-
-
-def _rms(values: NDArray[np.float32]) -> float:
-    return float(np.sqrt(2 * np.mean(np.square(values, dtype=float)))) or 1.0
 
 
 def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:

@@ -140,19 +140,24 @@ def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path)
 
 
 def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
+    from sklearn.ensemble import ExtraTreesRegressor
+
     from wrf_mi.models.interpolation.trees import GrownTrees, Trees
 
     record = load(flat_folder)
     rng = np.random.default_rng(2)
     positions, heading = rng.uniform(0, 5, (400, 3)), rng.uniform(-3, 3, 400)
     for turned_by in (None, heading):
-        model = Trees(30, 2).fit(positions, np.sin(positions[:, 0]).astype(np.float32), turned_by)
-        kept = GrownTrees.from_arrays(model.grown().arrays())
+        values, columns = np.sin(positions[:, 0]).astype(np.float32), [positions]
+        columns += [] if turned_by is None else [np.cos(heading)[:, None], np.sin(heading)[:, None]]
+        model = ExtraTreesRegressor(30, min_samples_leaf=2, random_state=0).fit(np.hstack(columns), values)
+        kept = GrownTrees(**Trees(30, 2).fit(positions, values, turned_by).arrays())
         # At thresholds, where single precision decides the side.
         edge = np.resize(record.tx_pos_m, (300, 3))
         edge[:, 0] = np.resize(kept.threshold[(kept.feature == 0) & (kept.left != kept.right)], 300)
         asked = edge, None if turned_by is None else np.resize(record.tx_heading_rad, 300)
-        np.testing.assert_allclose(kept.predict(*asked), model.predict(*asked), atol=1e-6)  # sums in another order
+        columns = [edge] if asked[1] is None else [edge, np.cos(asked[1])[:, None], np.sin(asked[1])[:, None]]
+        np.testing.assert_allclose(kept.predict(*asked), model.predict(np.hstack(columns)), atol=1e-6)
 
 
 def test_published_figure_of_mri(tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ from small_fits import network_settings
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.method import Method, inputs_of
+from wrf_mi.models import Model, Problem
+from wrf_mi.models.model import inputs_of
 from wrf_mi.models.networks import dcgan, nerf2, vae
 from wrf_mi.models.networks.dcgan import DcganSettings
 from wrf_mi.models.networks.nerf2 import Nerf2Settings
@@ -46,11 +47,11 @@ def needs(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(not (DATA / name).is_dir(), reason=f"WRF_MI_DATA names no folder with {name}/")
 
 
-SMALL: dict[str, tuple[Method, Any]] = {
-    "vae": (vae.METHOD, network_settings(VaeSettings, 250, 8, 3e-3, latent=4, width=32, last=16, octaves=2)),
-    "dcgan": (dcgan.METHOD, network_settings(DcganSettings, 150, 8, 3e-3, noise=2, hidden=24, channels=16, octaves=2)),
+SMALL: dict[str, tuple[Model, Any]] = {
+    "vae": (vae.MODEL, network_settings(VaeSettings, 250, 8, 3e-3, latent=4, width=32, last=16, octaves=2)),
+    "dcgan": (dcgan.MODEL, network_settings(DcganSettings, 150, 8, 3e-3, noise=2, hidden=24, channels=16, octaves=2)),
     "nerf2": (
-        nerf2.METHOD,
+        nerf2.MODEL,
         network_settings(
             Nerf2Settings,
             350,
@@ -92,9 +93,9 @@ def first_rows(record: Record, count: int) -> Split:
 def test_eight_spectra_are_fitted_and_stored(name: str):
     method, settings = SMALL[name]
     record = array_spectra()
-    fitted = method.fit(record, first_rows(record, 8), settings, 0, FitSession())
+    fitted = method.fit(Problem(record, settings, 0), first_rows(record, 8), FitSession())
     asked = inputs_of(record, np.arange(8))
-    found = fitted.predict(asked, 0)
+    found = fitted.predict(asked, 0).mean
     truth = record.observation[0, :8]
     assert found.shape == truth.shape
     assert np.median(ssim(found, truth)) > FITTED
@@ -102,7 +103,7 @@ def test_eight_spectra_are_fitted_and_stored(name: str):
     blank = replace(record, observation=np.zeros_like(record.observation))
     arrays = fitted.arrays()
     assert not any(key.startswith("run/") for key in arrays)
-    again = method.load(arrays, blank).predict(inputs_of(record, np.array([5])), 0)
+    again = method.load(arrays, Problem(blank, None), Path()).predict(inputs_of(record, np.array([5])), 0).mean
     np.testing.assert_allclose(again[0], found[5], atol=SAME)
 
 
@@ -119,7 +120,7 @@ def test_fits_do_not_depend_on_held_out_rows(name: str, two_gateways: Record):
     other[:, 10:] = 1 - other[:, 10:]
     asked = inputs_of(two_gateways, np.arange(3))
     both = [
-        [method.fit(one, split, settings, 0, FitSession()).predict(asked, r) for r in (0, 1)]
+        [method.fit(Problem(one, settings, 0), split, FitSession()).predict(asked, r).mean for r in (0, 1)]
         for one in (replace(two_gateways, observation=o) for o in (seen, other))
     ]
     np.testing.assert_allclose(both[0], both[1], atol=1e-3)
@@ -132,12 +133,12 @@ def test_rows_without_positions_or_observations_are_refused(name: str, one_gatew
     method, settings = SMALL[name]
     nowhere = replace(one_gateway, tx_pos_m=np.full_like(one_gateway.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="no position in row 0"):
-        method.fit(nowhere, first_rows(nowhere, 8), settings, 0, FitSession())
+        method.fit(Problem(nowhere, settings, 0), first_rows(nowhere, 8), FitSession())
     nothing = replace(one_gateway, observation=np.full_like(one_gateway.observation, np.nan))
     with pytest.raises(InputError, match="gateway1 received 0 training row"):
-        method.fit(nothing, first_rows(nothing, 8), settings, 0, FitSession())
+        method.fit(Problem(nothing, settings, 0), first_rows(nothing, 8), FitSession())
     with pytest.raises(InputError, match=r"received 1 training row; .* needs two at least"):
-        method.fit(one_gateway, first_rows(one_gateway, 1), settings, 0, FitSession())
+        method.fit(Problem(one_gateway, settings, 0), first_rows(one_gateway, 1), FitSession())
 
 
 @pytest.mark.parametrize(
@@ -169,11 +170,13 @@ def test_signal_strengths_of_two_receivers_beat_their_means():
     record = Record("made", "rssi", tx, receivers, power, frequencies_hz=np.array([2.4e9]))
     split = Split("some", 0, np.arange(50), np.arange(50, 60), np.arange(60, 80))
     method, settings = SMALL["nerf2"]
-    fitted = method.fit(record, split, replace(settings, steps=250, sphere_batch=16, tx_octaves=1), 0, FitSession())
+    fitted = method.fit(
+        Problem(record, replace(settings, steps=250, sphere_batch=16, tx_octaves=1), 0), split, FitSession()
+    )
     errors, of_means = [], []
     for r in (0, 1):
         truth = power[r, split.test]
-        found = fitted.predict(inputs_of(record, split.test), r)
+        found = fitted.predict(inputs_of(record, split.test), r).mean
         assert found.shape == truth.shape
         errors.append(abs_error_db(found, truth))
         of_means.append(abs_error_db(np.full_like(truth, np.nanmean(power[r, split.all_train])), truth))
@@ -217,44 +220,46 @@ def test_downlink_from_uplink_beats_the_uplink():
     split = Split("some", 0, rows[:200], rows[200:230], rows[230:])
     method, settings = SMALL["nerf2"]
     chosen = replace(settings, steps=400, sphere_batch=64, sphere_rays=8)
-    fitted = method.fit(record, split, chosen, 0, FitSession())
+    fitted = method.fit(Problem(record, chosen, 0), split, FitSession())
     asked, truth = inputs_of(record, split.test), record.observation[0, split.test]
-    found = fitted.predict(asked, 0)
+    found = fitted.predict(asked, 0).mean
     assert found.shape == truth.shape
     assert record.uplink is not None
     copied = np.median(cea_db(record.uplink[split.test], truth))
     assert np.median(cea_db(found, truth)) > copied + 3
     # An uplink that is turned and louder brings a downlink that is.
     louder = replace(asked, uplink=asked.uplink * np.complex64(2j))
-    np.testing.assert_allclose(fitted.predict(louder, 0), 2j * found, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(fitted.predict(louder, 0).mean, 2j * found, rtol=1e-3, atol=1e-5)
     with pytest.raises(InputError, match="rows to predict have none"):
         fitted.predict(replace(asked, uplink=None), 0)
     assert record.uplink is not None
     with pytest.raises(InputError, match="uplink of 1 antennas and a downlink of 2"):
-        method.fit(replace(record, uplink=record.uplink[:, :1]), split, chosen, 0, FitSession())
+        method.fit(Problem(replace(record, uplink=record.uplink[:, :1]), chosen, 0), split, FitSession())
 
 
 def test_channels_by_position_keep_their_shape():
     record = replace(sparse_paths(12), uplink=None, uplink_hz=None)
     settings = replace(SMALL["nerf2"][1], steps=5)
     split = first_rows(record, 12)
-    fitted = nerf2.fit(record, split, settings, 0, FitSession())
-    found = fitted.predict(inputs_of(record, split.test), 0)
+    fitted = nerf2.MODEL.fit(Problem(record, settings, 0), split, FitSession())
+    found = fitted.predict(inputs_of(record, split.test), 0).mean
     assert found.shape == record.observation[0].shape
     assert found.dtype == np.complex64
     one = replace(record, observation=record.observation[:, :, 0])
-    assert nerf2.fit(one, split, settings, 0, FitSession()).predict(inputs_of(one, split.test), 0).shape == (12, 6)
+    assert nerf2.MODEL.fit(Problem(one, settings, 0), split, FitSession()).predict(
+        inputs_of(one, split.test), 0
+    ).mean.shape == (12, 6)
 
 
 def test_networks_of_each_receiver_are_stored_and_loaded(two_gateways: Record):
     settings = replace(SMALL["nerf2"][1], steps=5, shared=False)
-    fitted = nerf2.fit(two_gateways, first_rows(two_gateways, 8), settings, 0, FitSession())
+    fitted = nerf2.MODEL.fit(Problem(two_gateways, settings, 0), first_rows(two_gateways, 8), FitSession())
     arrays = fitted.arrays()
     assert any(key.startswith("group1/") for key in arrays)
     asked = inputs_of(two_gateways, np.arange(2))
-    again = nerf2.load(arrays, two_gateways)
+    again = nerf2.MODEL.load(arrays, Problem(two_gateways, None), Path())
     for r in (1, 0):
-        np.testing.assert_allclose(again.predict(asked, r), fitted.predict(asked, r), atol=SAME)
+        np.testing.assert_allclose(again.predict(asked, r).mean, fitted.predict(asked, r).mean, atol=SAME)
 
 
 @needs("rfid-lab")
@@ -262,27 +267,27 @@ def test_networks_of_each_receiver_are_stored_and_loaded(two_gateways: Record):
 @pytest.mark.parametrize(
     ("method", "settings"),
     [
-        (vae.METHOD, VaeSettings(steps=750, batch=8)),
-        (dcgan.METHOD, DcganSettings(steps=750)),
-        (nerf2.METHOD, Nerf2Settings(steps=1000, batch=8, rays=512)),
+        (vae.MODEL, VaeSettings(steps=750, batch=8)),
+        (dcgan.MODEL, DcganSettings(steps=750)),
+        (nerf2.MODEL, Nerf2Settings(steps=1000, batch=8, rays=512)),
     ],
     ids=["vae", "dcgan", "nerf2"],
 )
-def test_eight_measured_spectra_are_fitted(method: Method, settings: Any):
+def test_eight_measured_spectra_are_fitted(method: Model, settings: Any):
     record = load("rfid-lab")
     rows = make_splits(record, "official")[0].train[::18][:8]
-    fitted = method.fit(record, Split("few", 0, rows, rows[:0], rows), settings, 0, FitSession())
-    assert np.median(ssim(fitted.predict(inputs_of(record, rows), 0), record.observation[0, rows])) > FITTED
+    fitted = method.fit(Problem(record, settings, 0), Split("few", 0, rows, rows[:0], rows), FitSession())
+    assert np.median(ssim(fitted.predict(inputs_of(record, rows), 0).mean, record.observation[0, rows])) > FITTED
 
 
 @needs("rfid-lab")
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [vae.METHOD, dcgan.METHOD, nerf2.METHOD], ids=["vae", "dcgan", "nerf2"])
-def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
+@pytest.mark.parametrize("method", [vae.MODEL, dcgan.MODEL, nerf2.MODEL], ids=["vae", "dcgan", "nerf2"])
+def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Model):
     record = load("rfid-lab")
     split = make_splits(record, "official")[0]
-    fitted = method.fit(record, split, method.settings(), 0, FitSession())
-    found = fitted.predict(inputs_of(record, split.test), 0)
+    fitted = method.fit(Problem(record, method.settings(), 0), split, FitSession())
+    found = fitted.predict(inputs_of(record, split.test), 0).mean
     assert np.median(ssim(found, record.observation[0, split.test])) > MEAN_SPECTRUM
 
 
@@ -291,9 +296,9 @@ def test_held_out_spectra_are_predicted_better_than_by_the_mean(method: Method):
 def test_measured_signal_strengths_beat_a_log_distance_fit():
     record = load("flat-ble")
     split = make_splits(record, "official")[0]
-    fitted = nerf2.fit(record, split, Nerf2Settings(), 0, FitSession())
+    fitted = nerf2.MODEL.fit(Problem(record, Nerf2Settings(), 0), split, FitSession())
     errors = [
-        abs_error_db(fitted.predict(inputs_of(record, split.test), r), record.observation[r, split.test])
+        abs_error_db(fitted.predict(inputs_of(record, split.test), r).mean, record.observation[r, split.test])
         for r in range(len(record.receivers))
     ]
     assert np.nanmedian(np.concatenate(errors)) < MRI_DB

@@ -13,11 +13,22 @@ import pytest
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import with_settings
-from wrf_mi.models.networks.conv import NORM_FLOOR, Convolution, Grid, InstanceNorm, coarser, finer, patches, resized
-from wrf_mi.models.networks.coordinates import Coordinates
-from wrf_mi.models.networks.dcgan import DcganSettings, Generator, softplus
-from wrf_mi.models.networks.layers import Module, columns
-from wrf_mi.models.networks.nerf2_march import LEAK, Nerf2Network, Networks, Rays, constant_parts, look, march
+from wrf_mi.models.model import field_arrays, from_field_arrays
+from wrf_mi.models.networks.dcgan import (
+    NORM_FLOOR,
+    Convolution,
+    DcganSettings,
+    Generator,
+    Grid,
+    InstanceNorm,
+    coarser,
+    finer,
+    patches,
+    resized,
+    softplus,
+)
+from wrf_mi.models.networks.layers import Coordinates, Module, columns
+from wrf_mi.models.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
 from wrf_mi.models.networks.training import Network, NetworkSettings, NetworkTrainer
 from wrf_mi.models.networks.vae import Vae, VaeSettings, elbo_loss, normal_divergence, pooled
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink
@@ -144,7 +155,7 @@ def test_columns_by_index(picked: list[int]):
 
 def test_coordinates_are_centred_and_stored():
     frame = Coordinates.of([[0, 0, 1], [2, 0, 1]])
-    again = Coordinates.load(frame.arrays())
+    again = from_field_arrays(Coordinates, field_arrays(frame))
     features = again.features([[2, 0, 1]], octaves=1, scale_m=2.0).numpy()[:, 0]
     # One unit of plain coordinate; a half turn in two units of scale is 1 m.
     np.testing.assert_allclose(features, [1, 0, 0, 1, 0, 0, 0, 1, 1], atol=1e-6)
@@ -175,7 +186,7 @@ def small_march(seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]
 
 def marched(weights: dict[str, Any], rays: dict[str, np.ndarray], condition: np.ndarray) -> Any:
     module = network(np.random.default_rng(0)).with_state(weights | {"offset": None})
-    seen = look(module, Rays(**{name: doubles(values) for name, values in rays.items()}))
+    seen = look(module, {name: doubles(values) for name, values in rays.items()})
     return march(module, seen, doubles(condition), SAMPLES)
 
 

@@ -12,9 +12,10 @@ from made_waves import FREQUENCY_HZ, SIZE, WAVELENGTH_M, positions, wave_record,
 from scipy.spatial.distance import cdist
 
 from wrf_mi.core import InputError, Record
-from wrf_mi.models.physics import anisotropic_kriging as nearby
+from wrf_mi.models.interpolation import kriging_equations as nearby
+from wrf_mi.models.interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
+from wrf_mi.models.model import field_arrays, from_field_arrays
 from wrf_mi.models.physics import measured_spectrum
-from wrf_mi.models.physics.anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
 from wrf_mi.models.physics.measured_spectrum import (
     GAPS,
     LEAST_ROWS,
@@ -23,7 +24,6 @@ from wrf_mi.models.physics.measured_spectrum import (
     fit_measured_spectrum,
     signal_weight,
 )
-from wrf_mi.models.physics.selection import field_arrays, from_field_arrays, kind_of
 from wrf_mi.receivers.lags import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
 
@@ -173,11 +173,8 @@ def progress() -> list[tuple[str, float]]:
 @pytest.fixture(scope="module")
 def physics(record: Record, progress: list[tuple[str, float]]) -> MeasuredSpectrumPhysics:
     assert record.official is not None
-    kind = kind_of(record, with_scene=False)
     settings = MeasuredSpectrumSettings(directions=60)
-    model = kind.fit(record, record.official[0], None, settings, 0, lambda *stage: progress.append(stage))
-    assert isinstance(model, MeasuredSpectrumPhysics)
-    return model
+    return fit_measured_spectrum(record, record.official[0], settings, 0, lambda *stage: progress.append(stage))
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
@@ -226,7 +223,7 @@ def test_fit_reports_progress_and_summary(physics: MeasuredSpectrumPhysics, prog
 def test_model_is_restored_from_arrays(record: Record, physics: MeasuredSpectrumPhysics, tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **physics.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
-        again = kind_of(record, with_scene=False).load(dict(stored))
+        again = MeasuredSpectrumPhysics.from_arrays(dict(stored))
     assert [r.name for r in again.receivers] == ["one", "two"]
     for receiver in (0, 1):
         before, after = (model.predict(record.tx_pos_m[:5], receiver) for model in (physics, again))
@@ -352,7 +349,7 @@ def test_spectra_of_an_unknown_instrument_are_refused(two_gateways: Record, reco
     [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0), ("starts", 0), ("shortest", 5.0)],
 )
 def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) -> None:
-    with pytest.raises(InputError, match=f"setting {setting}: {value}; choose"):
+    with pytest.raises(InputError, match=f"setting {setting}: {value} is out of range, choose"):
         MeasuredSpectrumSettings(**{setting: value})
 
 

@@ -13,9 +13,8 @@ from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
-from wrf_mi.models.physics.rssi_fit import Part, fit_pooled, folds, shift_of, widening
-from wrf_mi.models.physics.rssi_map import PowerMap, trace_map
-from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, stops_of
+from wrf_mi.models.physics.rssi_fit import Part, PooledProcess, folds, shift_of, widening
+from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, PowerMap, stops_of, trace_map
 
 FREQUENCY_HZ = 2.44e9
 AT_1M_DBM = -40.2
@@ -61,14 +60,14 @@ def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
 def test_posterior_equals_dense_gaussian_conditioning() -> None:
     """Shared coefficients and independent fields, against one covariance matrix of all receivers' rows."""
     rng = np.random.default_rng(1)
-    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0)
+    kernel = Hyperparameters(3.0, 1.5, 1.0, 1.0, 1.0, 0.0, 0.0)
     prior = np.array([5.0, 1.0])
     places = [Poses(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
     bases = [rng.normal(size=(len(p), 2)) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
     parts = [Part(*one) for one in zip(places, bases, values, noise, strict=True)]
-    process = fit_pooled(parts, kernel.covariance, prior, kernel.variance(True))
+    process = PooledProcess(parts, kernel.covariance, prior, kernel.variance(True))
 
     asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
     mean, variance = process.predict(1, asked, basis)
@@ -89,9 +88,9 @@ def test_reweighting_is_robust_to_outliers() -> None:
     places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
     part = Part(places, np.ones((21, 1)), value, np.ones(21))
-    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0)
+    kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
     plain, robust = (
-        fit_pooled([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
+        PooledProcess([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
         for rounds in (0, 3)
     )
     assert plain == pytest.approx(40 / 21, rel=0.02)

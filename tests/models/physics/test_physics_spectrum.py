@@ -26,10 +26,9 @@ from wrf_mi.models.physics.spectrum_fit import (
     map_centres,
     scan_offsets,
 )
-from wrf_mi.models.physics.spectrum_loss import Grid, Spectrometer
 from wrf_mi.models.physics.spectrum_model import Fit, SpectrumModel, begin
-from wrf_mi.models.physics.spectrum_rays import Chaining
 from wrf_mi.models.physics.spectrum_search import KnownPaths, Search
+from wrf_mi.models.physics.spectrum_waves import Grid, Spectrometer
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6
@@ -40,7 +39,7 @@ ARRAY = planar_array(4, 4, 0.16)
 RECEIVER = Receiver("array", np.array([5.2, 2.4, 1.1]), np.array([0.5, -0.5, -0.5, 0.5]), array_m=ARRAY)
 NOISE = RESIDUALS[0].noise
 INSTRUMENT = Spectrometer(RECEIVER, HZ, HEIGHT, WIDTH)
-HOW = Chaining(reflections=2, passed=1, rays=1 << 14, most=1000, seed=1)
+HOW = SpectrumSettings(reflections=2, passed=1, rays=1 << 14, chains=1000), 1
 
 
 def places(count: int, seed: int) -> np.ndarray:
@@ -55,7 +54,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> SpectrumModel:
-    return begin(INSTRUMENT, open_scene(write_xml(tmp_path_factory.mktemp("bare"), SHOEBOX), HZ, THICKNESS_M), HOW)
+    return begin(INSTRUMENT, open_scene(write_xml(tmp_path_factory.mktemp("bare"), SHOEBOX), HZ, THICKNESS_M), *HOW)
 
 
 def record_of(model: SpectrumModel, tx: np.ndarray) -> Record:
@@ -74,7 +73,7 @@ def record_of(model: SpectrumModel, tx: np.ndarray) -> Record:
 def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any, rx: Antenna, tx_antenna: Antenna) -> None:
     receiver = replace(RECEIVER, antenna=rx)
     instrument = replace(INSTRUMENT, receiver=receiver, tx_antenna=tx_antenna)
-    model, tx = begin(instrument, scene, HOW), places(20, 0)
+    model, tx = begin(instrument, scene, *HOW), places(20, 0)
     waves = model.waves(tx)
     gain, length = waves.gain(model.constants.slabs), np.linalg.norm(waves.paths.image_m, axis=1)
     options = TraceOptions(transmission=True, max_depth=3, max_reflections=2, rays=1 << 14)
@@ -96,7 +95,7 @@ def test_paths_and_gains_are_those_of_the_ray_tracer(scene: Any, rx: Antenna, tx
 
 
 def test_numpy_and_mitsuba_intersections_agree(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, tx = begin(INSTRUMENT, scene, HOW), places(15, 10)
+    model, tx = begin(INSTRUMENT, scene, *HOW), places(15, 10)
     found = []
     for pairs in (0, 1 << 30):
         monkeypatch.setattr(spectrum_rays, "FEW_PAIRS", pairs)
@@ -110,7 +109,7 @@ def test_numpy_and_mitsuba_intersections_agree(scene: Any, monkeypatch: pytest.M
 
 def test_a_displaced_plane_moves_images_as_a_displaced_mesh_does(bare: SpectrumModel, tmp_path: Path) -> None:
     moved = {**SHOEBOX, "west": ("itu_brick", sheet(0, 0.05, (0.0, 5.0), (0.0, 3.0)))}
-    other = begin(INSTRUMENT, open_scene(write_xml(tmp_path, moved), HZ, THICKNESS_M), HOW)
+    other = begin(INSTRUMENT, open_scene(write_xml(tmp_path, moved), HZ, THICKNESS_M), *HOW)
     surfaces = bare.table.surfaces
     assert surfaces is not None
     offset = np.zeros(len(surfaces.normal))
@@ -170,7 +169,7 @@ def test_gain_slopes_equal_finite_differences(bare: SpectrumModel) -> None:
 
 def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> None:
     plate = {"plate": ("itu_metal", sheet(1, 4.6, (1.5, 3.2), (0.4, 2.2)))}
-    room = begin(INSTRUMENT, open_scene(write_xml(tmp_path, {**SHOEBOX, **plate}), HZ, THICKNESS_M), HOW)
+    room = begin(INSTRUMENT, open_scene(write_xml(tmp_path, {**SHOEBOX, **plate}), HZ, THICKNESS_M), *HOW)
     tx = places(80, 4)
     shapes = INSTRUMENT.grid.shapes(INSTRUMENT.report(room.signals(room.waves(tx))))
     waves, frames = bare.waves(tx), bare.frames(tx)
@@ -183,7 +182,7 @@ def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> 
     # Edges show by the transmitters that just see them, 80 in 40 cubic metres.
     assert np.abs(corners.min(axis=0)[[0, 2]] - [1.5, 0.4]).max() < 0.4
     assert np.abs(corners.max(axis=0)[[0, 2]] - [3.2, 2.2]).max() < 0.4
-    with_it = bare.with_sheets([found], frames, HOW)
+    with_it = bare.with_sheets([found], frames, *HOW)
     before, after = (INSTRUMENT.grid.loss(m.signals(m.waves(tx)), shapes)[0].mean() for m in (bare, with_it))
     assert after < 0.6 * before
 
@@ -305,7 +304,7 @@ def test_surfaces_are_added_only_where_validation_rows_gain(bare: SpectrumModel)
     settings = SpectrumSettings(surfaces=2, steps=5)
     fit = Fit(INSTRUMENT, tx, spectra, np.arange(45), np.arange(45, 60), settings)
     # The mesh explains everything: no surface is needed, and none is taken.
-    assert fit.surfaces(bare, HOW).learned == 0
+    assert fit.surfaces(bare, HOW[1]).learned == 0
 
 
 def test_residual_kriging_acts_near_training_rows_only() -> None:

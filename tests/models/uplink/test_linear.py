@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from wrf_mi.core import InputError, Receiver, Record, Split
-from wrf_mi.models.method import Inputs, inputs_of
+from wrf_mi.models import Problem
+from wrf_mi.models.model import Inputs, inputs_of
 from wrf_mi.models.uplink.csi_bands import relative_error
-from wrf_mi.models.uplink.linear import METHOD, PENALTIES, LinearMap, LinearSettings, choose
+from wrf_mi.models.uplink.linear import MODEL, PENALTIES, LinearMap, LinearSettings, choose
 from wrf_mi.tasks.conditions import normalised_uplink
 from wrf_mi.training.session import FitSession
 
@@ -48,7 +49,7 @@ def split_of(train: int = 24, validation: int = 6) -> Split:
 
 
 def fit(record: Record, split: Split, **settings: float) -> LinearMap:
-    fitted = METHOD.fit(record, split, LinearSettings(**settings), 0, FitSession())
+    fitted = MODEL.fit(Problem(record, LinearSettings(**settings), 0), split, FitSession())
     assert isinstance(fitted, LinearMap)
     return fitted
 
@@ -59,7 +60,7 @@ def test_exact_on_a_noise_free_linear_relation() -> None:
     fitted = fit(record, split)
     assert fitted.penalty == PENALTIES[0]
     np.testing.assert_allclose(fitted.matrix, matrix, atol=EXACT)
-    found, truth = fitted.predict(inputs_of(record, split.test), 0), record.observation[0, split.test]
+    found, truth = fitted.predict(inputs_of(record, split.test), 0).mean, record.observation[0, split.test]
     assert found.dtype == np.complex64
     assert relative_error(found, truth).max() < EXACT**2
 
@@ -70,7 +71,7 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
     split = split_of(8, 12)
     shares: list[float] = []
     session = FitSession(on_progress=lambda stage, share, progress: shares.append(share))
-    fitted = METHOD.fit(record, split, LinearSettings(), 0, session)
+    fitted = MODEL.fit(Problem(record, LinearSettings(), 0), split, session)
     assert isinstance(fitted, LinearMap)
     assert shares[-1] == 1
     assert shares == sorted(shares)
@@ -135,7 +136,7 @@ def test_uplink_of_zeros_at_an_antenna_gives_a_downlink_of_zeros() -> None:
     record, _ = linear_record()
     uplink = np.ones((2, ANTENNAS, UP), np.complex64)
     uplink[1, 2] = 0
-    found = fit(record, split_of()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0)
+    found = fit(record, split_of()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0).mean
     assert not found[1, 2].any()
     assert found[1, 1].all()
 
@@ -143,7 +144,7 @@ def test_uplink_of_zeros_at_an_antenna_gives_a_downlink_of_zeros() -> None:
 def test_penalties_out_of_range_and_rows_without_energy_are_refused() -> None:
     record, _ = linear_record()
     for penalty in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(InputError, match="choose a positive number, or null"):
+        with pytest.raises(InputError, match="choose more than 0"):
             LinearSettings(penalty=penalty)
     with pytest.raises(InputError, match="made: no training row's downlink has any energy"):
         fit(replace(record, observation=np.zeros_like(record.observation)), split_of())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from small_fits import network_settings
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.method import Inputs, inputs_of
+from wrf_mi.models import Problem
+from wrf_mi.models.model import Inputs, inputs_of
 from wrf_mi.models.networks import nerf2
 from wrf_mi.models.networks.nerf2_field import Nerf2Settings
 from wrf_mi.models.networks.nerf2_march import Networks
@@ -23,7 +25,7 @@ from wrf_mi.models.uplink.fire import FireSettings
 from wrf_mi.models.uplink.linear import LinearSettings
 from wrf_mi.models.uplink.optml import OptMLSettings
 from wrf_mi.models.uplink.path_network import Simulation
-from wrf_mi.models.uplink.r2f2 import R2F2Settings
+from wrf_mi.models.uplink.r2f2 import PathSettings
 from wrf_mi.models.uplink.uplink_paths import find_paths
 from wrf_mi.models.uplink.uplink_waves import waves_of
 from wrf_mi.tasks.scores import cea_db
@@ -36,13 +38,13 @@ HZ = CARRIER_HZ + OFFSETS
 EXACT_DB = 60.0
 """Coefficients are stored as complex64, whose 140 dB the step to the next band and single antennas in a fade may cost
 some; a wrong path, or one of them missing, gives less than 30."""
-METHODS = {"linear": linear.METHOD, "fire": fire.METHOD, "r2f2": r2f2.METHOD, "optml": optml.METHOD}
+METHODS = {"linear": linear.MODEL, "fire": fire.MODEL, "r2f2": r2f2.MODEL, "optml": optml.MODEL}
 """Methods that predict from the uplink alone."""
-FIELDS = {"nerf2": nerf2.METHOD}
+FIELDS = {"nerf2": nerf2.MODEL}
 SMALL = {
     "linear": LinearSettings(),
     "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
-    "r2f2": R2F2Settings(max_paths=3, choice_rows=2),
+    "r2f2": PathSettings(max_paths=3, choice_rows=2),
     "optml": OptMLSettings(
         steps=5,
         batch=4,
@@ -123,9 +125,9 @@ def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
     h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.METHOD.fit(record, split_of(10), R2F2Settings(max_paths=5, choice_rows=2), 0, FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(10), FitSession())
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
-    cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0), h[:, :, HALF:])
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0).mean, h[:, :, HALF:])
     assert cea.min() > EXACT_DB
 
 
@@ -134,9 +136,9 @@ def test_r2f2_without_elements_is_exact_where_delays_are_apart():
     delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
-    fitted = r2f2.METHOD.fit(record_of(h), split_of(6), R2F2Settings(), 0, FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record_of(h), PathSettings(), 0), split_of(6), FitSession())
     record = record_of(h)
-    cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0), h[:, :, HALF:])
+    cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0).mean, h[:, :, HALF:])
     assert fitted.kind == "free"
     assert cea.min() > EXACT_DB
 
@@ -146,7 +148,7 @@ def test_r2f2_finds_the_gap_between_unknown_bands():
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
     waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
     record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
-    fitted = r2f2.METHOD.fit(record, split_of(6), R2F2Settings(), 0, FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(), 0), split_of(6), FitSession())
     assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
 
 
@@ -167,7 +169,7 @@ def test_search_finds_as_many_paths_as_there_are_in_noise(elements):
 def test_gradient_of_the_projected_residual_equals_finite_differences(kind, elements):
     """Variable projection: derivative of the residual's energy with the gains at their best."""
     rng = np.random.default_rng(5)
-    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), elements[:, :2], True)
+    bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), True, elements[:, :2])
     waves = waves_of(kind, bands, 100.0)
     h = rng.standard_normal((2, len(elements), HALF, 2)) @ np.array([1, 1j])
     theta = np.concatenate([rng.uniform(2, 20, (2, 3, 1)), rng.uniform(-0.5, 0.5, (2, 3, 2))], axis=2)
@@ -187,9 +189,9 @@ def test_fire_beats_copying_the_uplink(walk):
     truth, record = walk
     split = split_of(80, 16)
     settings = network_settings(FireSettings, 375, 128, 2e-3, 100, sample="antenna", width=64, latent=16)
-    fitted = fire.METHOD.fit(record, split, settings, 0, FitSession())
+    fitted = fire.MODEL.fit(Problem(record, settings, 0), split, FitSession())
     inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
-    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0).mean, inputs.uplink))
     assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
 
 
@@ -201,7 +203,7 @@ def test_fire_ignores_rows_without_downlink(walk):
     observation[0, :2] = 0
     lost = replace(record, observation=observation)
     first, second = (
-        np.median(cea_db(fire.METHOD.fit(one, split, settings, 0, FitSession()).predict(inputs, 0), down))
+        np.median(cea_db(fire.MODEL.fit(Problem(one, settings, 0), split, FitSession()).predict(inputs, 0).mean, down))
         for one in (record, lost)
     )
     assert second > first - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
@@ -210,9 +212,9 @@ def test_fire_ignores_rows_without_downlink(walk):
 def test_linear_map_beats_copying_the_uplink(walk):
     truth, record = walk
     split = split_of(80, 16)
-    fitted = linear.METHOD.fit(record, split, LinearSettings(), 0, FitSession())
+    fitted = linear.MODEL.fit(Problem(record, LinearSettings(), 0), split, FitSession())
     inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
-    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0), inputs.uplink))
+    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0).mean, inputs.uplink))
     assert mine > copied + 10, "its phase alone, put right, gives 2 dB"
 
 
@@ -233,15 +235,17 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
     settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
     method, split = (METHODS | FIELDS)[name], split_of(30, 5)
-    fitted = method.fit(record, split, settings, 0, FitSession())
+    fitted = method.fit(Problem(record, settings, 0), split, FitSession())
     inputs = inputs_of(record, split.test)
-    found = fitted.predict(inputs, 0)
+    found = fitted.predict(inputs, 0).mean
     assert found.shape == (5, 6, HALF)
     assert np.isfinite(found).all()
     assert np.abs(found).min() > 0
     if name in ("linear", "r2f2", "optml"):
         assert np.median(cea_db(found, record.observation[0][split.test])) > 15
-    np.testing.assert_array_equal(method.load(fitted.arrays(), record).predict(inputs, 0), found)
+    np.testing.assert_array_equal(
+        method.load(fitted.arrays(), Problem(record, None), Path()).predict(inputs, 0).mean, found
+    )
 
 
 def test_optml_finds_all_paths_with_few_steps(elements):
@@ -258,8 +262,8 @@ def test_optml_finds_all_paths_with_few_steps(elements):
         rounds=2,
         max_distance_m=60.0,
     )
-    fitted = optml.METHOD.fit(record, split, settings, 0, FitSession())
-    cea = cea_db(fitted.predict(inputs_of(record, split.test), 0), h[split.test][:, :, HALF:])
+    fitted = optml.MODEL.fit(Problem(record, settings, 0), split, FitSession())
+    cea = cea_db(fitted.predict(inputs_of(record, split.test), 0).mean, h[split.test][:, :, HALF:])
     assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
 
 
@@ -267,17 +271,18 @@ def test_optml_finds_all_paths_with_few_steps(elements):
 def test_loaded_model_predicts_the_same(name, walk, tmp_path):
     _, record = walk
     split = split_of(80, 16)
-    fitted = METHODS[name].fit(record, split, SMALL[name], 0, FitSession())
+    fitted = METHODS[name].fit(Problem(record, SMALL[name]), split, FitSession())
     arrays = fitted.arrays()
     assert not any(key.startswith("run/") for key in arrays)
     np.savez(tmp_path / "a.npz", **arrays)
     with np.load(tmp_path / "a.npz", allow_pickle=False) as stored:
-        again = METHODS[name].load(dict(stored), replace(record, observation=np.zeros_like(record.observation)))
+        blank = Problem(replace(record, observation=np.zeros_like(record.observation)), None)
+        again = METHODS[name].load(dict(stored), blank, Path())
     inputs = inputs_of(record, split.test[:5])
-    prediction = fitted.predict(inputs, 0)
+    prediction = fitted.predict(inputs, 0).mean
     assert prediction.shape == (5, 48, HALF)
     assert prediction.dtype == np.complex64
-    np.testing.assert_array_equal(again.predict(inputs, 0), prediction)
+    np.testing.assert_array_equal(again.predict(inputs, 0).mean, prediction)
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -286,11 +291,11 @@ def test_records_of_two_receivers_or_of_another_array_are_refused(name, walk):
     record = walk[1]
     doubled = replace(record, receivers=record.receivers * 2, observation=np.repeat(record.observation, 2, axis=0))
     with pytest.raises(InputError, match="needs one receiver"):
-        METHODS[name].fit(doubled, split_of(80), SMALL[name], 0, FitSession())
+        METHODS[name].fit(Problem(doubled, SMALL[name]), split_of(80), FitSession())
     if name != "linear":  # which does not use the array
         fewer = record.with_array(record.receivers[0].array_m[:-1])
         with pytest.raises(InputError, match="47, 3"):
-            METHODS[name].fit(fewer, split_of(80), SMALL[name], 0, FitSession())
+            METHODS[name].fit(Problem(fewer, SMALL[name]), split_of(80), FitSession())
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -298,15 +303,15 @@ def test_a_single_row_is_refused(name, walk):
     nothing = np.zeros(0, np.int64)
     split = Split("made", 0, np.array([0]), nothing, nothing)
     with pytest.raises(InputError, match="1 training row"):
-        METHODS[name].fit(walk[1], split, SMALL[name], 0, FitSession())
+        METHODS[name].fit(Problem(walk[1], SMALL[name]), split, FitSession())
 
 
 def test_uplink_of_zeros_gives_a_downlink_of_zeros(walk):
-    fitted = r2f2.METHOD.fit(walk[1], split_of(80), SMALL["r2f2"], 0, FitSession())
-    assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).any()
+    fitted = r2f2.MODEL.fit(Problem(walk[1], SMALL["r2f2"], 0), split_of(80), FitSession())
+    assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).mean.any()
 
 
-@pytest.mark.parametrize("settings", [lambda: R2F2Settings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
+@pytest.mark.parametrize("settings", [lambda: PathSettings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
 def test_unknown_words_are_refused_by_the_settings_themselves(settings: Callable[[], object]) -> None:
     with pytest.raises(InputError, match="choose from"):
         settings()

@@ -6,7 +6,6 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +13,9 @@ from calling import refused, stored
 from made_channels import ANTENNAS, SUBCARRIERS, channels
 
 from wrf_mi import models
-from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core import InputError, Prediction, Split
 from wrf_mi.datasets import load, write_nerf2_csi
-from wrf_mi.models.method import Inputs, Method
+from wrf_mi.models import Fitted, Inputs, Model, Problem
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
@@ -42,41 +41,43 @@ def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
 
 
-class Turned:
+class Turned(Fitted):
     """Turns the uplink by a fitted angle: exact for `channels`."""
 
     def __init__(self, angle: float) -> None:
         self.angle = angle
 
-    def predict(self, inputs: Inputs, receiver: int) -> np.ndarray:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         assert inputs.uplink is not None
-        return (inputs.uplink * np.exp(1j * self.angle)).astype(np.complex64)
+        return Prediction((inputs.uplink * np.exp(1j * self.angle)).astype(np.complex64))
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"angle": np.asarray(self.angle)}
 
 
-def fit_turned(record: Record, split: Split, settings: Any, seed: int, session: FitSession) -> Turned:
+def fit_turned(problem: Problem, split: Split, session: FitSession) -> Turned:
+    record = problem.record
     assert record.uplink is not None
     rows = split.all_train
     return Turned(float(np.angle((record.observation[0, rows] * record.uplink[rows].conj()).sum())))
 
 
-TURNED = Method(
+TURNED = Model(
     "turned",
     ("csi",),
     models.MODELS["mri"].settings,
     fit_turned,
-    lambda arrays, record: Turned(float(arrays["angle"])),
+    lambda arrays, problem, folder: Turned(float(arrays["angle"])),
     "this test",
-    needs_uplink=True,
+    uplink="required",
+    headings=True,
 )
 
 
 @pytest.fixture
 def turned(monkeypatch: pytest.MonkeyPatch) -> None:
     """A method that predicts from the uplink, among the others."""
-    monkeypatch.setitem(models._MODELS._known, "turned", TURNED)
+    monkeypatch.setitem(models.MODELS._known, "turned", TURNED)
 
 
 def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folder: Path, tmp_path: Path) -> None:

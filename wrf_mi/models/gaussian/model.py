@@ -31,8 +31,7 @@ from ...training.reach import Reach
 from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
-from ..method import Inputs, keyed, under
-from ..model import Arrays, Fitted, Model, Problem, Session
+from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
 PARAM = "param/"

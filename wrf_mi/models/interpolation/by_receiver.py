@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, known_positions, under
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
 HEADING, CARRIERS = "heading", "carriers_hz"
 """Keys of the arrays: whether headings are used, and the carriers where there are several."""
@@ -30,8 +31,9 @@ class Single(Protocol):
         """Arrays of a run file."""
 
 
-FitSingle = Callable[[Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
-"""From a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to its model."""
+FitSingle = Callable[[Problem, Split, Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
+"""From a problem, its split, a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to the
+receiver's model."""
 
 
 def observed_rows(
@@ -54,7 +56,7 @@ def observed_rows(
 
 
 @dataclass(frozen=True)
-class ByReceiver:
+class ByReceiver(Fitted):
     """A model for each receiver, and for each carrier where the rows have several.
 
     Attributes:
@@ -69,7 +71,7 @@ class ByReceiver:
     heading: bool
     carriers_hz: FloatArray | None = None
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of a receiver, [m, ...].
 
         Raises:
@@ -83,7 +85,7 @@ class ByReceiver:
             )
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
-            return self.models[receiver].predict(inputs.tx_pos_m, heading)
+            return Prediction(self.models[receiver].predict(inputs.tx_pos_m, heading))
         known, receivers = carriers_text(self.carriers_hz), len(self.models) // len(self.carriers_hz)
         if inputs.carriers_hz is None:
             raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
@@ -94,10 +96,9 @@ class ByReceiver:
                 row = inputs.first_row + rows[0] + 1
                 raise InputError(f"{self.name}: row {row}: no training row at {carrier_hz:.10g} Hz; trained on {known}")
             model = self.models[number[0] * receivers + receiver]
-            result: NDArray[Any] = model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows])
-            return result
+            return np.asarray(model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows]))
 
-        return by_carrier(inputs.carriers_hz, of_carrier)
+        return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of all models, use of headings, and carriers."""
@@ -109,51 +110,50 @@ class ByReceiver:
         return arrays
 
 
-def method_by_receiver(
+def model_by_receiver(
     name: str,
     tasks: tuple[str, ...] | None,
     settings: type,
-    fitter: Callable[[Record, Split, Any, int], FitSingle],
+    fit_single: FitSingle,
     load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
     source: str,
     heading: Callable[[Record, Any], bool] = lambda record, settings: False,
-) -> Method:
+) -> Model:
     """Entry of the registry for a method that fits every receiver to all training rows, those of each carrier alone.
 
     Args:
         name: name of the method.
         tasks: tasks that it serves; None: all.
         settings: class of its settings.
-        fitter: ``fitter(record, split, settings, seed)``: fit of one receiver.
+        fit_single: fit of one receiver.
         load_single: the model of a receiver from its arrays.
         source: publication.
         heading: ``heading(record, settings)``: whether headings count where the record has them.
     """
 
-    def fit(record: Record, split: Split, settings: Any, seed: int, session: FitSession) -> ByReceiver:
-        rows, stated = split.all_train, record.carriers_hz
+    def fit(problem: Problem, split: Split, session: FitSession) -> ByReceiver:
+        record, rows, stated = problem.record, split.all_train, problem.record.carriers_hz
         known_positions(record, rows, name)
-        fit_single = fitter(record, split, settings, seed)
-        headings = record.tx_heading_rad if heading(record, settings) else None
+        headings = record.tx_heading_rad if heading(record, problem.settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
-        parts = (
-            [rows] if stated is None or carriers is None else [rows[stated[rows] == carrier] for carrier in carriers]
-        )
+        parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
         models: list[Single] = []
         for part in parts:
             turned = None if headings is None else headings[part]
             for receiver, observed in zip(record.receivers, record.observation, strict=True):
                 try:
-                    models.append(fit_single(receiver, record.tx_pos_m[part], observed[part], turned))
+                    rows_of = record.tx_pos_m[part], observed[part], turned
+                    models.append(fit_single(problem, split, receiver, *rows_of))
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
                 session.report(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
         return ByReceiver(name, models, headings is not None, carriers)
 
-    def load(arrays: dict[str, NDArray[Any]], record: Record) -> ByReceiver:
+    def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:
         carriers = arrays.get(CARRIERS)
-        receivers = record.receivers * (1 if carriers is None else len(carriers))
+        receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
         models = [load_single(receiver, under(f"{number}/", arrays)) for number, receiver in enumerate(receivers)]
         return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
 
-    return Method(name, tasks, settings, fit, load, source, several_carriers=True)
+    how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}
+    return Model(name, tasks, settings, fit, load, source, **how)

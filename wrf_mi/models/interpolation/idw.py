@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Receiver, Split
 from ...core.angles import FloatArray
 from ...tasks import task_of
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from ..model import Problem
+from .by_receiver import model_by_receiver, observed_rows
 
 
 class InverseDistance:
@@ -94,22 +95,21 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def _fitter(record: Record, split: Split, settings: IdwSettings, seed: int) -> FitSingle:
-    task = task_of(record)
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> InverseDistance:
+    settings: IdwSettings = problem.settings
+    task = task_of(problem.record)
     k = task.neighbours if settings.neighbours is None else settings.neighbours
     softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
-
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> InverseDistance:
-        return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
-
-    return single
+    return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "idw",
     None,
     IdwSettings,
-    _fitter,
+    _fit,
     lambda receiver, arrays: InverseDistance.from_arrays(arrays),
     "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
 )

@@ -8,19 +8,22 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.linalg import LinAlgError
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
-from .kriging_equations import KERNELS, KrigingSystem, component_root, correlation
+from ..model import Problem
+from .by_receiver import model_by_receiver, observed_rows
+from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)
@@ -37,13 +40,11 @@ class Trend:
     """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
 
     Attributes:
-        name: ``constant`` or ``log-distance``.
-        receiver_m: position [3] from which d is the distance, metres.
+        receiver_m: position [3] from which d is the distance, metres; None: one unknown mean.
 
     Source: Rappaport, "Wireless Communications" (2002), section 4.9.
     """
 
-    name: str
     receiver_m: FloatArray | None = None
 
     def __call__(self, positions_m: FloatArray) -> FloatArray:
@@ -56,22 +57,22 @@ class Trend:
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-constant = Trend(CONSTANT)
+constant = Trend()
 """Trend of one unknown mean."""
 
 
 def log_distance(receiver_m: ArrayLike) -> Trend:
     """Trend of the log-distance law at a receiver's position [3], metres."""
-    return Trend(LOG_DISTANCE, np.asarray(receiver_m, float))
+    return Trend(np.asarray(receiver_m, float))
 
 
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
-"""Attributes of `KrigedMean` that are stored as they are."""
+"""Attributes of `Kriged` that are stored as they are."""
 
 
 @dataclass(frozen=True)
-class KrigedMean:
-    """Predictions of a fitted kriging: a trend, and weights of the training rows' correlations.
+class Kriged:
+    """A fitted kriging: a trend, and weights of the training rows' correlations.
 
     Attributes:
         kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
@@ -82,6 +83,9 @@ class KrigedMean:
         weights: weights of the rows for each component [n, q].
         like: empty array of the shape and type of observations, [0, ...].
         trend: columns of the trend.
+        noise: variance of the noise as a share of the field's.
+        variance: variance of the field for each component [q]; None, as ``system``, in a stored model.
+        system: covariance of the rows, factored.
     """
 
     kernel: str
@@ -92,127 +96,18 @@ class KrigedMean:
     weights: NDArray[np.inexact]
     like: NDArray[np.inexact]
     trend: Trend
+    noise: float = 0.0
+    variance: FloatArray | None = None
+    system: KrigingSystem | None = None
 
-    def correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
-        """Correlations [m, n] of positions [m, 3] with the rows.
-
-        Raises:
-            InputError: headings that the fit did not have, or the other way round.
-        """
+    def _correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
+        """Correlations [m, n] of positions [m, 3] with the rows."""
         if (tx_heading_rad is None) != (self.circle is None):
             had = "no headings" if self.circle is None else "headings"
             raise InputError(f"kriging: fitted with {had}; predict with the same")
         turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
         requested = _coordinates(positions_m, turned, self.lengths)
         return correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
-
-    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Observations [m, ...], see `Kriging.predict`."""
-        positions = np.atleast_2d(np.asarray(tx_pos, float))
-        cross = self.correlations(positions, tx_heading_rad)
-        mean = self.trend(positions) @ self.coefficients + cross @ self.weights
-        return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file."""
-        circle = np.zeros((0, 2)) if self.circle is None else self.circle
-        names = {"trend": np.asarray(self.trend.name), "kernel": np.asarray(self.kernel)}
-        return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedMean:
-        """The predictions that `arrays` described."""
-        circle = arrays["circle"] if len(arrays["circle"]) else None
-        trend, kept = _trend(str(arrays["trend"]), receiver), {name: arrays[name] for name in KEPT}
-        return cls(str(arrays["kernel"]), circle=circle, trend=trend, **kept)
-
-
-class Kriging:
-    """Kriging of real or complex observations over positions and, if given, headings.
-
-    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). Arguments that are
-    None are chosen by the restricted likelihood of the training rows, with the variance at its best value.
-
-    Args:
-        length_m: correlation length in metres, or None.
-        noise: variance of the noise as a share of the field's, or None.
-        heading_length: correlation length over headings, in chords of the unit circle, or None; unused without.
-        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
-        trend: columns of the trend; one unknown mean by default.
-        trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
-            kriging), in which every row weighs the same.
-        likelihood_rows: at most so many rows, drawn with ``seed``, enter the likelihood; all of them the prediction.
-        seed: seed of that draw.
-    """
-
-    def __init__(
-        self,
-        length_m: float | None = None,
-        noise: float | None = None,
-        heading_length: float | None = None,
-        kernel: str = "exponential",
-        trend: Trend = constant,
-        trend_fit: Literal["gls", "ols"] = "gls",
-        likelihood_rows: int = 1000,
-        seed: int = 0,
-    ) -> None:
-        for what, value in (("length", length_m), ("heading length", heading_length), ("noise", noise)):
-            zero = what == "noise"
-            if value is not None and not (np.isfinite(value) and (value > 0 or (zero and value == 0))):
-                raise InputError(f"kriging: {what} {value}; choose a finite number above 0, or None to have it chosen")
-        if kernel not in KERNELS or trend_fit not in ("gls", "ols"):
-            known = f"choose a kernel of {', '.join(KERNELS)} and gls or ols"
-            raise InputError(f"kriging: kernel {kernel!r}, trend by {trend_fit!r}; {known}")
-        if likelihood_rows < 2:
-            raise InputError(f"kriging: likelihood of {likelihood_rows} rows; choose 2 or more")
-        self.length_m, self.noise, self.heading_length = length_m, noise, heading_length
-        self.kernel, self.trend, self.trend_fit = kernel, trend, trend_fit
-        self.likelihood_rows, self.seed = likelihood_rows, seed
-
-    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriging:
-        """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
-
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: shape [n, ...], real or complex; rows with NaN, where nothing was received, are left out.
-            tx_heading_rad: shape [n], or None to leave headings out.
-
-        Raises:
-            InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
-                or rows that coincide while the noise is zero.
-        """
-        self._positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
-        like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
-        y = values.reshape(len(values), -1).astype(complex if np.iscomplexobj(values) else float)
-        self._circle = None if heading is None else _circle(heading)
-        columns = self.trend(self._positions)
-        if len(y) < columns.shape[1]:
-            raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
-        field, ordinary = y, None
-        if self.trend_fit == "ols":
-            # The field is the residual of the least-squares trend, which is taken as known from here on.
-            ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
-            field, columns = y - columns @ ordinary, columns[:, :0]
-        self._lengths, self.chosen_noise = self._choose(field, columns)
-        try:
-            self._system = self._factored(slice(None), columns, self._lengths, self.chosen_noise)
-        except LinAlgError:
-            raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
-        beta = self._system.coefficients(field)
-        weights = self._system.weights(field, beta)
-        coefficients = beta if ordinary is None else ordinary
-        rows = self._lengths, self._positions, self._circle
-        self.mean = KrigedMean(self.kernel, *rows, coefficients, weights, like, self.trend)
-        quadratic = (field.conj() * weights).real.sum(axis=0)
-        # The trend's degrees of freedom make the residual too small by their share.
-        self._variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
-        return self
-
-    @property
-    def chosen(self) -> dict[str, float]:
-        """Length in metres, noise as a share of the variance, and the heading's length where there is one."""
-        names = ("length_m", "heading_length")
-        return dict(zip(names, map(float, self._lengths), strict=False)) | {"noise": float(self.chosen_noise)}
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
         """Interpolate: [m, ...], in the observations' unit and type.
@@ -224,41 +119,135 @@ class Kriging:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
-        return self.mean.predict(tx_pos, tx_heading_rad)
+        positions = np.atleast_2d(np.asarray(tx_pos, float))
+        cross = self._correlations(positions, tx_heading_rad)
+        mean = self.trend(positions) @ self.coefficients + cross @ self.weights
+        return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
 
     def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
         """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
 
         The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
         """
+        assert self.system is not None
+        assert self.variance is not None
         mean = self.predict(tx_pos, tx_heading_rad)
         positions = np.atleast_2d(np.asarray(tx_pos, float))
-        cross = self.mean.correlations(positions, tx_heading_rad)
-        columns = self.trend(positions)[:, : self._system.trend.shape[1]]
-        share = self._system.variance(1.0, cross, columns) + self.chosen_noise
-        std = np.sqrt(share)[:, None] * np.sqrt(self._variance)
+        columns = self.trend(positions)[:, : self.system.trend.shape[1]]
+        share = self.system.variance(1.0, self._correlations(positions, tx_heading_rad), columns) + self.noise
+        std = np.sqrt(share)[:, None] * np.sqrt(self.variance)
         return Prediction(mean, std.reshape(mean.shape))
 
-    def _factored(
-        self, rows: slice | NDArray[np.intp], columns: FloatArray, lengths: FloatArray, noise: float
-    ) -> KrigingSystem:
-        circle = None if self._circle is None else self._circle[rows]
-        x = _coordinates(self._positions[rows], circle, lengths)
-        return KrigingSystem(correlation(x, x, self.kernel), noise, columns[rows])
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a run file."""
+        circle = np.zeros((0, 2)) if self.circle is None else self.circle
+        trend = CONSTANT if self.trend.receiver_m is None else LOG_DISTANCE
+        names = {"trend": np.asarray(trend), "kernel": np.asarray(self.kernel)}
+        return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
 
-    def _choose(self, field: NDArray[np.inexact], columns: FloatArray) -> tuple[FloatArray, float]:
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> Kriged:
+        """The predictions that `arrays` described."""
+        circle = arrays["circle"] if len(arrays["circle"]) else None
+        trend = _trend(str(arrays["trend"]), receiver)
+        kept: dict[str, Any] = {name: arrays[name] for name in KEPT}
+        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=trend, **kept)
+
+
+@dataclass(frozen=True)
+class CovarianceSettings(CheckedSettings):
+    """Settings of kriging's covariance; null: of the greatest restricted likelihood of the training rows.
+
+    Attributes:
+        length_m: correlation length, metres, or null.
+        noise: variance of the noise as a share of the field's, or null.
+        heading_length: correlation length over headings, in chords of the unit circle, or null; unused without.
+        kernel: exponential, matern32 or gaussian, see `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+        likelihood_rows: most rows of the likelihood, drawn with the seed; the prediction uses all.
+    """
+
+    length_m: Annotated[float | None, Field(gt=0, description="more than 0")] = None
+    noise: float | None = None
+    heading_length: Annotated[float | None, Field(gt=0, description="more than 0")] = None
+    kernel: Literal["exponential", "matern32", "gaussian"] = "exponential"
+    likelihood_rows: Annotated[int, Field(ge=2, description="2 or more")] = 1000
+
+
+@dataclass(frozen=True)
+class Kriging(CovarianceSettings):
+    """Kriging of real or complex observations over positions and, if given, headings.
+
+    c is a kernel of sqrt(|x - x'|^2 / length^2 + |(cos, sin) - (cos, sin)'|^2 / heading_length^2). The likelihood that
+    chooses has the variance at its best value.
+
+    Attributes:
+        trend: columns of the trend; one unknown mean by default.
+        trend_fit: ``gls``, jointly with the field (universal kriging); ``ols``, by least squares before it (regression
+            kriging), in which every row weighs the same.
+        seed: seed of the rows of the likelihood.
+    """
+
+    trend: Trend = constant
+    trend_fit: Literal["gls", "ols"] = "gls"
+    seed: int = 0
+
+    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriged:
+        """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
+
+        Args:
+            tx_pos: shape [n, 3], metres.
+            observation: shape [n, ...], real or complex; rows with NaN, where nothing was received, are left out.
+            tx_heading_rad: shape [n], or None to leave headings out.
+
+        Raises:
+            InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
+                or rows that coincide while the noise is zero.
+        """
+        positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
+        like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
+        y = values.reshape(len(values), -1).astype(complex if np.iscomplexobj(values) else float)
+        circle = None if heading is None else _circle(heading)
+        columns = self.trend(positions)
+        if len(y) < columns.shape[1]:
+            raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
+        field, ordinary = y, None
+        if self.trend_fit == "ols":
+            # The field is the residual of the least-squares trend, which is taken as known from here on.
+            ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
+            field, columns = y - columns @ ordinary, columns[:, :0]
+        lengths, noise = self._choose(field, columns, positions, circle)
+        try:
+            system = self._factored(_coordinates(positions, circle, lengths), noise, columns)
+        except LinAlgError:
+            raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
+        beta = system.coefficients(field)
+        weights = system.weights(field, beta)
+        coefficients = beta if ordinary is None else ordinary
+        quadratic = (field.conj() * weights).real.sum(axis=0)
+        # The trend's degrees of freedom make the residual too small by their share.
+        variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
+        rows = lengths, positions, circle
+        return Kriged(self.kernel, *rows, coefficients, weights, like, self.trend, noise, variance, system)
+
+    def _factored(self, coordinates: FloatArray, noise: float, columns: FloatArray) -> KrigingSystem:
+        return KrigingSystem(correlation(coordinates, coordinates, self.kernel), noise, columns)
+
+    def _choose(
+        self, field: NDArray[np.inexact], columns: FloatArray, positions_m: FloatArray, circle: FloatArray | None
+    ) -> tuple[FloatArray, float]:
         """Lengths and noise: as given, or of the greatest likelihood."""
         rows = np.arange(len(field))
         if len(rows) > self.likelihood_rows:
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
-        extent = float(np.linalg.norm(np.ptp(self._positions[rows], axis=0)))
+        positions_m, circle, columns = positions_m[rows], None if circle is None else circle[rows], columns[rows]
+        extent = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
         # Given value or None, limits, and first value of the search.
         table = [
             (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
-        given, limits, first = zip(*(table if self._circle is not None else [table[0], table[2]]), strict=True)
+        given, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
         free = np.array([value is None for value in given])
         value = np.array([0.0 if v is None else v for v in given])
         if not free.any():
@@ -271,7 +260,7 @@ class Kriging:
             """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
             value[free] = np.exp(logarithm)
             try:
-                system = self._factored(rows, columns, value[:-1], float(value[-1]))
+                system = self._factored(_coordinates(positions_m, circle, value[:-1]), float(value[-1]), columns)
             except LinAlgError:
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
@@ -301,56 +290,46 @@ def _circle(heading_rad: ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class KrigingSettings:
-    """Settings of kriging. Lengths and noise that are null are those of the greatest likelihood of the training rows.
+class KrigingSettings(CovarianceSettings):
+    """Settings of kriging.
 
     Attributes:
-        length_m: correlation length, metres, or null.
-        noise: variance of the noise as a share of the field's, or null.
-        heading_length: correlation length over headings, in chords of the unit circle, or null.
-        kernel: exponential, matern32 or gaussian.
         trend: constant, log-distance, or null: log-distance for signal strengths, else constant.
         trend_fit: gls (jointly with the field) or ols (before it), or null: ols for log-distance, else gls.
         heading: whether headings count, where the data have them and hold signal strengths.
-        likelihood_rows: most rows of the likelihood.
     """
 
-    length_m: float | None = None
-    noise: float | None = None
-    heading_length: float | None = None
-    kernel: str = "exponential"
     trend: str | None = None
     trend_fit: str | None = None
     heading: bool = True
-    likelihood_rows: int = 1000
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
     return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
 
 
-def _fitter(record: Record, split: Split, s: KrigingSettings, seed: int) -> FitSingle:
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> Kriged:
+    s, record = problem.settings, problem.record
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
-    how = cast(Literal["gls", "ols"], s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls"))
+    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
-    given = s.length_m, s.noise, s.heading_length, s.kernel
-
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> KrigedMean:
-        model = Kriging(*given, _trend(name, receiver), how, s.likelihood_rows, seed)
-        return model.fit(tx_pos, observed, heading).mean
-
-    return single
+    given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
+    model = Kriging(*given, _trend(name, receiver), how, problem.seed)
+    # The factored covariance of all receivers would fill the memory.
+    return replace(model.fit(tx_pos, observed, heading), system=None)
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "kriging",
     None,
     KrigingSettings,
-    _fitter,
-    lambda receiver, arrays: KrigedMean.from_arrays(arrays, receiver),
+    _fit,
+    lambda receiver, arrays: Kriged.from_arrays(arrays, receiver),
     "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
     lambda record, settings: settings.heading and task_of(record).in_decibel,
 )

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Receiver, Split
 from ...core.angles import FloatArray
-from .by_receiver import FitSingle, method_by_receiver
+from ..model import Problem
+from .by_receiver import model_by_receiver
 from .kriging import log_distance
 
 
@@ -54,16 +55,15 @@ class PathLoss:
         return {"law": self.law}
 
 
-def _fitter(record: Record, split: Split, settings: MriSettings, seed: int) -> FitSingle:
-    rows = split.all_train
-    columns = np.stack([log_distance(receiver.position_m)(record.tx_pos_m[rows]) for receiver in record.receivers])
-    shared = _law(columns, record.observation[:, rows]) if settings.shared else None
-
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: NDArray[Any], heading: FloatArray | None) -> PathLoss:
-        law = _law(log_distance(receiver.position_m)(tx_pos), observed) if shared is None else shared
-        return PathLoss(receiver.position_m, law)
-
-    return single
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> PathLoss:
+    columns = log_distance(receiver.position_m)(tx_pos)
+    if problem.settings.shared:
+        record, rows = problem.record, split.all_train
+        columns = np.stack([log_distance(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
+        observed = record.observation[:, rows]
+    return PathLoss(receiver.position_m, _law(columns, observed))
 
 
 def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
@@ -71,15 +71,14 @@ def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
     columns, observed = columns[received], observed[received].astype(float)
     if len(observed) < 2 or not np.ptp(columns[:, 1]) > 0:
         raise InputError(f"mri: {len(observed)} rows at one distance; an exponent shows at two or more")
-    law: FloatArray = np.linalg.lstsq(columns, observed, rcond=None)[0]
-    return law
+    return np.asarray(np.linalg.lstsq(columns, observed, rcond=None)[0])
 
 
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "mri",
     ("rssi",),
     MriSettings,
-    _fitter,
+    _fit,
     lambda receiver, arrays: PathLoss(receiver.position_m, arrays["law"]),
     "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss",
 )

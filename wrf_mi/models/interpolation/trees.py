@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Prediction, Receiver, Record, Split
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.angles import FloatArray
-from .by_receiver import FitSingle, method_by_receiver, observed_rows
+from ...core.settings import CheckedSettings, Count
+from ..model import Problem
+from .by_receiver import model_by_receiver, observed_rows
 
 
-class Trees:
+@dataclass(frozen=True)
+class Trees(CheckedSettings):
     """An average of extremely randomised regression trees over x, y, z and, if given, cosine and sine of the heading.
 
-    Args:
+    Attributes:
         trees: number of trees.
         leaf_rows: least number of training rows in a leaf, which averages noise out.
         seed: seed of the random cuts.
@@ -25,12 +27,11 @@ class Trees:
     Source: Geurts, Ernst and Wehenkel, "Extremely randomized trees" (2006); scikit-learn's `ExtraTreesRegressor`.
     """
 
-    def __init__(self, trees: int = 300, leaf_rows: int = 5, seed: int = 0) -> None:
-        if trees < 1 or leaf_rows < 1:
-            raise InputError(f"{trees} trees with {leaf_rows} rows in a leaf: choose 1 or more of both")
-        self.trees, self.leaf_rows, self.seed = trees, leaf_rows, seed
+    trees: Count = 300
+    leaf_rows: Count = 5
+    seed: int = 0
 
-    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Trees:
+    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> GrownTrees:
         """Grow the trees on the rows that were observed.
 
         Args:
@@ -48,39 +49,10 @@ class Trees:
         if values.ndim != 1 or np.iscomplexobj(values):
             raise InputError(f"trees: observations {values.shape} of type {values.dtype}; give one real number per row")
         positions, values, heading = observed_rows(tx_pos, values, tx_heading_rad)
-        self._like = np.empty((0, 3 if heading is None else 5), np.result_type(values, np.float32))
+        like = np.empty((0, 3 if heading is None else 5), np.result_type(values, np.float32))
         model = ExtraTreesRegressor(self.trees, min_samples_leaf=self.leaf_rows, random_state=self.seed)
-        self.model = model.fit(_features(positions, heading, self._like), values.astype(float))
-        return self
-
-    def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
-        """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].
-
-        Raises:
-            InputError: headings that the fit did not have, or the other way round.
-        """
-        result: NDArray[np.floating] = self.model.predict(_features(tx_pos, tx_heading_rad, self._like)).astype(
-            self._like.dtype
-        )
-        return result
-
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
-        """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
-
-        The variance within leaves and that between trees add up (law of total variance).
-        """
-        features = _features(tx_pos, tx_heading_rad, self._like)
-        mean, square = np.zeros(len(features)), np.zeros(len(features))
-        for tree in self.model.estimators_:
-            leaf = tree.apply(features)
-            value = tree.tree_.value[leaf, 0, 0]
-            mean += value / self.trees
-            square += (tree.tree_.impurity[leaf] + value**2) / self.trees
-        return Prediction(mean.astype(self._like.dtype), np.sqrt(np.maximum(square - mean**2, 0)))
-
-    def grown(self) -> GrownTrees:
-        """The trees as plain arrays."""
-        parts = [tree.tree_ for tree in self.model.estimators_]
+        model.fit(_features(positions, heading, like), values.astype(float))
+        parts = [tree.tree_ for tree in model.estimators_]
         first = np.concatenate([[0], np.cumsum([part.node_count for part in parts])])
         of_tree = np.repeat(first[:-1], np.diff(first))
         nodes = np.arange(first[-1])
@@ -99,7 +71,8 @@ class Trees:
             threshold=joined("threshold"),
             value=joined("value")[:, 0, 0],
             depth=np.asarray(max(part.max_depth for part in parts)),
-            like=self._like,
+            like=like,
+            variance=joined("impurity"),
         )
 
 
@@ -116,6 +89,7 @@ class GrownTrees:
         value: mean of the training rows in the node.
         depth: longest path from a root to a leaf.
         like: empty array [0, features] of the observations' type.
+        variance: variance of the training rows in the node; None in a stored model.
     """
 
     root: NDArray[np.int32]
@@ -126,9 +100,30 @@ class GrownTrees:
     value: FloatArray
     depth: NDArray[Any]
     like: NDArray[Any]
+    variance: FloatArray | None = None
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
-        """Average of the trees [m], as by `Trees.predict`."""
+        """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].
+
+        Raises:
+            InputError: headings that the fit did not have, or the other way round.
+        """
+        value = self.value[self._leaves(tx_pos, tx_heading_rad)]
+        return np.asarray(value.mean(axis=0), self.like.dtype)
+
+    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
+        """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
+
+        The variance within leaves and that between trees add up (law of total variance).
+        """
+        assert self.variance is not None
+        leaf = self._leaves(tx_pos, tx_heading_rad)
+        value = self.value[leaf]
+        variance = self.variance[leaf].mean(axis=0) + value.var(axis=0)
+        return Prediction(value.mean(axis=0).astype(self.like.dtype), np.sqrt(variance))
+
+    def _leaves(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None) -> NDArray[np.int32]:
+        """Leaf of each tree for each position [trees, m]."""
         # scikit-learn cuts features in single precision.
         single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
         rows = np.arange(len(single))
@@ -136,17 +131,11 @@ class GrownTrees:
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
-        result: NDArray[np.floating] = self.value[node].mean(axis=0).astype(self.like.dtype)
-        return result
+        return node
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GrownTrees:
-        """The trees that `arrays` described."""
-        return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
+        return {name: values for name, values in vars(self).items() if name != "variance"}
 
 
 def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray[Any]) -> FloatArray:
@@ -177,19 +166,18 @@ class TreesSettings:
     heading: bool = True
 
 
-def _fitter(record: Record, split: Split, settings: TreesSettings, seed: int) -> FitSingle:
-    def single(receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None) -> GrownTrees:
-        return Trees(settings.trees, settings.leaf_rows, seed).fit(tx_pos, observed, heading).grown()
+def _fit(
+    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
+) -> GrownTrees:
+    return Trees(problem.settings.trees, problem.settings.leaf_rows, problem.seed).fit(tx_pos, observed, heading)
 
-    return single
 
-
-METHOD = method_by_receiver(
+MODEL = model_by_receiver(
     "trees",
     ("rssi",),
     TreesSettings,
-    _fitter,
-    lambda receiver, arrays: GrownTrees.from_arrays(arrays),
+    _fit,
+    lambda receiver, arrays: GrownTrees(**arrays),
     "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
     lambda record, settings: settings.heading,
 )

@@ -18,33 +18,33 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...core import Record, Split
 from ...core.types import IntArray
-from ...tasks.conditions import channel_scales, channels_from, conditions_of, outputs_of, placed_receivers, truth_of
+from ...tasks.conditions import channel_scales, conditions_of, outputs_of, placed_receivers, truth_of
 from ...training.session import FitSession
-from ..method import (
-    Inputs,
-    Method,
+from ..model import (
+    Arrays,
+    Model,
+    Problem,
+    from_field_arrays,
     inputs_of,
-    keyed,
     known_positions,
     received_rows,
-    settings_array,
     stored_settings,
     under,
 )
-from .coordinates import Coordinates
-from .layers import columns
+from .layers import Coordinates, columns
 from .nerf2_field import Field, Nerf2Settings, step_loss
-from .nerf2_march import Nerf2Network, Seen
+from .nerf2_march import Nerf2Network
 from .training import Network, opaque_rows, train_network
 
 SCORED_RAYS = 512
@@ -53,56 +53,14 @@ FAR_M = 10.0
 """Length of rays if positions are not known: the size of a large room."""
 
 
-class FittedNerf2:
-    """Fitted fields.
-
-    Args:
-        field: evaluation of the fields.
-        networks: networks of each group of receivers.
-        shape: shape of an observation.
-    """
-
-    def __init__(self, field: Field, networks: list[Nerf2Network], shape: tuple[int, ...]) -> None:
-        self._field, self._networks, self._shape = field, networks, shape
-        self._seen: tuple[int, list[Seen]] | None = None
-
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
-
-        Raises:
-            InputError: fitted to uplink channels, and there are none.
-        """
-        field = self._field
-        network = next(n for n, members in zip(self._networks, field.groups, strict=True) if receiver in members)
-        if self._seen is None or self._seen[0] != receiver:
-            # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
-            self._seen = receiver, field.look(network, receiver)
-        condition, divisor = field.condition_of(inputs, receiver)
-        values, shape = field.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
-        return channels_from(values, divisor, shape) if field.task.is_complex else values.reshape(shape)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, frame and weights."""
-        field = self._field
-        arrays = {
-            "settings": settings_array(field.settings),
-            "far_m": np.asarray(field.far_m),
-            "scales": field.scales,
-            **keyed("frame/", field.coordinates.arrays()),
-        }
-        for g, network in enumerate(self._networks):
-            arrays |= keyed(f"group{g}/", network.arrays())
-        return arrays
-
-
-def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, session: FitSession) -> FittedNerf2:
+def fit(problem: Problem, split: Split, session: FitSession) -> Field:
     """Fit the networks.
 
     Raises:
         InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
     """
-    known = split.all_train
-    outputs = outputs_of(record)
+    record, known = problem.record, split.all_train
+    outputs, settings = outputs_of(record), problem.settings
     where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
     known_rx = np.stack([receiver.position_m for receiver in record.receivers])
     rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
@@ -112,8 +70,8 @@ def fit(record: Record, split: Split, settings: Nerf2Settings, seed: int, sessio
         where, farthest = rx, FAR_M
     scales = channel_scales(record, known)
     field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    networks = [_fit_group(record, split, field, seed, session, members) for members in field.groups]
-    return FittedNerf2(field, networks, record.observation.shape[2:])
+    field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
+    return field
 
 
 def _fit_group(
@@ -142,9 +100,6 @@ def _fit_group(
         rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
-    def loss(network: Nerf2Network, data: Any, given: Any) -> Any:
-        return step_loss(network, data, given, field)
-
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
     def score(network: Nerf2Network) -> float:
@@ -162,20 +117,21 @@ def _fit_group(
     everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
-    score_or_none = score if able else None
-    network = Network(name, initial, loss, data, draw, train, everything, score_or_none, "mean squared error")
+    rows_of = draw, train, everything, score if able else None
+    network = Network(name, initial, partial(step_loss, field=field), data, *rows_of, "mean squared error")
     trained: Nerf2Network = train_network(network, config, (seed, *members), session)[0]
     return trained
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedNerf2:
-    """The fields that `FittedNerf2.arrays` described."""
+def load(arrays: Arrays, problem: Problem, folder: Path) -> Field:
+    """The fields that `Field.arrays` described."""
     settings = stored_settings(Nerf2Settings, arrays, "nerf2")
-    coordinates = Coordinates.load(under("frame/", arrays))
-    field = Field(record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-    networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
-    return FittedNerf2(field, networks, record.observation.shape[2:])
+    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+    field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+    field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+    return field
 
 
 SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
-METHOD = Method("nerf2", ("spectrum", "rssi", "csi"), Nerf2Settings, fit, load, SOURCE)
+TASKS = "spectrum", "rssi", "csi"
+MODEL = Model("nerf2", TASKS, Nerf2Settings, fit, load, SOURCE, uplink="optional", headings=True)

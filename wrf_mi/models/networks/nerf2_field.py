@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
 from ...backend.recorded import Recorded
-from ...core import InputError, Record
+from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ...tasks import Task, task_of
-from ...tasks.conditions import known_uplink, normalised_uplink, outputs_of, placed_receivers
+from ...tasks.conditions import channels_from, known_uplink, normalised_uplink, outputs_of, placed_receivers
 from ...training.loop_config import AdamConfig
-from ..method import Inputs
-from .coordinates import Coordinates, feature_count
-from .layers import columns
-from .nerf2_march import Nerf2Network, Networks, Rays, Seen, constant_parts, look, march
+from ..model import Fitted, Inputs, field_arrays, keyed, settings_array
+from .layers import Coordinates, columns, feature_count
+from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
 from .training import NetworkSettings, network_adam, opaque_rows
 
 DB_UNIT = 10.0
@@ -78,10 +77,10 @@ class Nerf2Settings(NetworkSettings):
             raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
 
 
-def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> Rays:
+def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> dict[str, Any]:
     """Rays of a receiver: its index, the rays' indices, and how many rays a receiver has."""
-    shared = {name: data[name] for name in ("distance", "cell", "before", "wave_re", "wave_im", "extent")}
-    return Rays(columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver), **shared)
+    direction, origin = columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver)
+    return {**data, "direction": direction, "origin": origin}
 
 
 def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
@@ -103,8 +102,8 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
     return dr.moveaxis(both, 0, 1)
 
 
-class Field:
-    """All of a fitted field but its weights, and its evaluation in two steps that are recorded once.
+class Field(Fitted):
+    """A fitted field, evaluated in two steps that are recorded once.
 
     Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
 
@@ -120,8 +119,9 @@ class Field:
         task: task of the record.
         n_rays: rays of a receiver.
         groups: indices of the receivers that share networks.
-        data: constants of every evaluation on the device: rays of all receivers, and the shared parts of `Rays`.
+        data: constants of every evaluation on the device: rays of all receivers, and `constant_parts`.
         network: networks whose weights are to be replaced.
+        networks: fitted networks of each group.
 
     Raises:
         InputError: a receiver without a pose that is needed.
@@ -131,7 +131,9 @@ class Field:
         self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
     ) -> None:
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
-        self.outputs, self.task = outputs_of(record), task_of(record)
+        self.outputs, self.task, self._shape = outputs_of(record), task_of(record), record.observation.shape[2:]
+        self.networks: list[Nerf2Network] = []
+        self._seen: tuple[int, list[Seen]] | None = None
         receivers = placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
         self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
@@ -154,7 +156,7 @@ class Field:
         network, s = self.network, settings
 
         @Recorded
-        def looked(params: dict[str, Any], rays: Rays) -> Any:
+        def looked(params: dict[str, Any], rays: dict[str, Any]) -> Any:
             with dr.suspend_grad():
                 return look(network.with_state(params), rays)
 
@@ -171,6 +173,32 @@ class Field:
         """Networks with random weights."""
         receivers = sum(len(members) for members in self.groups)
         return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
+
+        Raises:
+            InputError: fitted to uplink channels, and there are none.
+        """
+        network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
+        if self._seen is None or self._seen[0] != receiver:
+            # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
+            self._seen = receiver, self.look(network, receiver)
+        condition, divisor = self.condition_of(inputs, receiver)
+        values, shape = self.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
+        return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Settings, frame and weights."""
+        arrays = {
+            "settings": settings_array(self.settings),
+            "far_m": np.asarray(self.far_m),
+            "scales": self.scales,
+            **field_arrays(self.coordinates, "frame/"),
+        }
+        for g, network in enumerate(self.networks):
+            arrays |= keyed(f"group{g}/", network.arrays())
+        return arrays
 
     def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
         """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""

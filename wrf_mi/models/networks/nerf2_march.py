@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -31,8 +31,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 
 from ...core.settings import Count, Positive
-from .coordinates import feature_count, with_encoding
-from .layers import Linear, Mlp, Module, relu, sigmoid
+from .layers import Linear, Mlp, Module, feature_count, relu, sigmoid, with_encoding
 
 LEAK = 0.01
 """Slope of the leaky ReLU below zero, PyTorch's default."""
@@ -87,31 +86,6 @@ class Nerf2Network(Module):
 
 
 @dataclass
-class Rays:
-    """Rays on the device, as arguments of recorded functions.
-
-    Attributes:
-        direction: unit vectors in the world [3, rays].
-        origin: starting point [3, 1], metres from the frame's centre.
-        distance: r_s of the cells' middles [1, S], metres.
-        cell: D, metres [1].
-        before: strictly lower triangular ones [S, S], transposed: sums over the cells before each.
-        wave_re: real part of (D / r_s) exp(-j k r_s), [outputs, S].
-        wave_im: its imaginary part.
-        extent: unit of plain coordinates [1], metres.
-    """
-
-    direction: Any
-    origin: Any
-    distance: Any
-    cell: Any
-    before: Any
-    wave_re: Any
-    wave_im: Any
-    extent: Any
-
-
-@dataclass
 class Seen:
     """Everything about the points of some rays that does not depend on the transmitter.
 
@@ -126,16 +100,22 @@ class Seen:
     first: Any
 
 
-def look(network: Nerf2Network, rays: Rays) -> Seen:
-    """Evaluate the attenuation network on all points of some rays."""
+def look(network: Nerf2Network, rays: Mapping[str, Any]) -> Seen:
+    """Evaluate the attenuation network on all points of some rays.
+
+    Args:
+        network: both networks.
+        rays: tensors of `constant_parts`, ``direction`` (unit vectors in the world [3, rays]) and ``origin`` (starting
+            point [3, 1], metres from the frame's centre).
+    """
     sizes, radiance = network.sizes, network.radiance.layers[0]
-    count, samples = rays.direction.shape[1], rays.distance.shape[1]
-    tensor = type(rays.direction)
+    count, samples = rays["direction"].shape[1], rays["distance"].shape[1]
+    tensor = type(rays["direction"])
     n = count * samples
-    along: Any = dr.reshape(rays.direction, (3, count, 1)) * dr.reshape(rays.distance, (1, 1, samples))
-    points = dr.reshape(along, (3, n)) + rays.origin
-    encoded = with_encoding(points, sizes.point_octaves, sizes.scale_m, 1 / rays.extent)
-    view = with_encoding(rays.direction, sizes.view_octaves, 1.0, 1)
+    along: Any = dr.reshape(rays["direction"], (3, count, 1)) * dr.reshape(rays["distance"], (1, 1, samples))
+    points = dr.reshape(along, (3, n)) + rays["origin"]
+    encoded = with_encoding(points, sizes.point_octaves, sizes.scale_m, 1 / rays["extent"])
+    view = with_encoding(rays["direction"], sizes.view_octaves, 1.0, 1)
     first, *others = network.attenuation.layers
     hidden = relu(first(point=encoded))
     for number, layer in enumerate(others, 1):
@@ -146,15 +126,15 @@ def look(network: Nerf2Network, rays: Rays) -> Seen:
 
     def before(x: Any) -> Any:
         """Sum over the cells before each, times their length, [outputs, rays * S]."""
-        total = dr.reshape(x, (outputs * count, samples)) @ rays.before
-        return dr.reshape(total * rays.cell, (outputs, n))
+        total = dr.reshape(x, (outputs * count, samples)) @ rays["before"]
+        return dr.reshape(total * rays["cell"], (outputs, n))
 
     amplitude = dr.exp(-before(strength(out[:outputs, :])))
     sine, cosine = dr.sincos(before(phase(out[outputs:, :])))
     # All rays have the same cells.
     waves: list[Any] = [
         dr.reshape(dr.reshape(w, (outputs, 1, samples)) + dr.zeros(tensor, (1, count, 1)), (outputs, n))
-        for w in (rays.wave_re, rays.wave_im)
+        for w in (rays["wave_re"], rays["wave_im"])
     ]
     wave_re, wave_im = waves
     re = amplitude * (wave_re * cosine + wave_im * sine)
@@ -186,8 +166,7 @@ def march(network: Nerf2Network, seen: Seen, condition: Any, samples: int) -> tu
     amplitude: Any = dr.reshape(strength(out[:outputs, :]), (outputs, batch, n))
     angle: Any = dr.reshape(phase(out[outputs:, :]), (outputs, batch, n))
     sine, cosine = dr.sincos(angle)
-    weights: list[Any] = [dr.reshape(w, (outputs, 1, n)) for w in (seen.weight_re, seen.weight_im)]
-    w_re, w_im = weights
+    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (seen.weight_re, seen.weight_im))
     re = amplitude * (cosine * w_re - sine * w_im)
     im = amplitude * (cosine * w_im + sine * w_re)
     return dr.block_sum(re.array, samples), dr.block_sum(im.array, samples)
@@ -206,7 +185,13 @@ def phase(x: Any) -> Any:
 def constant_parts(
     extent_m: float, near_m: float, far_m: float, samples: int, frequencies_hz: ArrayLike
 ) -> Mapping[str, NDArray[Any]]:
-    """Everything of `Rays` but origin and directions, as NumPy arrays; a frequency of 0 has no phase."""
+    """Constants of all rays, as NumPy arrays; a frequency of 0 has no phase.
+
+    Returns:
+        ``distance``: r_s of the cells' middles [1, S], metres; ``cell``: D, metres [1]; ``before``: strictly lower
+        triangular ones [S, S], transposed: sums over the cells before each; ``wave_re`` and ``wave_im``: parts of
+        (D / r_s) exp(-j k r_s), [outputs, S]; ``extent``: unit of plain coordinates [1], metres.
+    """
     cell = (far_m - near_m) / samples
     distance = near_m + (np.arange(samples, dtype=np.float64) + 0.5) * cell
     wavenumber = 2 * np.pi * np.asarray(frequencies_hz, float)[:, None] / speed_of_light

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -12,12 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.device import to_float, to_tensor
-from ...core import Record, Split
+from ...core import Prediction, Split
 from ...tasks import TASKS
 from ...tasks.ssim import ssim
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, known_positions, received_rows, settings_array, stored_settings, under
-from .coordinates import Coordinates
+from ..model import (
+    Arrays,
+    Fitted,
+    Inputs,
+    Model,
+    Problem,
+    field_arrays,
+    from_field_arrays,
+    keyed,
+    known_positions,
+    received_rows,
+    settings_array,
+    stored_settings,
+    under,
+)
+from .layers import Coordinates
 from .training import Network, train_network
 
 SPECTRUM = TASKS["spectrum"]
@@ -39,11 +54,6 @@ class ReceiverRows:
     where: Any
     train: int
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of a spectrum."""
-        return int(self.spectra.shape[1]), int(self.spectra.shape[2])
-
     def network(self, kind: SpectrumNetwork, module: Any, loss: Any, data: Any, draw: Any) -> Network:
         """Training of a network on these rows, scored by the median structural similarity of those that choose."""
         count = len(self.spectra) - self.train
@@ -52,7 +62,7 @@ class ReceiverRows:
             asked, truth = to_tensor(self.where.numpy()[:, self.train :]), to_float(self.spectra[self.train :])
             with dr.suspend_grad():
                 predicted = getattr(module, kind.generator).spectra(asked)
-            return float(np.median(ssim(predicted, truth, count, *self.shape).numpy()))
+            return float(np.median(ssim(predicted, truth, count, *self.spectra.shape[1:]).numpy()))
 
         rows = [np.arange(self.train)], [np.arange(len(self.spectra))], score if count else None
         name = f"{kind.name} {self.receiver}"
@@ -82,13 +92,14 @@ class SpectrumNetwork:
     at_once: int
     source: str
 
-    def method(self) -> Method:
+    def model(self) -> Model:
         """Entry of the registry."""
-        return Method(self.name, ("spectrum",), self.settings, partial(_fit, self), partial(_load, self), self.source)
+        how = partial(_fit, self), partial(_load, self), self.source
+        return Model(self.name, ("spectrum",), self.settings, *how, uplink="optional", headings=True)
 
 
 @dataclass(frozen=True)
-class FittedNetworks:
+class FittedNetworks(Fitted):
     """Fitted networks.
 
     Attributes:
@@ -105,7 +116,7 @@ class FittedNetworks:
     generators: list[Any]
     shape: tuple[int, int]
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], float32."""
         s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
         for first in range(0, len(inputs), self.kind.at_once):
@@ -113,20 +124,19 @@ class FittedNetworks:
             where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
             with dr.suspend_grad():
                 out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
-        return out
+        return Prediction(out)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
         arrays = {"settings": settings_array(self.settings), "shape": np.asarray(self.shape)}
-        arrays |= keyed("frame/", self.coordinates.arrays())
+        arrays |= field_arrays(self.coordinates, "frame/")
         for r, generator in enumerate(self.generators):
             arrays |= keyed(f"receiver{r}/{self.kind.generator}.", generator.arrays())
         return arrays
 
 
-def _fit(
-    kind: SpectrumNetwork, record: Record, split: Split, settings: Any, seed: int, session: FitSession
-) -> FittedNetworks:
+def _fit(kind: SpectrumNetwork, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
+    record, settings, seed = problem.record, problem.settings, problem.seed
     coordinates = Coordinates.of(known_positions(record, split.all_train, kind.name))
     generators = []
     for r, receiver in enumerate(record.receivers):
@@ -140,9 +150,12 @@ def _fit(
     return FittedNetworks(kind, settings, coordinates, generators, (height, width))
 
 
-def _load(kind: SpectrumNetwork, arrays: dict[str, NDArray[Any]], record: Record) -> FittedNetworks:
+def _load(kind: SpectrumNetwork, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
     settings: Any = stored_settings(kind.settings, arrays, kind.name)
     height, width = (int(side) for side in arrays["shape"])
     made = kind.make(settings, (height, width), np.random.default_rng(0))
-    generators = [made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(record.receivers))]
-    return FittedNetworks(kind, settings, Coordinates.load(under("frame/", arrays)), generators, (height, width))
+    generators = [
+        made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(problem.record.receivers))
+    ]
+    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+    return FittedNetworks(kind, settings, coordinates, generators, (height, width))

@@ -26,7 +26,7 @@ from ...training.loop_config import AdamConfig, LoopConfig
 from ...training.schedule import plan
 from ...training.session import FitSession
 from ...training.state import FitState
-from ..method import keyed, under
+from ..model import keyed, under
 from .layers import Module
 
 HOLD_OUT = 0.8

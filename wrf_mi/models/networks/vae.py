@@ -14,6 +14,7 @@ output representation using deep conditional generative models" (2015). Chosen h
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -23,13 +24,9 @@ from numpy.typing import NDArray
 from ...backend.device import to_tensor
 from ...core.settings import Count, Positive, Share
 from ...core.types import IntArray
-from .coordinates import feature_count
-from .layers import Linear, Mlp, Module, columns, sigmoid
+from .layers import Linear, Mlp, Module, columns, feature_count, sigmoid
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, opaque_rows
-
-CHUNK_SIZE = 64
-"""Spectra that are predicted together: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +69,13 @@ def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
     n, height, width = spectra.shape
     side = max(s for s in range(1, pool + 1) if height % s == 0 and width % s == 0)
     blocks = spectra.reshape(n, height // side, side, width // side, side)
-    result: NDArray[np.float32] = blocks.mean(axis=(2, 4), dtype=np.float64).reshape(n, -1).astype(np.float32)
-    return result
+    return np.asarray(blocks.mean(axis=(2, 4), dtype=np.float64).reshape(n, -1), np.float32)
 
 
 class Decoder(Mlp):
     """Mean of p(spectrum | z, position), [pixels, batch], in 0..1."""
 
-    def __init__(self, s: VaeSettings, shape: tuple[int, int], rng: np.random.Generator) -> None:
+    def __init__(self, s: VaeSettings, shape: tuple[int, ...], rng: np.random.Generator) -> None:
         first = Linear({"latent": s.latent, "position": feature_count(s.octaves)}, s.width, rng)
         super().__init__([first, Linear(s.width, s.last, rng)], Linear(s.last, shape[0] * shape[1], rng, gain=1.0))
         self.size = s.latent
@@ -93,7 +89,7 @@ class Decoder(Mlp):
 class Vae(Module):
     """Encoder ``q`` and decoder ``p``."""
 
-    def __init__(self, s: VaeSettings, cells: int, shape: tuple[int, int], rng: np.random.Generator) -> None:
+    def __init__(self, s: VaeSettings, cells: int, shape: tuple[int, ...], rng: np.random.Generator) -> None:
         first = Linear({"image": cells, "position": feature_count(s.octaves)}, s.width, rng)
         self.q = Mlp([first, Linear(s.width, s.width, rng)], Linear(s.width, 2 * s.latent, rng, gain=0.1))
         self.p = Decoder(s, shape, rng)
@@ -132,7 +128,7 @@ def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Net
     cells, flat = pooled(rows.spectra, s.pool), rows.spectra.reshape(len(rows.spectra), -1)
     data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
     dr.make_opaque(data)
-    vae = Vae(s, cells.shape[1], rows.shape, rng)
+    vae = Vae(s, cells.shape[1], rows.spectra.shape[1:], rng)
     # The decoder starts at the mean spectrum of the rows that it may learn from.
     mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
     assert vae.p.out is not None
@@ -142,7 +138,7 @@ def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Net
         noise, prior = rng.standard_normal((2, s.latent, len(chosen)))
         return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
 
-    return rows.network(KIND, vae, lambda vae, data, given: elbo_loss(vae, data, given, s), data, draw)
+    return rows.network(KIND, vae, partial(elbo_loss, s=s), data, draw)
 
 
 KIND = SpectrumNetwork(
@@ -151,7 +147,7 @@ KIND = SpectrumNetwork(
     network,
     Decoder,
     "p",
-    CHUNK_SIZE,
+    64,
     "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
 )
-METHOD = KIND.method()
+MODEL = KIND.model()

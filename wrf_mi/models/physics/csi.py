@@ -3,7 +3,7 @@
 A mesh from LiDAR gives planes to millimetres or centimetres, and rough outlines. Phases need tenths of millimetres, and
 the error is mostly decided by which paths exist. So, with measured channels, three steps alternate: the probability of
 each path is inferred from a row's channel (`csi_fit`), planes are shifted and tilted until all phases fit
-(`csi_repair`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
+(`csi_paths`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
 elsewhere (`csi_visibility`). The residual is a diffuse field, useful within half a wavelength of measurements.
 
 Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field.
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,15 @@ from ...core import InputError, Receiver, Record, receiver_arrays, stored_receiv
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
+from ...tracing.search import shoot
+from ...tracing.surfaces import scene_surfaces
 from ...tracing.walls import Walls, no_walls, walls_of
 from ...training.session import OnProgress, quiet
-from ..interpolation.kriging_equations import simple_weights
+from ..model import Arrays, field_arrays, from_field_arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
-from .csi_paths import MOUNTED_M, images_of
-from .csi_repair import NUMBERS, Complex, Model
+from .csi_paths import MOUNTED_M, NUMBERS, Complex, Model, images_of
 from .csi_visibility import Visibility
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from .selection import PhysicsModel, physics_model
 
 DEFAULTS = CsiSettings()
 NEIGHBOURS = 32
@@ -75,9 +76,9 @@ class DiffuseField:
         between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
         matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
         across = self.share * np.sinc(self.k * distance / np.pi)
-        weight, known = simple_weights(matrix, across)
+        weight = np.linalg.solve(matrix, across[..., None])[..., 0]
         mean = np.einsum("mn,mnf->mf", weight, self.value[index])
-        return mean, self.power * np.maximum(1 - known, 1e-6)
+        return mean, self.power * np.maximum(1 - (weight * across).sum(axis=-1), 1e-6)
 
 
 def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:
@@ -130,11 +131,8 @@ class CsiPhysics(PhysicsModel):
     sharpness: float
     covariance: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "csi"
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[Complex, FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))
         paths = paths_of_rows(self.model, rows)
         odds = self.visibility.log_odds(self.model.walls, self.model.images, paths)
@@ -198,15 +196,10 @@ def fit_csi(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> CsiPhysics:
-    """Fit a CSI physics model.
+    """Fit a CSI physics model to ``rows`` of a record; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: complex channels.
-        rows: training rows; none: the image method on the scene as given.
-        scene: from `wrf_mi.tracing.open_scene`, or None: the line of sight and a diffuse field.
-        settings: settings of the fit.
-        seed: seed of rays, folds and grids of cells.
-        on_progress: progress callback: stage and fraction done.
+    Without rows it is the image method on the scene as given, without a scene the line of sight and a diffuse field.
+    ``seed`` is that of rays, folds and grids of cells.
 
     Raises:
         InputError: a record of another task, without frequencies, or neither rows nor a scene.
@@ -238,7 +231,7 @@ def fit_csi(
     return CsiPhysics(record.receivers, fit.model, fit.visibility, fields, sharpness, fit.covariance, fit.facts)
 
 
-KIND = PhysicsKind(CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
+MODEL = physics_model("csi", CsiSettings, fit_csi, CsiPhysics.from_arrays, uses_antennas=False)
 
 
 def _measured(record: Record, rows: IntArray) -> Rows:
@@ -256,9 +249,6 @@ def _start(record: Record, scene: Any | None, settings: CsiSettings, seed: int) 
     line_of_sight = np.full((1, depth), -1)
     walls, chains = no_walls(), [line_of_sight] * len(source_m)
     if scene is not None:
-        from ...tracing.search import shoot
-        from ...tracing.surfaces import scene_surfaces
-
         surfaces = scene_surfaces(scene)
         walls = walls_of(surfaces)
         for index, antenna_m in enumerate(source_m):

@@ -9,16 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import combinations
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy.special import expit
 
 from ...core import InputError
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
-from .csi_paths import CandidatePaths, candidate_paths
-from .csi_repair import Complex, Explained, Model, refit
-from .csi_visibility import Learner, Visibility, prior_odds
+from .csi_paths import CandidatePaths, Complex, Explained, Model, candidate_paths, refit
+from .csi_visibility import MARGINS_M, Learner, Visibility, prior_odds
 
 FLIPS = (24, 24, 14, 9)
 """Hypotheses flip 1, 2, 3 or 4 of so many most uncertain paths of a row against their likelier prior state."""
@@ -38,7 +40,7 @@ SHARPNESS = (1.0, 2.0, 4.0, 16.0)
 
 
 @dataclass(frozen=True)
-class CsiSettings:
+class CsiSettings(CheckedSettings):
     """Settings of the fit of a CSI physics model.
 
     Attributes:
@@ -56,29 +58,22 @@ class CsiSettings:
     """
 
     reflections: int = 2
-    rays: int = 1 << 18
-    reflection: float = 1.0
+    rays: Count = 1 << 18
+    reflection: Finite = 1.0
     reflection_sd: float = 0.05
-    shift_sd_m: float = 0.004
-    outline_sd_m: float = 0.02
-    ridge: float = 1.0
+    shift_sd_m: Positive = 0.004
+    outline_sd_m: Positive = 0.02
+    ridge: Positive = 1.0
     repair_rounds: int = 8
     visibility_rounds: int = 6
-    folds: int = 5
+    folds: Annotated[int, Field(ge=2, description="2 or more")] = 5
     fit_gain: bool = False
 
     def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        whole = {"reflections": 0, "rays": 1, "repair_rounds": 0, "visibility_rounds": 0, "folds": 2}
-        for name, least in whole.items():
-            if getattr(self, name) < least:
-                raise InputError(f"{name} {getattr(self, name)}: give {least} or more")
-        for name in ("shift_sd_m", "outline_sd_m", "ridge"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} {getattr(self, name)}: give a positive number")
-        if self.reflection == 0 or self.reflection_sd < 0:
-            text = f"reflection {self.reflection}, reflection_sd {self.reflection_sd}"
-            raise InputError(f"{text}: give a reflection other than 0 and a standard deviation of 0 or more")
+        """Refuse settings out of range (`InputError`)."""
+        super().__post_init__()
+        if self.reflection == 0:
+            raise InputError("setting reflection: 0 is out of range, choose another number")
 
 
 @dataclass(frozen=True)
@@ -134,24 +129,23 @@ def decode(
     log_odds: FloatArray,
     phase_sd_rad: FloatArray,
     noise: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, Complex, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
     """Posterior probabilities of p paths in measured channels [n, subcarriers].
 
     ``row`` (ascending), ``gain`` [p, subcarriers], prior ``log_odds`` and ``phase_sd_rad`` are those of each path [p];
     ``noise`` holds weights and standard deviations of a mixture of circular Gaussians.
 
     Returns:
-        Probability of each path [p]; residual of the likeliest hypothesis [n, subcarriers]; probability of each
-        component of the noise [n, components].
+        Probability of each path [p], and of each component of the noise [n, components].
     """
     count, carriers = channel.shape
     flips, (weight, sd) = _flips(), noise
     probability = 1 / (1 + np.exp(-log_odds))
-    residual, share = channel.astype(complex), np.zeros((count, len(weight)))
+    share = np.zeros((count, len(weight)))
     if not len(row):
-        log = np.log(weight) - carriers * np.log(sd * sd) - np.square(np.abs(residual)).sum(axis=1)[:, None] / (sd * sd)
+        log = np.log(weight) - carriers * np.log(sd * sd) - np.square(np.abs(channel)).sum(axis=1)[:, None] / (sd * sd)
         share = np.exp(log - log.max(axis=1, keepdims=True))
-        return probability, residual, share / share.sum(axis=1, keepdims=True)
+        return probability, share / share.sum(axis=1, keepdims=True)
     first = np.searchsorted(row, np.arange(count + 1))
     likely = log_odds > 0
     blur = np.square(np.abs(gain)).mean(axis=1) * np.square(phase_sd_rad)
@@ -178,9 +172,8 @@ def decode(
         hypothesis = joint.sum(axis=2)
         flipped = hypothesis @ flips
         probability[path[known]] = np.where(likely[path], 1 - flipped, flipped)[known]
-        residual[rows] = left[np.arange(len(rows)), hypothesis.argmax(axis=1)]
         share[rows] = joint.sum(axis=1)
-    return probability, residual, share
+    return probability, share
 
 
 def prior_sd(model: Model, settings: CsiSettings) -> FloatArray:
@@ -202,7 +195,8 @@ class Fit:
 
     def __init__(self, model: Model, rows: Rows, settings: CsiSettings, seed: int) -> None:
         self.model, self._rows, self._settings, self._seed = model, rows, settings, seed
-        self.visibility = Visibility.of_scene(len(model.scan.edge_m), settings.outline_sd_m, seed)
+        unlearned = np.zeros(1 + 2 * len(MARGINS_M)), np.zeros(0, np.int64), np.zeros(0)
+        self.visibility = Visibility(np.zeros(len(model.scan.edge_m)), *unlearned, settings.outline_sd_m, seed)
         self.covariance = np.diag(np.square(prior_sd(model, settings)).reshape(-1))
         self.facts = {"rows": float(len(rows.channel))}
         self._paths = paths_of_rows(model, rows)
@@ -259,7 +253,7 @@ class Fit:
         position = rows.position_m[paths.row]
         phase = np.minimum(self.model.phase_sd(paths.chain, position, self.covariance), WIDEST_RAD)
         gain = self.model.path_gain(paths.chain, position)
-        probability, _, share = decode(rows.channel, paths.row, gain, self._odds, phase, self._noise)
+        probability, share = decode(rows.channel, paths.row, gain, self._odds, phase, self._noise)
         self._noise = (1 - FLOOR) * share.mean(axis=0) + FLOOR / len(SCALES), self._noise[1]
         unsure = np.square(np.abs(gain)).mean(axis=1) * probability * (1 - probability)
         unsure = np.bincount(paths.row, unsure, len(rows.channel))

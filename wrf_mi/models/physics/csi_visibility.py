@@ -64,12 +64,6 @@ class Visibility:
     outline_sd_m: float
     seed: int
 
-    @classmethod
-    def of_scene(cls, edges: int, outline_sd_m: float, seed: int) -> Visibility:
-        """Visibility in the scene as given, with ``edges`` edges."""
-        margin, key = np.zeros(1 + 2 * len(MARGINS_M)), np.zeros(0, np.int64)
-        return cls(np.zeros(edges), margin, key, np.zeros(0), outline_sd_m, seed)
-
     def log_odds(self, walls: Walls, images: Images, paths: CandidatePaths) -> FloatArray:
         """Logarithm of the odds that paths exist."""
         path, cell, value = path_cells(walls, images, paths, self.seed)

@@ -6,7 +6,7 @@ Two estimates of a spectrum are mixed:
   leaving within a cone around the line of sight (`wrf_mi.models.physics.signals`), and the spectrum to be expected from
   them: at each direction the beam former's output is a complex Gaussian number, so its magnitude is Rician;
 - *nearby*: kriging of the spectra themselves along and across the line of sight
-  (`wrf_mi.models.physics.anisotropic_kriging`).
+  (`wrf_mi.models.interpolation.kriging_equations`).
 
 Kriging is best over millimetres, as it needs no phase, and the signals over a wavelength; beyond, the mean of the
 spectra, to which kriging falls back, is safest. So the signals have the weight v^2 / (v^2 + c^2) (1 - v), v being their
@@ -20,16 +20,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from scipy.special import i0e, i1e
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray, pixel_directions
+from ...core.settings import CheckedSettings, Count, Positive
 from ...core.types import IntArray
 from ...receivers.array import array_response
 from ...receivers.lags import Lags
@@ -37,8 +39,9 @@ from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks import require
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress, quiet
-from .anisotropic_kriging import AnisotropicKriging, fit_anisotropic, line_of_sight
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from ..interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
+from ..model import Arrays, field_arrays, from_field_arrays
+from .selection import PhysicsModel, physics_model
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
@@ -62,7 +65,7 @@ Image = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
-class MeasuredSpectrumSettings:
+class MeasuredSpectrumSettings(CheckedSettings):
     """Settings of the physics model for spectra without a mesh.
 
     Attributes:
@@ -74,22 +77,18 @@ class MeasuredSpectrumSettings:
         starts: starts of the phase retrieval of one spectrum, at most.
     """
 
-    cone_deg: float = 80.0
-    directions: int = 120
-    longest: float = 4.6
-    shortest: float = 0.25
-    lengths: int = 4
-    starts: int = 60
+    cone_deg: Annotated[float, Field(gt=0, le=180, description="more than 0 and at most 180")] = 80.0
+    directions: Count = 120
+    longest: Positive = 4.6
+    shortest: Positive = 0.25
+    lengths: Count = 4
+    starts: Count = 60
 
     def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name in ("directions", "lengths", "starts"):
-            if getattr(self, name) < 1:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose 1 or more")
-        if not 0 < self.cone_deg <= 180:
-            raise InputError(f"setting cone_deg: {self.cone_deg}; choose more than 0 and at most 180")
-        if not 0 < self.shortest <= self.longest < np.inf:
-            raise InputError(f"setting shortest: {self.shortest}; choose more than 0 and at most longest")
+        """Refuse settings out of range (`InputError`)."""
+        super().__post_init__()
+        if self.shortest > self.longest:
+            raise InputError(f"setting shortest: {self.shortest} is out of range, choose at most longest")
 
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -191,12 +190,9 @@ class MeasuredSpectrumPhysics(PhysicsModel):
     sides: tuple[Side, ...]
     frequency_hz: float
     shape: tuple[int, int]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 16
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[NDArray[np.float32], FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         side = self.sides[receiver]
         posterior = side.signals.predict(tx_pos_m)
         mean, std = side.mixed(posterior, side.nearby.predict(tx_pos_m), side.nearby.std(tx_pos_m))
@@ -255,14 +251,9 @@ def fit_measured_spectrum(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> MeasuredSpectrumPhysics:
-    """Fit the physics model to training rows.
+    """Fit the physics model to ``rows`` of spectra; arguments as ``fit`` of `physics_model`, without a scene.
 
-    Args:
-        record: spectra, with array and carrier frequency.
-        rows: training rows [n].
-        settings: settings of the fit.
-        seed: seed of starts and of the held-out rows.
-        on_progress: progress callback: stage and fraction done.
+    ``seed`` is that of starts and of the held-out rows.
 
     Raises:
         InputError: no spectra, no array, or too few rows.
@@ -303,7 +294,8 @@ def fit_measured_spectrum(
     return MeasuredSpectrumPhysics(record.receivers, tuple(sides), frequency_hz, (height, width))
 
 
-KIND = PhysicsKind(
+MODEL = physics_model(
+    "spectrum",
     MeasuredSpectrumSettings,
     lambda record, rows, scene, *how: fit_measured_spectrum(record, rows, *how),
     MeasuredSpectrumPhysics.from_arrays,

@@ -1,6 +1,6 @@
 """Received signal strength: expectation by mesh and physics, corrected by measurements.
 
-The expected value is the traced power, averaged over a neighbourhood (`rssi_map`), or free space without a mesh. It is
+The expected value is the traced power, averaged over a neighbourhood (`PowerMap`), or free space without a mesh. It is
 corrected by an offset of each receiver, the exponent of the distance, and patterns, whose common parts are learned from
 all receivers (`rssi_terms`); shadowing and the body's effect at a position are a Gaussian process. Hyperparameters, the
 noise of each receiver, and the calibration of predictions come from held-out stretches of the training rows
@@ -12,34 +12,32 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Count, Finite, Positive
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
+from ..model import Arrays, field_arrays, from_field_arrays
 from .rssi_fit import Field, Fit, PriorMean, shift_of, widening
-from .rssi_map import PowerMap, trace_map
-from .rssi_terms import Hyperparameters, Measured, Poses, Stops, stops_of
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from .rssi_terms import Hyperparameters, Measured, Poses, PowerMap, Stops, stops_of, trace_map
+from .selection import PhysicsModel, physics_model
 
 HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""
 ROBUST_ROUNDS = 2
 WIDER = 2.0
 """Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
-POSITIVE = {"shadow_db", "shadow_m", "body_m", "noise_db", "spacing_m", "offset_sd_db", "receiver_sd_db", "stop_rows"}
-SIGNED = {"transmit_dbm", "lever_m", "skew_db"}
-"""Settings that must be positive, and that may be negative."""
 
 
 @dataclass(frozen=True)
-class RssiSettings:
-    """Settings of the fit of an RSSI physics model.
+class RssiSettings(CheckedSettings, Hyperparameters):
+    """Settings of the fit of an RSSI physics model: hyperparameters at the start of the search, and the following.
 
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included.
@@ -49,14 +47,6 @@ class RssiSettings:
         traced_sd: standard deviation of the factor of the traced decibels about one.
         body_pattern_db: first harmonic of the transmitter's pattern, standard deviation; 0: none.
         receiver_pattern_db: first harmonic of each receiver's pattern, standard deviation; 0: none.
-        shadow_db: standard deviation of shadowing.
-        shadow_m: its correlation length.
-        body_db: standard deviation of the heading's effect that varies with the position.
-        body_m: its correlation length.
-        concentration: concentration of that effect in the heading.
-        drift_db: standard deviation of noise that persists while the transmitter stands.
-        noise_db: standard deviation of a single report's noise.
-        lever_m: distance of the antenna ahead of the stated position.
         skew_db: shift of predictions a priori, as fades reach deeper than peaks.
         search_rows: least number of training rows with which held-out rows choose hyperparameters.
         search_rounds: rounds of that search; 0: none.
@@ -69,39 +59,23 @@ class RssiSettings:
         max_reflections: reflections of a traced path.
     """
 
-    transmit_dbm: float = 0.0
-    offset_sd_db: float = 10.0
-    receiver_sd_db: float = 4.0
+    transmit_dbm: Finite = 0.0
+    offset_sd_db: Positive = 10.0
+    receiver_sd_db: Positive = 4.0
     exponent_sd: float = 1.0
     traced_sd: float = 0.5
     body_pattern_db: float = 1.0
     receiver_pattern_db: float = 2.0
-    shadow_db: float = 4.5
-    shadow_m: float = 2.0
-    body_db: float = 1.5
-    body_m: float = 1.5
-    concentration: float = 1.0
-    drift_db: float = 2.8
-    noise_db: float = 2.8
-    lever_m: float = 0.0
-    skew_db: float = 0.4
+    skew_db: Finite = 0.4
     search_rows: int = 500
     search_rounds: int = 1
     stop_m: float = 0.1
     stop_rad: float = 0.2
-    stop_rows: int = 20
-    spacing_m: float = 0.25
+    stop_rows: Count = 20
+    spacing_m: Positive = 0.25
     smooth_m: float = 0.3
     max_depth: int = 6
     max_reflections: int = 2
-
-    def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name, value in asdict(self).items():
-            if not np.isfinite(value) or (name in POSITIVE and value <= 0):
-                raise InputError(f"{name} {value}: give a positive number")
-            if name not in SIGNED and value < 0:
-                raise InputError(f"{name} {value}: give 0 or more")
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -132,16 +106,13 @@ class RssiPhysics(PhysicsModel):
     shift_db: float
     widen: FloatArray
     fit_facts: dict[str, float]
-    task: ClassVar[str] = "rssi"
 
     @property
     def uses_heading(self) -> bool:
         """Whether the training rows had headings."""
         return self.field.headings
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         headings = [heading_rad]
         if self.uses_heading and heading_rad is None:
             headings = [np.full(len(tx_pos_m), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
@@ -155,7 +126,7 @@ class RssiPhysics(PhysicsModel):
         stops, prior = field.stops, field.prior
         arrays: dict[str, Any] = {
             **receiver_arrays(self.receivers),
-            "stop.position_m": stops.poses.position_m,
+            **field_arrays(stops.poses, "stop."),
             **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
             "base": np.array([prior.transmit_dbm, prior.frequency_hz]),
             "prior.shared": prior.sd,
@@ -168,8 +139,6 @@ class RssiPhysics(PhysicsModel):
             "fact.value": np.array(list(self.fit_facts.values()), float),
             **field_arrays(field.hyperparameters, "knob."),
         }
-        if stops.poses.heading_rad is not None:
-            arrays["stop.heading_rad"] = stops.poses.heading_rad
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced, "map.")
         return {name: np.asarray(value) for name, value in arrays.items()}
@@ -182,8 +151,12 @@ class RssiPhysics(PhysicsModel):
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receiver_position_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        poses = Poses(arrays["stop.position_m"], arrays.get("stop.heading_rad"))
-        stops = Stops(poses, arrays["stop.value_dbm"], arrays["stop.count"], arrays["stop.row"])
+        stops = Stops(
+            from_field_arrays(Poses, arrays, "stop."),
+            arrays["stop.value_dbm"],
+            arrays["stop.count"],
+            arrays["stop.row"],
+        )
         field = Field(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(stored_receivers(arrays), field, float(arrays["shift_db"]), arrays["widen"], facts)
@@ -210,15 +183,10 @@ def fit_rssi(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> RssiPhysics:
-    """Fit an RSSI physics model.
+    """Fit an RSSI physics model to ``rows`` of a record; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: signal strengths; rows should be in the order of time, see `wrf_mi.models.physics.rssi_fit.folds`.
-        rows: training rows; none: the scene alone.
-        scene: from `wrf_mi.tracing.open_scene`, or None: free space is expected.
-        settings: settings of the fit.
-        seed: unused: nothing is drawn.
-        on_progress: progress callback: stage and fraction done.
+    Rows should be in the order of time (`wrf_mi.models.physics.rssi_fit.folds`); without rows the scene alone predicts,
+    without a scene free space is expected. Nothing is drawn, so ``seed`` is unused.
 
     Raises:
         InputError: a record of another task or without its frequency, or neither rows nor a scene.
@@ -274,4 +242,4 @@ def fit_rssi(
     return RssiPhysics(record.receivers, field, shift, widen, facts)
 
 
-KIND = PhysicsKind(RssiSettings, fit_rssi, RssiPhysics.from_arrays)
+MODEL = physics_model("rssi", RssiSettings, fit_rssi, RssiPhysics.from_arrays)

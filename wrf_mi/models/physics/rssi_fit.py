@@ -26,8 +26,7 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks.scores import REAL_90
 from ..interpolation.kriging_equations import KrigingSystem
-from .rssi_map import PowerMap
-from .rssi_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .rssi_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, PowerMap, Stops, basis
 
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
@@ -71,18 +70,26 @@ class PooledProcess:
     """The posterior of all receivers.
 
     ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
-    beta, above zero; ``point_variance`` is k(x, x); ``beta`` [k] the posterior mean of the shared coefficients.
+    beta, above zero; ``point_variance`` is k(x, x); ``rounds`` reweight rows for Student-t noise; ``beta`` [k] is the
+    posterior mean of the shared coefficients.
 
     Raises:
         numpy.linalg.LinAlgError: a covariance that is not positive definite.
     """
 
-    def __init__(self, parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float) -> None:
-        self._parts, self._kernel, self._point_variance = parts, kernel, point_variance
-        jitter = JITTER * point_variance
+    def __init__(
+        self, parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float, rounds: int = 0
+    ) -> None:
+        self._kernel, self._prior_sd, self._point_variance = kernel, prior_sd, point_variance
+        self._solve(parts)
+        for _ in range(rounds):
+            self._solve(self._reweighted([part.variance for part in parts]))
+
+    def _solve(self, parts: Sequence[Part]) -> None:
+        kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
         self._systems = [KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis) for p in parts]
         pairs = list(zip(self._systems, parts, strict=True))
-        self._information = np.diag(1 / np.square(prior_sd)) + sum(system.information for system in self._systems)
+        self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
         self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
 
@@ -92,7 +99,7 @@ class PooledProcess:
         mean = basis @ self.beta + cross @ self._weights[receiver]
         return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
 
-    def reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
+    def _reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
         """Parts with the noise variances that their residuals imply for Student-t noise.
 
         The expected squared residual, posterior variance of the field included, is compared with the squared scale
@@ -105,17 +112,6 @@ class PooledProcess:
             square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
             parts.append(replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1)))
         return parts
-
-
-def fit_pooled(
-    parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float, rounds: int = 0
-) -> PooledProcess:
-    """`PooledProcess` of the same arguments after ``rounds`` of reweighting for Student-t noise."""
-    process = PooledProcess(parts, kernel, prior_sd, point_variance)
-    scale = [part.variance for part in parts]
-    for _ in range(rounds):
-        process = PooledProcess(process.reweighted(scale), kernel, prior_sd, point_variance)
-    return process
 
 
 @dataclass(frozen=True)
@@ -162,7 +158,7 @@ class Field:
             expected, columns, sd = prior.columns(poses, receiver)
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
             parts.append(Part(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
-        self._process = fit_pooled(parts, h.covariance, sd, h.variance(self.headings), rounds)
+        self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
 
     def predict(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Mean in dBm, and variance of a single report about it before calibration, [m] each."""

@@ -1,35 +1,36 @@
-"""The physics model of each task: their common interface, and the choice by what is measured and by scene."""
+"""What the physics models of all tasks share: prediction in chunks, stored dataclasses, entry of the registry."""
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from importlib import import_module
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ...core import InputError, Prediction, Receiver, Record
+from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
 from ...core.receivers import receiver_index
 from ...core.types import IntArray
+from ...tracing.polarization import check_polarization
+from ...tracing.solve import Prepared
 from ...training.session import OnProgress
+from ..model import Arrays, Fitted, Inputs, Model, Problem, Session
 
-Arrays = dict[str, NDArray[Any]]
+logger = logging.getLogger(__name__)
 
 
 class PhysicsModel(ABC):
     """A fitted physics model.
 
     Attributes:
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"``.
         chunk_size: transmitters that are predicted together, which bounds the memory.
         receivers: receivers whose observations are predicted, in the record's order.
     """
 
-    task: ClassVar[str]
     chunk_size: ClassVar[int] = 1024
     receivers: tuple[Receiver, ...]
 
@@ -63,7 +64,7 @@ class PhysicsModel(ABC):
             if heading.shape != (len(positions),) or not np.isfinite(heading).all():
                 raise InputError(f"predict: {len(positions)} positions and headings {heading.shape}; give one for each")
         index = receiver_index(self.receivers, receiver)
-        mean, std = np.empty(0), np.empty(0)
+        mean, std = np.empty(0), np.empty(0)  # filled chunk by chunk: joined chunks would take the memory twice
         for begin in range(0, max(len(positions), 1), self.chunk_size):
             rows = slice(begin, begin + self.chunk_size)
             values, deviation = self._predict(positions[rows], index, None if heading is None else heading[rows])
@@ -74,7 +75,7 @@ class PhysicsModel(ABC):
             mean[rows] = values
             if not shared:
                 std[rows] = deviation
-        return Prediction(mean, std if std.shape == mean.shape else np.broadcast_to(std, mean.shape))
+        return Prediction(mean, np.broadcast_to(std, mean.shape))
 
     @abstractmethod
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
@@ -89,58 +90,73 @@ class PhysicsModel(ABC):
         """Fitted parameters and choices as plain numbers and strings."""
 
 
-def field_arrays(value: Any, prefix: str) -> Arrays:
-    """Fields of a dataclass instance as arrays by ``prefix`` and name."""
-    return {f"{prefix}{one.name}": np.asarray(getattr(value, one.name)) for one in fields(value)}
+class FittedPhysics(Fitted):
+    """A fitted physics model as the registry's interface."""
+
+    def __init__(self, model: PhysicsModel) -> None:
+        self.model, self.receivers, self.uses_heading = model, model.receivers, model.uses_heading
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Prediction with standard deviations, see `Fitted`."""
+        return self.model.predict(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
+
+    def arrays(self) -> Arrays:
+        """Arrays of the fitted model, see `Fitted`."""
+        return self.model.arrays()
+
+    def facts(self) -> dict[str, Any]:
+        """Fitted parameters and choices."""
+        return {"fitted": self.model.summary()}
 
 
-def from_field_arrays(kind: type, arrays: Mapping[str, NDArray[Any]], prefix: str) -> Any:
-    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    stored = (arrays[f"{prefix}{one.name}"] for one in fields(kind))
-    return kind(*(value if value.ndim else value.item() for value in stored))
+def physics_model(
+    task: str,
+    settings: type,
+    fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], PhysicsModel],
+    load: Callable[[Arrays], PhysicsModel],
+    uses_antennas: bool = True,
+) -> Model:
+    """Entry of the physics model for a task.
 
-
-@dataclass(frozen=True)
-class PhysicsKind:
-    """Entry of one physics model.
-
-    Attributes:
+    Args:
+        task: task of the data.
         settings: dataclass of its settings.
-        fit: ``fit(record, rows, scene, settings, seed, on_progress)``; ``scene`` as opened by Sionna RT, or None.
+        fit: ``fit(record, rows, scene, settings, seed, on_progress)``: a record of the task with frequencies, numbers
+            of its training rows, ``sionna.rt.Scene`` at the carrier or None, settings, seed, progress callback (stage
+            and fraction done).
         load: ``load(arrays)``, from `PhysicsModel.arrays`.
         uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
     """
 
-    settings: type
-    fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], PhysicsModel]
-    load: Callable[[Arrays], PhysicsModel]
-    uses_antennas: bool = True
+    def fit_problem(problem: Problem, split: Split, session: Session) -> Fitted:
+        given = problem.record, problem.rows(split), problem.opened_scene
+        return FittedPhysics(fit(*given, problem.settings, problem.seed, session.report))
 
+    def check(problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse antennas in solids; warn of antennas near surfaces, crossed polarisations and ignored antennas."""
+        record, scene = problem.record, problem.opened_scene
+        if task == "csi" and record.observation.ndim != 3:
+            text = f"channels of {record.observation.shape[2]} antennas; the physics model serves receivers with one"
+            raise InputError(f"{record.name}: {text}")
+        if scene is None:
+            return
+        positions = np.asarray(record.tx_pos_m, float)
+        Prepared(scene).check(positions, record.receivers)
+        if uses_antennas:
+            check_polarization(scene, positions, record.receivers, record.tx_antenna)
+        elif any(antenna != ANTENNA for antenna in (record.tx_antenna, *(one.antenna for one in record.receivers))):
+            logger.warning("%s: the physics model for channels takes all antennas to be isotropic", record.name)
 
-MODULES = {"spectrum": ("measured_spectrum", "spectrum"), "rssi": ("rssi", "rssi"), "csi": ("csi", "csi")}
-"""Modules of the physics models without and with a scene, by task; each has its `PhysicsKind` as ``KIND``."""
-
-
-def kind_of(record: Record, with_scene: bool) -> PhysicsKind:
-    """The physics model for a record, with or without a mesh of the surroundings.
-
-    Raises:
-        InputError: a task without physics model, or channels of receivers with several antennas.
-    """
-    if record.task not in MODULES:
-        raise InputError(f"{record.name}: holds {record.task}; no physics model predicts that")
-    check_antennas(record)
-    return kind_of_task(record.task, with_scene)
-
-
-def kind_of_task(task: str, with_scene: bool) -> PhysicsKind:
-    """The physics model for a task of `MODULES`."""
-    kind: PhysicsKind = import_module(f".{MODULES[task][with_scene]}", __package__).KIND
-    return kind
-
-
-def check_antennas(record: Record) -> None:
-    """Refuse channels of receivers with several antennas (`InputError`)."""
-    if record.task == "csi" and record.observation.ndim != 3:
-        antennas = record.observation.shape[2]
-        raise InputError(f"{record.name}: channels of {antennas} antennas; the physics model serves receivers with one")
+    return Model(
+        "physics",
+        (task,),
+        settings,
+        fit_problem,
+        lambda arrays, problem, folder: FittedPhysics(load(arrays)),
+        "docs/joint.md",
+        scene="optional",
+        uses_antennas=uses_antennas,
+        scene_alone=True,
+        headings=True,
+        check=check,
+    )

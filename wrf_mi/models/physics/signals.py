@@ -31,10 +31,10 @@ from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray, fibonacci_sphere
 from ...core.types import IntArray
-from ...receivers.beams import mirror_order
+from ...receivers.array import mirror_order
 from ...receivers.retrieve import align_signals
-from ..interpolation.kriging_equations import KrigingSystem, left_out
-from .anisotropic_kriging import chosen_rows
+from ..interpolation.kriging_equations import KrigingSystem, chosen_rows, left_out
+from ..model import field_arrays, from_field_arrays
 
 ComplexArray = NDArray[np.complex128]
 LEAST_NOISE = 3e-3
@@ -73,11 +73,7 @@ class Covariances:
 
     def __call__(self, tx_pos_m: FloatArray) -> ComplexArray:
         """All covariances between positions [n, 3] (metres), shape [count, n, n], length slowest."""
-        n = len(tx_pos_m)
-        decay = np.exp(-cdist(tx_pos_m, tx_pos_m) / self.lengths_m[:, None, None])
-        phase = np.exp(1j * (self.turns @ tx_pos_m.T))
-        product: ComplexArray = decay[:, None] * (phase[:, :, None] * phase[:, None, :].conj())
-        return product.reshape(self.count, n, n)
+        return self.mixed(tx_pos_m, tx_pos_m, np.eye(self.count))
 
     def mixed(self, a_m: FloatArray, b_m: FloatArray, weight: FloatArray) -> ComplexArray:
         """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m].
@@ -152,8 +148,7 @@ class Posterior:
     @property
     def ignorance(self) -> FloatArray:
         """Posterior variance as a share of the prior variance, [q]: 0 known, 1 unknown."""
-        result: FloatArray = self.variance.sum(axis=1) / self.prior.sum()
-        return result
+        return np.asarray(self.variance.sum(axis=1) / self.prior.sum())
 
 
 @dataclass(eq=False)
@@ -192,8 +187,7 @@ class SignalProcess:
     @property
     def prior(self) -> FloatArray:
         """Variance of each component without measurements, [m], noise included."""
-        total: FloatArray = self.weight.sum(axis=1) + self.noise
-        return total
+        return np.asarray(self.weight.sum(axis=1) + self.noise)
 
     def _posterior(self, mean: ComplexArray, variance: FloatArray) -> Posterior:
         return Posterior(mean @ self.basis.T, np.maximum(variance, self.noise), self.basis, self.prior)
@@ -211,15 +205,13 @@ class SignalProcess:
 
     def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
         """Arrays for `from_arrays`."""
-        stored = {f"{prefix}{name}": getattr(self, name) for name in STORED}
-        return stored | {f"{prefix}{name}": getattr(self.covariances, name) for name in ("lengths_m", "turns")}
+        return {f"{prefix}{name}": getattr(self, name) for name in STORED} | field_arrays(self.covariances, prefix)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> SignalProcess:
         """The process that `arrays` stored."""
         positions, signals, *components = (arrays[f"{prefix}{name}"] for name in STORED)
-        covariances = Covariances(arrays[f"{prefix}lengths_m"], arrays[f"{prefix}turns"])
-        return cls(positions, signals, covariances, *components)
+        return cls(positions, signals, from_field_arrays(Covariances, arrays, prefix), *components)
 
 
 def fit_signals(

@@ -28,11 +28,12 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from .selection import Arrays, PhysicsKind, PhysicsModel, field_arrays, from_field_arrays
+from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
+from .selection import PhysicsModel, physics_model
 from .spectrum_fit import MIXES, Constants, Maps, ResidualKriging
-from .spectrum_loss import Spectrometer
 from .spectrum_model import SEARCHED_ROWS, Fit, SpectrumModel, SpectrumSettings, begin
 from .spectrum_rays import Room
+from .spectrum_waves import Spectrometer
 
 logger = logging.getLogger(__name__)
 
@@ -68,16 +69,13 @@ class SpectrumPhysics(PhysicsModel):
 
     models: tuple[SpectrumModel, ...]
     fit_facts: dict[str, Any]
-    task: ClassVar[str] = "spectrum"
     chunk_size: ClassVar[int] = 256
 
     def __post_init__(self) -> None:
         """Name the receivers."""
         self.receivers = tuple(model.instrument.receiver for model in self.models)
 
-    def _predict(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None
-    ) -> tuple[NDArray[np.float32], NDArray[Any]]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
         model = self.models[receiver]
         mean = model.spectra(tx_pos_m)
         return mean, mean.std(axis=(1, 2), keepdims=True) if model.error is None else model.error.astype(float)
@@ -85,7 +83,7 @@ class SpectrumPhysics(PhysicsModel):
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`, the mesh's triangles included."""
         out: Arrays = {"format": np.array(FORMAT), "receivers": np.array(len(self.models))}
-        out |= {f"fact/{key}": np.asarray(value) for key, value in self.fit_facts.items()}
+        out |= keyed("fact/", {key: np.asarray(value) for key, value in self.fit_facts.items()})
         for index, model in enumerate(self.models):
             instrument, corners = model.instrument, model.room.corners
             stored: Arrays = {
@@ -109,7 +107,7 @@ class SpectrumPhysics(PhysicsModel):
                 stored |= field_arrays(model.residual, "rest_")
             if model.error is not None:
                 stored["error"] = model.error
-            out |= {f"{index}/{key}": value for key, value in stored.items()}
+            out |= keyed(f"{index}/", stored)
         return out
 
     @classmethod
@@ -123,7 +121,7 @@ class SpectrumPhysics(PhysicsModel):
             raise InputError(f"physics for spectra: format {arrays.get('format')}, not {FORMAT}; fit it again")
         models = []
         for index in range(int(arrays["receivers"])):
-            stored = {key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{index}/")}
+            stored = under(f"{index}/", arrays)
             (receiver,), tx_antenna = stored_receivers(stored), Antenna(*map(str, stored["tx_antenna"]))
             height, width = (int(size) for size in stored["size"])
             corners = (stored["triangles_m"][a:b] for a, b in pairwise(np.cumsum([0, *stored["thing_faces"]])))
@@ -139,8 +137,7 @@ class SpectrumPhysics(PhysicsModel):
                 stored.get("error"),
             )
             models.append(model)
-        facts = {key.partition("/")[2]: value.tolist() for key, value in arrays.items() if key.startswith("fact/")}
-        return cls(tuple(models), facts)
+        return cls(tuple(models), {key: value.tolist() for key, value in under("fact/", arrays).items()})
 
     def summary(self) -> dict[str, Any]:
         """Chains, surfaces, amplitudes, displacements, and losses on validation rows after each step."""
@@ -155,16 +152,11 @@ def fit_spectrum(
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> SpectrumPhysics:
-    """Fit the physics model to spectra.
+    """Fit the physics model to ``rows`` of spectra; arguments as ``fit`` of `physics_model`.
 
-    Args:
-        record: spectra, with array and carrier.
-        rows: training rows. Fewer than `FEW_ROWS` fit planes, materials and the mix with kriging alone; without rows,
-            or with rows at fewer than `LEAST_POSITIONS` positions, the room is traced as given.
-        scene: opened ``sionna.rt.Scene`` at the carrier, or None: free space and learned surfaces.
-        settings: settings of the fit.
-        seed: seed of validation rows and of the rays.
-        on_progress: progress callback: stage and fraction done.
+    Fewer rows than `FEW_ROWS` fit planes, materials and the mix with kriging alone; without rows, or with rows at fewer
+    than `LEAST_POSITIONS` positions, the room is traced as given. Without a scene: free space and learned surfaces.
+    ``seed`` is that of validation rows and of the rays.
 
     Raises:
         InputError: a record of another task, or without array or carrier.
@@ -185,35 +177,29 @@ def fit_spectrum(
 
         instrument = Spectrometer(receiver, float(record.frequencies_hz[0]), height, width, record.tx_antenna)
         report("chains of planes", 0.0)
-        model = begin(instrument, scene, settings.chaining(seed))
-        usable = rows[~np.isnan(record.observation[index, rows]).any(axis=(1, 2))]
+        model = begin(instrument, scene, settings, seed)
+        usable = np.sort(rows[~np.isnan(record.observation[index, rows]).any(axis=(1, 2))])
         if len(usable):
-            few = len(usable) < FEW_ROWS
-            usable = usable if few else np.sort(usable)
             spectra = np.asarray(record.observation[index, usable], np.float32)
-            fit = _fitted_to_few if few else _fitted
-            model, found = fit(model, record.tx_pos_m[usable], spectra, settings, seed, report)
-            facts |= {f"{receiver.name}.{key}": value for key, value in found.items()}
+            order = np.random.default_rng([seed, 3]).permutation(len(usable))
+            held = min(max(round(settings.validation * len(usable)), 20), len(usable) // 4)
+            split, fit_rows = (order[held:], order[:held]), _fitted
+            if len(usable) < FEW_ROWS:
+                split, fit_rows = (np.arange(len(usable)), order[:0]), _fitted_to_few
+            fit = Fit(instrument, record.tx_pos_m[usable], spectra, *split, settings)
+            model, found = fit_rows(fit, model, seed, report)
+            facts |= keyed(f"{receiver.name}.", found)
         models.append(model)
     return SpectrumPhysics(tuple(models), facts)
 
 
-KIND = PhysicsKind(SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
+MODEL = physics_model("spectrum", SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
 
 
-def _fitted(
-    model: SpectrumModel,
-    tx_pos_m: FloatArray,
-    spectra: NDArray[np.float32],
-    settings: SpectrumSettings,
-    seed: int,
-    on_progress: OnProgress,
-) -> tuple[SpectrumModel, dict[str, Any]]:
-    """The model fitted to training rows [n, 3], [n, height, width], and facts."""
-    count, how = len(tx_pos_m), settings.chaining(seed)
-    everyone, order = np.arange(count), np.random.default_rng([seed, 3]).permutation(count)
-    held = min(max(round(settings.validation * count), 20), count // 4)
-    fit = Fit(model.instrument, tx_pos_m, spectra, order[held:], order[:held], settings)
+def _fitted(fit: Fit, model: SpectrumModel, seed: int, on_progress: OnProgress) -> tuple[SpectrumModel, dict[str, Any]]:
+    """The model fitted to training rows, and facts."""
+    settings = fit.settings
+    everyone, truth = np.arange(len(fit.spectra)), fit.spectra[fit.validation]
     losses: dict[str, Any] = {"as given": fit.validation_loss(model)}
 
     def note(step: str, share: float) -> None:
@@ -224,7 +210,7 @@ def _fitted(
     note("planes and materials", 0.2)
     for turn in range(settings.rounds if settings.surfaces else 0):
         before = model.learned
-        model = fit.surfaces(model, how)
+        model = fit.surfaces(model, seed)
         again = fit.constants(model, fit.rows[:SEARCHED_ROWS], rounds=0)
         model = min(model, again, key=fit.validation_loss)
         note(f"surfaces, round {turn + 1}", 0.2 + 0.5 * (turn + 1) / settings.rounds)
@@ -235,8 +221,8 @@ def _fitted(
         model, deviation, reflections = fit.amplitudes(model)
         note("amplitudes", 0.85)
     field = fit.residual_field(model) if settings.rest else None
-    predicted = fit.with_residual(model, fit.rows, field).spectra(tx_pos_m[fit.validation])
-    error = np.sqrt(np.square(predicted - spectra[fit.validation]).mean(axis=0)).astype(np.float32)
+    predicted = fit.with_residual(model, fit.rows, field).spectra(fit.tx_pos_m[fit.validation])
+    error = np.sqrt(np.square(predicted - truth).mean(axis=0)).astype(np.float32)
     if deviation:
         model = fit.mapped(model.replaced(maps=None), everyone, deviation, reflections)
     model = fit.with_residual(model, everyone, field)
@@ -255,33 +241,27 @@ def _fitted(
 
 
 def _fitted_to_few(
-    model: SpectrumModel,
-    tx_pos_m: FloatArray,
-    spectra: NDArray[np.float32],
-    settings: SpectrumSettings,
-    seed: int,
-    on_progress: OnProgress,
+    fit: Fit, model: SpectrumModel, seed: int, on_progress: OnProgress
 ) -> tuple[SpectrumModel, dict[str, Any]]:
     """The candidate that predicts held-out rows best, and facts: the choice and the error of each candidate."""
-    name, everyone = model.instrument.receiver.name, np.arange(len(tx_pos_m))
+    name, tx_pos_m, spectra = model.instrument.receiver.name, fit.tx_pos_m, fit.spectra
     group = groups(tx_pos_m, model.instrument.wavelength_m, seed)
     if not len(group):
         text = "%s: %d training rows at fewer than %d places cannot tell what to fit: the room is traced as given"
         logger.warning(text, name, len(tx_pos_m), LEAST_POSITIONS)
         return model, {"chosen": AS_GIVEN}
-    fit = Fit(model.instrument, tx_pos_m, spectra, everyone, everyone[:0], settings)
     predicted: dict[str, NDArray[np.float32]] = {}
     for number in range(GROUPS):
         on_progress("held-out rows", number / (GROUPS + 1))
         train, out = np.flatnonzero(group != number), np.flatnonzero(group == number)
-        for label, trial in _trials(fit, model, train, settings.rest) if len(out) else ():
+        for label, trial in _trials(fit, model, train) if len(out) else ():
             predicted.setdefault(label, np.empty_like(spectra))[out] = trial.spectra(tx_pos_m[out])
     square = {label: np.square(images - spectra) for label, images in predicted.items()}
     # Structural similarity falls nearly linearly with the logarithm, and no row that is hard to predict dominates.
     score = {label: float(np.log(each.mean(axis=(1, 2)) + LEAST_ERROR).mean()) for label, each in square.items()}
     chosen = min(score, key=lambda label: score[label])
     on_progress("all rows", GROUPS / (GROUPS + 1))
-    best = dict(_trials(fit, model, everyone, settings.rest))[chosen]
+    best = dict(_trials(fit, model, fit.rows))[chosen]
     facts: dict[str, Any] = {"chosen": chosen}
     facts |= {f"held-out error, {label}": round(float(np.sqrt(each.mean())), 4) for label, each in square.items()}
     facts["plane_offsets_m"] = [round(float(x), 4) for x in best.constants.offset_m]
@@ -300,10 +280,10 @@ def groups(position_m: FloatArray, wavelength_m: float, seed: int) -> IntArray:
     return np.asarray(np.random.default_rng([seed, 4]).permutation(count)[label] % GROUPS)
 
 
-def _trials(fit: Fit, model: SpectrumModel, rows: IntArray, residual: bool) -> Iterator[tuple[str, SpectrumModel]]:
+def _trials(fit: Fit, model: SpectrumModel, rows: IntArray) -> Iterator[tuple[str, SpectrumModel]]:
     """Candidates fitted to some rows, by name."""
     yield AS_GIVEN, model
     room = fit.constants(model, rows, SCANS)
     yield "room with fitted planes and materials", room
-    for name, field in MIXES.items() if residual else ():
+    for name, field in MIXES.items() if fit.settings.rest else ():
         yield name, fit.with_residual(room, rows, field)

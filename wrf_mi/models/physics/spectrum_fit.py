@@ -1,6 +1,6 @@
 """Fits of a traced spectrum: displacements, materials, amplitudes that vary with the position, residual kriging.
 
-All fits minimise the sum of the rows' losses (`wrf_mi.models.physics.spectrum_loss`) plus half the squared distance
+All fits minimise the sum of the rows' losses (`wrf_mi.models.physics.spectrum_waves`) plus half the squared distance
 from the prior in standard deviations: a maximum a posteriori estimate. They use L-BFGS (Nocedal and Wright, "Numerical
 Optimization" (2006), section 7.2) with exact derivatives by signals, and differences by constants of materials.
 
@@ -23,9 +23,8 @@ from scipy.optimize import minimize
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..interpolation.kriging_equations import KrigingSystem, correlation
-from .spectrum_gains import Waves
-from .spectrum_loss import ComplexArray
 from .spectrum_rays import ChainPaths
+from .spectrum_waves import ComplexArray, Waves
 
 SPREAD = (0.8, 1.5, 0.8)
 """Standard deviation of the logarithms of a material's susceptibility, conductivity and thickness about those given:

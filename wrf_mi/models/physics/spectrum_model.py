@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError
 from ...core.angles import FloatArray
+from ...core.settings import CheckedSettings, Inside, Positive
 from ...core.types import IntArray
+from ...tracing.search import shoot
+from ...tracing.surfaces import Surfaces
 from ...tracing.walls import plane_centres
 from .spectrum_fit import (
     MIXES,
@@ -25,10 +27,9 @@ from .spectrum_fit import (
     map_centres,
     scan_offsets,
 )
-from .spectrum_gains import Waves
-from .spectrum_loss import ComplexArray, Spectrometer
-from .spectrum_rays import Chaining, ChainTable, Room, find_chains
+from .spectrum_rays import ChainTable, Room
 from .spectrum_search import KINDS, Frame, KnownPaths, Search, Sheet, frames_of
+from .spectrum_waves import ComplexArray, Spectrometer, Waves
 
 SEARCHED_ROWS = 300
 """Rows of the first fit of the constants, which are a few dozen numbers."""
@@ -37,7 +38,7 @@ DEVIATIONS = (0.1, 0.2, 0.4)
 
 
 @dataclass(frozen=True)
-class SpectrumSettings:
+class SpectrumSettings(CheckedSettings):
     """Settings of the physics model for spectra.
 
     Attributes:
@@ -60,30 +61,15 @@ class SpectrumSettings:
     passed: int = 1
     rays: int = 1 << 16
     chains: int = 4000
-    offset_sd_m: float = 0.03
+    offset_sd_m: Positive = 0.03
     surfaces: int = 16
-    surface_gain: float = 30.0
+    surface_gain: Positive = 30.0
     rounds: int = 2
     amplitudes: bool = True
-    scale_m: float = 1.0
+    scale_m: Positive = 1.0
     rest: bool = True
     steps: int = 15
-    validation: float = 0.15
-
-    def __post_init__(self) -> None:
-        """Reject settings out of range (`InputError`)."""
-        for name in ("reflections", "passed", "surfaces", "rounds", "steps", "chains", "rays"):
-            if getattr(self, name) < 0:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose 0 or more")
-        for name in ("offset_sd_m", "scale_m", "surface_gain"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"setting {name}: {getattr(self, name)}; choose more than 0")
-        if not 0 < self.validation < 1:
-            raise InputError(f"setting validation: {self.validation}; choose more than 0 and less than 1")
-
-    def chaining(self, seed: int) -> Chaining:
-        """Search for chains of planes."""
-        return Chaining(self.reflections, self.passed, self.rays, self.chains, seed)
+    validation: Inside = 0.15
 
 
 @dataclass(frozen=True)
@@ -153,7 +139,7 @@ class SpectrumModel:
         return frames_of(surfaces.normal, plane_centres(surfaces)[1], surfaces.triangles.reshape(-1, 3))
 
     def with_sheets(
-        self, sheets: list[Sheet], frames: list[Frame], how: Chaining, single: bool = False
+        self, sheets: list[Sheet], frames: list[Frame], settings: SpectrumSettings, seed: int, single: bool = False
     ) -> SpectrumModel:
         """The model with further surfaces and their chains, without learned amplitudes.
 
@@ -164,7 +150,7 @@ class SpectrumModel:
         opened = room.open()
         assert opened is not None
         new, old = opened[1], self.table.surfaces
-        chain = find_chains(opened, self.instrument.receiver.position_m, how)
+        chain = find_chains(opened, self.instrument.receiver.position_m, settings, seed)
         learned = self.learned + len(sheets)
         if single:
             first = len(room.names) - learned
@@ -189,6 +175,7 @@ class SpectrumModel:
         return model
 
 
+@dataclass
 class Fit:
     """Fits a `SpectrumModel` to rows [n, 3] with spectra [n, height, width].
 
@@ -196,22 +183,20 @@ class Fit:
     take four times as many.
     """
 
-    def __init__(
-        self,
-        instrument: Spectrometer,
-        tx_pos_m: FloatArray,
-        spectra: NDArray[np.float32],
-        rows: IntArray,
-        validation: IntArray,
-        settings: SpectrumSettings,
-    ) -> None:
-        self._tx, self.rows, self.validation, self._spectra = tx_pos_m, rows, validation, spectra
-        self.instrument, self.shapes = instrument, instrument.grid.shapes(spectra)
-        self._settings = settings
+    instrument: Spectrometer
+    tx_pos_m: FloatArray
+    spectra: NDArray[np.float32]
+    rows: IntArray
+    validation: IntArray
+    settings: SpectrumSettings
+
+    def __post_init__(self) -> None:
+        """Take the spectra's shapes on the grid."""
+        self.shapes = self.instrument.grid.shapes(self.spectra)
 
     def losses(self, model: SpectrumModel, rows: IntArray, waves: Waves | None = None) -> FloatArray:
         """Loss of each of some rows."""
-        signals = model.signals(waves or model.waves(self._tx[rows]))
+        signals = model.signals(waves or model.waves(self.tx_pos_m[rows]))
         return self.instrument.grid.loss(signals, self.shapes[rows])[0]
 
     def validation_loss(self, model: SpectrumModel) -> float:
@@ -222,21 +207,21 @@ class Fit:
         """The model with fitted planes and materials, after ``rounds`` scans of the planes for other minima."""
         if not len(model.constants.vector()) or not len(rows):
             return model
-        waves, shapes = model.waves(self._tx[rows]), self.shapes[rows]
+        waves, shapes = model.waves(self.tx_pos_m[rows]), self.shapes[rows]
         factor = model.factor(waves)
         prior = Constants(np.zeros(len(model.constants.offset_m)), model.room.slabs)
-        found, sd = model.constants, self._settings.offset_sd_m
+        found, sd = model.constants, self.settings.offset_sd_m
         for turn in range(max(rounds, 1)):
             if turn < rounds:
                 found = scan_offsets(waves, shapes, found, sd, factor)
-            found = fit_constants(waves, shapes, found, prior, sd, self._settings.steps, factor)
+            found = fit_constants(waves, shapes, found, prior, sd, self.settings.steps, factor)
         return model.replaced(constants=found)
 
-    def surfaces(self, model: SpectrumModel, how: Chaining) -> SpectrumModel:
+    def surfaces(self, model: SpectrumModel, seed: int) -> SpectrumModel:
         """The model with further surfaces as far as they lower the validation rows' loss; see `Search`."""
-        frames = model.frames(self._tx[self.rows])
+        frames = model.frames(self.tx_pos_m[self.rows])
         search, signals = self._search(model, frames, self.rows)
-        found = search(signals, self._settings.surfaces, self._settings.surface_gain)
+        found = search(signals, self.settings.surfaces, self.settings.surface_gain)
         # Sheet by sheet on validation rows, by their change at first order.
         judge, signals = self._search(model, frames, self.validation)
         before, kept = judge.loss(signals), []
@@ -250,7 +235,7 @@ class Fit:
         best, lowest = model, self.validation_loss(model)
         for count in sorted({len(kept), (len(kept) + 1) // 2} - {0}, reverse=True):
             for single in (False, True):
-                trial = model.with_sheets(kept[:count], frames, how, single)
+                trial = model.with_sheets(kept[:count], frames, self.settings, seed, single)
                 loss = self.validation_loss(trial)
                 if loss < lowest:
                     best, lowest = trial, loss
@@ -258,7 +243,7 @@ class Fit:
 
     def _search(self, model: SpectrumModel, frames: list[Frame], rows: IntArray) -> tuple[Search, ComplexArray]:
         """A search with some rows, and their element signals."""
-        tx = self._tx[rows]
+        tx = self.tx_pos_m[rows]
         waves = model.waves(tx)
         known = KnownPaths.of(model.table, waves.paths, model.path_waves(waves), tx)
         return Search(frames, self.instrument, tx, self.shapes[rows], known), waves.sum @ known.wave
@@ -271,7 +256,7 @@ class Fit:
         Returns:
             The model, the prior deviation (0: none) and up to how many reflections chains vary with the position.
         """
-        waves, held_out = model.waves(self._tx[self.rows]), model.waves(self._tx[self.validation])
+        waves, held_out = model.waves(self.tx_pos_m[self.rows]), model.waves(self.tx_pos_m[self.validation])
         before = self.losses(model, self.validation, held_out)
         best, most, chosen = model, 0.0, (0.0, -1)
         for reflections in (-1, 0, 1):
@@ -286,14 +271,14 @@ class Fit:
         self, model: SpectrumModel, rows: IntArray, deviation: float, reflections: int, waves: Waves | None = None
     ) -> SpectrumModel:
         """The model with amplitudes of its chains, which vary with the position up to so many reflections."""
-        waves = waves or model.waves(self._tx[rows])
-        maps = map_centres(waves.paths, model.table.length, self._settings.scale_m, reflections)
-        steps = 4 * self._settings.steps
+        waves = waves or model.waves(self.tx_pos_m[rows])
+        maps = map_centres(waves.paths, model.table.length, self.settings.scale_m, reflections)
+        steps = 4 * self.settings.steps
         return model.replaced(maps=fit_maps(waves, self.shapes[rows], model.constants, maps, deviation, steps))
 
     def residual_field(self, model: SpectrumModel) -> ResidualField | None:
         """The field whose kriging predicts validation rows best; None: none helps."""
-        truth, position = self._spectra[self.validation], self._tx[self.validation]
+        truth, position = self.spectra[self.validation], self.tx_pos_m[self.validation]
         before = np.square(model.spectra(position) - truth).mean(axis=(1, 2))
         most, best = 0.0, None
         for field in (*RESIDUALS, *MIXES.values()):
@@ -307,19 +292,29 @@ class Fit:
         """The model with kriging of the residuals of some rows; unchanged without a field."""
         if field is None:
             return model
-        position, spectra = self._tx[rows], self._spectra[rows]
+        position, spectra = self.tx_pos_m[rows], self.spectra[rows]
         wavelength_m = self.instrument.wavelength_m
         return model.replaced(
             residual=ResidualKriging.of(position, spectra, model.spectra(position), field, wavelength_m)
         )
 
 
-def begin(instrument: Spectrometer, scene: Any | None, how: Chaining) -> SpectrumModel:
+def find_chains(
+    opened_room: tuple[Any, Surfaces], receiver_m: FloatArray, settings: SpectrumSettings, seed: int
+) -> IntArray:
+    """Chains of planes seen from a receiver [3] in metres: shape [c, reflections], -1 beyond the last plane."""
+    depth = settings.reflections + settings.passed
+    found = shoot(*opened_room, receiver_m, settings.rays, depth, settings.reflections, seed)
+    order = np.argsort(np.count_nonzero(found >= 0, axis=1), kind="stable")
+    return found[order[: settings.chains]]
+
+
+def begin(instrument: Spectrometer, scene: Any | None, settings: SpectrumSettings, seed: int) -> SpectrumModel:
     """The room as given, with the chains of planes that the receiver sees."""
     room = Room.of(scene)
-    none = np.full((0, max(how.reflections, 1)), -1)
-    model = SpectrumModel(instrument, room, 0, none, how.passed, Constants(np.zeros(0), room.slabs))
+    none = np.full((0, max(settings.reflections, 1)), -1)
+    model = SpectrumModel(instrument, room, 0, none, settings.passed, Constants(np.zeros(0), room.slabs))
     if scene is None:
         return model
-    chain = find_chains(model.opened, instrument.receiver.position_m, how)
+    chain = find_chains(model.opened, instrument.receiver.position_m, settings, seed)
     return model.replaced(chain=chain, constants=Constants(np.zeros(len(model.opened[1].normal)), room.slabs))

@@ -13,14 +13,17 @@ from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.device import on_device, to_float, to_uint, to_vectors
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.image_method import image_sources, meeting_point
-from ...tracing.search import shoot
-from ...tracing.surfaces import Surfaces, find_planes
+from ...tracing.material_parameters import read_materials
+from ...tracing.surfaces import Surfaces, find_planes, scene_surfaces
 
 MARGIN_M = 1e-3
 """Slack of a plane's bounds, and greatest distance of a leg's end from the mesh at a reflection."""
@@ -55,9 +58,6 @@ class Room:
         """Triangles and materials of a ``sionna.rt.Scene``; None: free space."""
         if scene is None:
             return cls((), (), np.zeros((3, 0)))
-        from ...tracing.material_parameters import read_materials
-        from ...tracing.surfaces import scene_surfaces
-
         surfaces, known = scene_surfaces(scene), read_materials(scene)
         index = [known.names.index(scene.objects[name].radio_material.name) for name in surfaces.names]
         slabs = np.stack([known.permittivity, known.conductivity, known.thickness_m])[:, index]
@@ -74,14 +74,9 @@ class Room:
         """A Mitsuba scene of the objects (as ``.mi_scene``) and their planes; None for free space."""
         if not self.names:
             return None
-        import drjit as dr
-        import mitsuba as mi
-
-        from ...backend.device import to_float, to_uint
-
-        keys = [f"thing{index}" for index in range(len(self.names))]
         parts: dict[str, Any] = {"type": "scene"}
-        for key, corners in zip(keys, self.corners, strict=True):
+        for index, corners in enumerate(self.corners):
+            key = f"thing{index:09}"  # Mitsuba sorts shapes by name
             mesh = mi.Mesh(key, 3 * len(corners), len(corners))
             parameters = mi.traverse(mesh)
             parameters["vertex_positions"] = to_float(corners)
@@ -89,11 +84,8 @@ class Room:
             parameters.update()
             parts[key] = mesh
         scene: Any = mi.load_dict(parts)
-        # Mitsuba sorts shapes by name; each shape states its number.
-        ids = np.zeros(len(self.names), np.uint32)
-        for shape in scene.shapes():
-            pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-            ids[keys.index(shape.id())] = int(pointer[0])
+        pointers: list[Any] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in scene.shapes()]
+        ids = np.array([int(pointer[0]) for pointer in pointers], np.uint32)
         first = np.cumsum([0, *(len(corners) for corners in self.corners)])
         triangles = np.concatenate(self.corners).astype(np.float32).astype(float)
         return SimpleNamespace(mi_scene=scene), find_planes(self.names, ids, first, triangles)
@@ -124,26 +116,8 @@ class ChainPaths:
         return len(self.tx)
 
 
-@dataclass(frozen=True)
-class Chaining:
-    """Search for chains of planes: limits, rays, most chains (those of fewest reflections), seed of the rays."""
-
-    reflections: int
-    passed: int
-    rays: int
-    most: int
-    seed: int
-
-
-def find_chains(opened_room: tuple[Any, Surfaces], receiver_m: FloatArray, how: Chaining) -> IntArray:
-    """Chains of planes seen from a receiver [3] in metres: shape [c, reflections], -1 beyond the last plane."""
-    found = shoot(*opened_room, receiver_m, how.rays, how.reflections + how.passed, how.reflections, how.seed)
-    order = np.argsort(np.count_nonzero(found >= 0, axis=1), kind="stable")
-    return found[order[: how.most]]
-
-
 class ChainTable:
-    """Chains of reflecting planes (`find_chains`) seen from a receiver [3], and the scene that blocks them.
+    """Chains of reflecting planes seen from a receiver [3], and the scene that blocks them.
 
     ``opened_room`` is from `Room.open`; None: the direct path alone, unobstructed.
     """
@@ -286,11 +260,6 @@ class ChainTable:
 
     def _hits_by_mitsuba(self, start_m: FloatArray, direction: FloatArray, far_m: FloatArray) -> Iterator[Hit]:
         """First, second, ... surface on each ray by Mitsuba, which is fastest for many transmitters."""
-        import drjit as dr
-        import mitsuba as mi
-
-        from ...backend.device import on_device, to_float, to_vectors
-
         lanes = max(LEAST_LANES, 1 << (len(far_m) - 1).bit_length())
 
         def padded(values: FloatArray) -> FloatArray:

@@ -19,9 +19,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.image_method import mirrored
 from ...tracing.slab import slab
-from .spectrum_gains import gains, spherical_waves
-from .spectrum_loss import ComplexArray, Spectrometer
 from .spectrum_rays import ChainPaths, ChainTable
+from .spectrum_waves import ComplexArray, Spectrometer, gains, spherical_waves
 
 KINDS = np.array([[1.0, 1e7, 0.002], [2.6, 0.02, 0.02]]).T
 """Relative permittivity, conductivity (S/m) and thickness (m) of a sheet, [3, kinds]: metal, or a wooden board."""
@@ -158,8 +157,9 @@ class Search:
     def __post_init__(self) -> None:
         """Compute the transmission of each kind of sheet at normal incidence."""
         self.wavelength_m, self._rx = self.instrument.wavelength_m, self.instrument.receiver.position_m
-        normal = np.ones(KINDS.shape[1])
-        self._passed = slab(normal, KINDS[0], KINDS[1], KINDS[2], self.instrument.frequency_hz).transmitted_te
+        self._passed = slab(
+            np.ones_like(KINDS[0]), KINDS[0], KINDS[1], KINDS[2], self.instrument.frequency_hz
+        ).transmitted_te
 
     def loss(self, signals: ComplexArray, row: IntArray | slice = slice(None)) -> FloatArray:
         """Loss of element signals of some rows."""
@@ -188,9 +188,7 @@ class Search:
         plane = plane or self.plane(sheet.frame, sheet.offset_m)
         inside = plane.fine & sheet.contains(plane.point)
         hidden = np.unique(plane.path[sheet.contains(plane.crossing)])
-        changed = inside.copy()
-        changed[self.known.tx[hidden]] = True
-        row = np.flatnonzero(changed)
+        row = np.union1d(np.flatnonzero(inside), self.known.tx[hidden])
         added = np.where(inside[row, None], plane.wave[sheet.kind, row], 0)
         lost = (1 - self._passed[sheet.kind]) * self.known.wave[hidden]
         np.subtract.at(added, np.searchsorted(row, self.known.tx[hidden]), lost)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..method import Inputs, received_rows
+from ..model import field_arrays, from_field_arrays, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -27,16 +27,16 @@ class Bands:
         uplink_hz: frequency of each uplink subcarrier [f].
         downlink_hz: frequency of each downlink subcarrier [g].
         antennas: number of antennas.
+        known: whether the frequencies come with the data.
         elements_m: positions of the antennas about the centre of the array, along its q principal axes [antennas, q],
             metres; None: unknown.
-        known: whether the frequencies come with the data.
     """
 
     uplink_hz: FloatArray
     downlink_hz: FloatArray
     antennas: int
-    elements_m: FloatArray | None
     known: bool
+    elements_m: FloatArray | None = None
 
     @property
     def reference_hz(self) -> float:
@@ -50,15 +50,12 @@ class Bands:
 
     def arrays(self, wavefront: str) -> dict[str, NDArray[Any]]:
         """Arrays of a run file, with the name of a wave model."""
-        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
-        return {"wavefront": np.array(wavefront), **arrays}
+        return {"wavefront": np.array(wavefront), **field_arrays(self)}
 
     @classmethod
     def load(cls, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, Bands]:
         """Wave model and bands that `arrays` described."""
-        elements_m, known = arrays.get("elements_m"), bool(arrays["known"])
-        bands = cls(arrays["uplink_hz"], arrays["downlink_hz"], int(arrays["antennas"]), elements_m, known)
-        return str(arrays["wavefront"]), bands
+        return str(arrays["wavefront"]), from_field_arrays(cls, arrays)
 
 
 def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
@@ -84,7 +81,7 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     elements = None if array_m is None or not known else np.asarray(array_m, float)
     if elements is not None and elements.shape != (antennas, 3):
         raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
-    return Bands(uplink_hz, downlink_hz, antennas, None if elements is None else principal(elements), known)
+    return Bands(uplink_hz, downlink_hz, antennas, known, None if elements is None else principal(elements))
 
 
 def principal(elements_m: FloatArray) -> FloatArray:
@@ -98,7 +95,7 @@ def principal(elements_m: FloatArray) -> FloatArray:
 
 
 def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.method.received_rows`.
+    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
 
     Raises:
         InputError: several receivers, no axis of antennas, or fewer than two rows.
@@ -110,11 +107,6 @@ def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntAr
             "that the uplink has, [1, rows, antennas, subcarriers]"
         )
     return received_rows(record, split, 0, name)
-
-
-def uplink_of(inputs: Inputs) -> NDArray[np.complex128]:
-    """Uplink coefficients [m, antennas, subcarriers] of rows to predict, checked by `wrf_mi.models.checks`."""
-    return np.asarray(inputs.uplink, complex)
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:

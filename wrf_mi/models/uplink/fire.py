@@ -18,6 +18,8 @@ are divided by the uplink's scale and phase. Chosen here:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import drjit as dr
@@ -26,15 +28,15 @@ from drjit import nn
 from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
-from ...core import Record, Split
+from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
+from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, bands_of, known_rows, relative_error, uplink_of
+from .csi_bands import Bands, bands_of, known_rows, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096
@@ -84,8 +86,7 @@ def units_of(uplink: NDArray[np.complex128]) -> NDArray[np.complex128]:
     first = np.where(strong.any(axis=1), strong.argmax(axis=1), np.abs(total).argmax(axis=1))
     chosen = total[np.arange(len(total)), first]
     phase = np.divide(chosen, np.abs(chosen), out=np.ones_like(chosen), where=np.abs(chosen) > 0)
-    result: NDArray[np.complex128] = np.where(scale > 0, scale, 1.0) * phase
-    return result
+    return np.asarray(np.where(scale > 0, scale, 1.0) * phase)
 
 
 def parts(h: NDArray[np.complex128]) -> NDArray[np.float32]:
@@ -137,7 +138,7 @@ def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
 
 
 @dataclass(frozen=True)
-class FittedFire:
+class FittedFire(Fitted):
     """A fitted network.
 
     Attributes:
@@ -152,12 +153,12 @@ class FittedFire:
     bands: Bands
     settings: FireSettings
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        uplink = uplink_of(inputs)
+        uplink = np.asarray(inputs.uplink, complex)
         samples = samples_of(uplink, self.sample)
         out = predict_samples(self.network, samples, units_of(samples), len(self.bands.downlink_hz))
-        return out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64)
+        return Prediction(out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Kind of sample, settings, bands and weights."""
@@ -179,30 +180,26 @@ def predict_samples(
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
 
 
-def fit(record: Record, split: Split, settings: FireSettings, seed: int, session: FitSession) -> FittedFire:
+def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
     """Fit a network, or two of which the better is kept."""
-    train, validation = known_rows(METHOD.name, record, split)
+    record, settings = problem.record, problem.settings
+    train, validation = known_rows(MODEL.name, record, split)
     bands = bands_of(record, settings.spacing_hz)
     kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
     few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
     unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
     if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
         kinds = ("antenna",)
-    fits = [(*_fit(record, train, validation, settings, seed, session, kind), kind) for kind in kinds]
+    fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
     network, _, kind = max(fits, key=lambda fit: fit[1])
     return FittedFire(kind, network, bands, settings)
 
 
 def _fit(
-    record: Record,
-    train: IntArray,
-    validation: IntArray,
-    s: FireSettings,
-    seed: int,
-    session: FitSession,
-    sample: str,
+    problem: Problem, train: IntArray, validation: IntArray, session: FitSession, sample: str
 ) -> tuple[Fire, float]:
     """Network and its best validation score."""
+    record, s = problem.record, problem.settings
     assert record.uplink is not None
     known = np.concatenate([train, validation])
     uplink, downlink = samples_of(record.uplink[known], sample), samples_of(record.observation[0, known], sample)
@@ -216,34 +213,27 @@ def _fit(
     weight = np.where(received, np.square(np.abs(unit)) / np.where(received, energy, 1), 0).astype(np.float32)[None]
     data = {"uplink": to_tensor(x), "downlink": to_tensor(y), "weight": to_tensor(weight)}
     dr.make_opaque(data)
-    seeds = seed, int(sample == "row")
+    seeds = problem.seed, int(sample == "row")
     fire = Fire(s, len(x), len(y), np.random.default_rng(seeds))
 
     def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
         return {"rows": opaque_rows(rows), "noise": to_tensor(rng.standard_normal((s.latent, len(rows))))}
 
-    def loss(fire: Fire, data: Any, given: Any) -> Any:
-        return fire_loss(fire, data, given, s.beta)
-
     judges = slice(len(train) * per_row, None)
 
     def score(fire: Fire) -> float:
         predicted = predict_samples(fire, uplink[judges], unit[judges], downlink.shape[-1])
-        return float(np.median(relative_error(_rows(predicted, per_row), _rows(downlink[judges], per_row))))
+        found, truth = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
+        return float(np.median(relative_error(found, truth)))
 
     first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
-    score_or_none = score if len(validation) else None
-    network = Network(f"fire {sample}", fire, loss, data, draw, first, everything, score_or_none, "relative error")
+    rows_of = draw, first, everything, score if len(validation) else None
+    network = Network(f"fire {sample}", fire, partial(fire_loss, beta=s.beta), data, *rows_of, "relative error")
     config = s if sample == "antenna" else replace(s, batch=s.row_batch)
     return train_network(network, config, seeds, session)
 
 
-def _rows(samples: NDArray[Any], per_row: int) -> NDArray[Any]:
-    """Samples [rows * per_row, antennas, f] as [rows, all of them]."""
-    return samples.reshape(len(samples) // per_row, -1)
-
-
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
     """The network that `FittedFire.arrays` described."""
     settings, (_, bands) = stored_settings(FireSettings, arrays, "fire"), Bands.load(arrays)
     weights = under("network/", arrays)
@@ -253,4 +243,4 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> FittedFire:
 
 
 SOURCE = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
-METHOD = Method("fire", ("csi",), FireSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("fire", ("csi",), FireSettings, fit, load, SOURCE, uplink="required", headings=True)

@@ -16,16 +16,19 @@ Source: Kay, "Fundamentals of statistical signal processing: estimation theory" 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from ...core import InputError, Record, Split
+from ...core import InputError, Prediction, Record, Split
+from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..method import Inputs, Method
-from .csi_bands import known_rows, relative_error, uplink_of
+from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays
+from .csi_bands import known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -36,23 +39,18 @@ CHUNK_SIZE = 256
 
 
 @dataclass(frozen=True)
-class LinearSettings:
+class LinearSettings(CheckedSettings):
     """Settings of the linear map.
 
     Attributes:
         penalty: in units of the mean energy of an uplink coefficient; None: chosen on validation rows.
     """
 
-    penalty: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse a penalty out of range."""
-        if self.penalty is not None and not 0 < self.penalty < np.inf:
-            raise InputError(f"linear: penalty {self.penalty}; choose a positive number, or null to have it chosen")
+    penalty: Annotated[float | None, Field(gt=0, description="more than 0")] = None
 
 
 @dataclass(frozen=True)
-class LinearMap:
+class LinearMap(Fitted):
     """A fitted map.
 
     Attributes:
@@ -65,13 +63,13 @@ class LinearMap:
     antennas: int
     penalty: float
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        return (uplink_of(inputs) @ self.matrix).astype(np.complex64)
+        return Prediction((np.asarray(inputs.uplink, complex) @ self.matrix).astype(np.complex64))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Matrix, number of antennas and penalty."""
-        return {name: np.asarray(value) for name, value in vars(self).items()}
+        return field_arrays(self)
 
 
 @dataclass(frozen=True)
@@ -131,9 +129,10 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
     return PENALTIES[int(np.argmin(errors))]
 
 
-def fit(record: Record, split: Split, settings: LinearSettings, seed: int, session: FitSession) -> LinearMap:
+def fit(problem: Problem, split: Split, session: FitSession) -> LinearMap:
     """Choose the penalty, then fit the map to all training rows."""
-    train, validation = known_rows(METHOD.name, record, split)
+    record, settings = problem.record, problem.settings
+    train, validation = known_rows(MODEL.name, record, split)
     known = np.concatenate([train, validation])
     if not len(validation):
         picked = np.arange(len(train)) % JUDGES == 0
@@ -144,10 +143,10 @@ def fit(record: Record, split: Split, settings: LinearSettings, seed: int, sessi
     return LinearMap(matrix, record.observation.shape[2], penalty)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> LinearMap:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
     """The map that `LinearMap.arrays` described."""
-    return LinearMap(np.asarray(arrays["matrix"], complex), int(arrays["antennas"]), float(arrays["penalty"]))
+    return from_field_arrays(LinearMap, arrays)
 
 
 SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-METHOD = Method("linear", ("csi",), LinearSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("linear", ("csi",), LinearSettings, fit, load, SOURCE, uplink="required", headings=True)

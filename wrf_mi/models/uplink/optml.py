@@ -11,29 +11,37 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 - A room has more paths than a single map separates: there are ``rounds`` of maps of the uplink's residual, each
   followed by a refinement of all paths found so far. Simulated channels are therefore noisier at times, 5 to 30 dB.
 - After each round a path stays if the Bayesian information criterion would rise without it.
-- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.models.uplink.cross_band`).
+- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.models.uplink.r2f2`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Record, Split
+from ...backend.device import to_tensor, to_uint
+from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
+from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..method import Inputs, Method, keyed, settings_array, stored_settings, under
-from ..networks.training import NetworkSettings, network_adam
-from .cross_band import PathSettings, choose
-from .csi_bands import Bands, uplink_of
-from .path_network import PathFinder, PathMap, Simulation, fit_paths
+from ..model import Arrays, Model, Problem, keyed, settings_array, stored_settings, under
+from ..networks.layers import columns
+from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
+from .csi_bands import Bands
+from .path_network import PathMap, Simulation, side_by_side, simulate
+from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import Complex, Mask, Waves, waves_of
+
+MAX_VALIDATION = 100
+"""Most maps that validate."""
 
 
 @dataclass(frozen=True)
@@ -60,26 +68,18 @@ class OptMLSettings(PathSettings, NetworkSettings):
     between: int = 3
     final: int = 5
 
-    def __post_init__(self) -> None:
-        """Refuse settings out of range."""
-        NetworkSettings.__post_init__(self)
 
-
-class OptML:
+class OptML(R2F2):
     """A fitted network with the bands and the array that it was fitted for."""
 
     def __init__(self, kind: str, bands: Bands, settings: OptMLSettings, network: PathMap) -> None:
-        self.kind, self.bands, self.settings, self.network = kind, bands, settings, network
-        self._waves = waves_of(kind, bands, settings.max_distance_m)
-        self._finder = PathFinder(self._waves, network)
+        super().__init__(kind, bands, settings)
+        self.settings: OptMLSettings = settings
+        self.network = network
 
-    def predict(self, inputs: Inputs, receiver: int) -> NDArray[np.complex64]:
-        """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        paths = self._paths(uplink_of(inputs))
-        return self._waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz).astype(np.complex64)
-
-    def _paths(self, h: Complex) -> Paths:
-        s, waves = self.settings, self._waves
+    def paths(self, h: Complex) -> Paths:
+        """Paths of uplinks [m, antennas, f]."""
+        s, waves = self.settings, self.waves
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))
         present: Mask = np.zeros((len(h), 0), bool)
         residual = h
@@ -89,7 +89,7 @@ class OptML:
 
         for _ in range(s.rounds):
             chunks = [residual[i : i + ROWS] for i in range(0, len(h), ROWS)]
-            proposals = [self._finder.propose(chunk, s.at_once, s.threshold) for chunk in chunks]
+            proposals = [self.network.propose(chunk, s.at_once, s.threshold) for chunk in chunks]
             fresh, found = (np.concatenate(part) for part in zip(*proposals, strict=True))
             theta = waves.limit(np.concatenate([theta, fresh], axis=1))
             present = np.concatenate([present, found], axis=1)
@@ -126,15 +126,45 @@ def prune(
     return theta, kept, waves.solve(theta, kept, h).residual
 
 
-def fit(record: Record, split: Split, settings: OptMLSettings, seed: int, session: FitSession) -> OptML:
-    """Choose the wave model on validation rows, then learn from simulated channels."""
-    kind, bands = choose(METHOD.name, record, split, settings, session.report)
+def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
+    """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
+    settings: OptMLSettings = problem.settings
+    kind, bands = choose(MODEL.name, problem.record, split, settings, session.report)
     waves = waves_of(kind, bands, settings.max_distance_m)
-    network = fit_paths(waves, bands, settings.simulation, settings.width, settings, seed, session)
+    session.report("simulating channels", 0.0)
+    rng = np.random.default_rng(problem.seed)
+    seen, truth = simulate(waves, settings.simulation, bands, rng)
+    channels, cells = seen.shape[1:]
+    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
+    around = to_uint(waves.around)
+    # One column a map, so that a batch is a choice of columns.
+    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
+    data = flat | {"around": around}
+    dr.make_opaque(data)
+
+    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+        return opaque_rows(rows)
+
+    def chosen(maps: Any, rows: Any) -> Any:
+        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
+        return dr.reshape(x, (channels, dr.width(rows) * cells))
+
+    def loss(network: PathMap, data: Any, rows: Any) -> Any:
+        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
+        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
+
+    asked, wanted = side_by_side(seen[:judges]), side_by_side(truth[:judges]).numpy()
+
+    def score(network: PathMap) -> float:
+        return float(np.square(network(asked, around).numpy() - wanted).mean())
+
+    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
+    maps = Network("paths", PathMap(waves, settings.width, rng), loss, data, draw, *rows, score, "mean squared error")
+    network = train_network(maps, settings, (problem.seed,), session)[0]
     return OptML(kind, bands, settings, network)
 
 
-def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
+def load(arrays: Arrays, problem: Problem, folder: Path) -> OptML:
     """The model that `OptML.arrays` described."""
     settings, (kind, bands) = stored_settings(OptMLSettings, arrays, "optml"), Bands.load(arrays)
     waves = waves_of(kind, bands, settings.max_distance_m)
@@ -143,4 +173,4 @@ def load(arrays: dict[str, NDArray[Any]], record: Record) -> OptML:
 
 
 SOURCE = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
-METHOD = Method("optml", ("csi",), OptMLSettings, fit, load, SOURCE, needs_uplink=True)
+MODEL = Model("optml", ("csi",), OptMLSettings, fit, load, SOURCE, uplink="required", headings=True)

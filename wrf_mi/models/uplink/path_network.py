@@ -16,14 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ...backend.device import on_device, to_tensor, to_uint
+from ...backend.device import to_tensor, to_uint
 from ...core.angles import FloatArray
 from ...core.settings import Count
-from ...core.types import IntArray
-from ...training.loop_config import LoopConfig
-from ...training.session import FitSession
-from ..networks.layers import Linear, Module, columns
-from ..networks.training import Network, opaque_rows, train_network
+from ..networks.layers import Linear, Module
 from .csi_bands import Bands
 from .uplink_waves import ArrayWaves, Complex, Waves
 
@@ -31,8 +27,6 @@ FLOOR_DB = 30.0
 """Range of maps, dB: 0 is this far below the strongest path, 1 the strongest path."""
 BLUR = 1.0
 """Width of a path in the map to be learned, in cells."""
-MAX_VALIDATION = 100
-"""Most maps that validate."""
 CHUNK_SIZE = 256
 """Maps that are made together: bounds the memory."""
 
@@ -76,12 +70,11 @@ def simulate(
     seen, truth = [], []
     axes = waves.cosines.shape[1]
     near = max(float(waves.grid[0]), 0.0)
-    spherical = isinstance(waves, ArrayWaves) and waves.spherical
     for first in range(0, simulation.channels, CHUNK_SIZE):
         n, k = min(CHUNK_SIZE, simulation.channels - first), simulation.paths
         present = np.arange(k) < rng.integers(1, k + 1, (n, 1))
         far = float(waves.grid[-1])
-        d = near * (far / near) ** rng.random((n, k)) if spherical else rng.uniform(near, far, (n, k))
+        d = near * (far / near) ** rng.random((n, k)) if waves.spherical else rng.uniform(near, far, (n, k))
         cosines = rng.standard_normal((n, k, axes))
         if axes:
             # Uniform in the ball of directions that an array of so many axes resolves.
@@ -120,14 +113,6 @@ def _target(waves: Waves, theta: FloatArray, level_db: FloatArray, present: NDAr
     return out
 
 
-def neighbours(lattice: IntArray) -> IntArray:
-    """Numbers of the cells around each cell of directions and of itself, [3^axes, cells]; -1 outside the lattice."""
-    axes = lattice.shape[1]
-    index = {tuple(point): number for number, point in enumerate(lattice)}
-    steps = np.array(list(np.ndindex(*(3,) * axes)), int) - 1
-    return np.array([[index.get(tuple(point + step), -1) for point in lattice] for step in steps])
-
-
 class PathMap(Module):
     """Two convolutions over directions and a layer for each cell: maps [channels, cells * batch] to such maps.
 
@@ -135,115 +120,50 @@ class PathMap(Module):
     """
 
     def __init__(self, waves: Waves, width: int, rng: np.random.Generator) -> None:
-        table, channels = neighbours(waves.lattice), len(waves.grid)
-        self.layers = [Linear(inputs * len(table), width, rng) for inputs in (channels, width)]
+        self.waves, channels = waves, len(waves.grid)
+        self.layers = [Linear(inputs * len(waves.around), width, rng) for inputs in (channels, width)]
         self.out = Linear(width, channels, rng, gain=0.5)
 
     def __call__(self, x: Any, around: Any) -> Any:
-        """Maps of paths; ``around`` is of `around_of`."""
+        """Maps of paths; ``around`` is `Waves.around` on the device."""
         for layer in self.layers:
-            x = _elu(layer(_patches(x, around)))
+            x = _elu(layer(_patches(x, around, len(self.waves.cosines))))
         return self.out(x)
+
+    def propose(self, h: Complex, count: int, threshold: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Up to ``count`` paths of each uplink: parameters [n, count, p] and which of them rise above ``threshold``."""
+        waves = self.waves
+        n, channels, cells = len(h), len(waves.grid), len(waves.cosines)
+        found = self(side_by_side(maps_of(waves, h)), to_uint(waves.around)).numpy()
+        found = found.reshape(channels, n, cells).transpose(1, 0, 2)
+        padded = np.full((n, channels + 2, cells + 1), -np.inf, np.float32)
+        padded[:, 1:-1, :-1] = found
+        highest = padded[:, :, waves.around].max(axis=2)
+        highest = np.maximum(np.maximum(highest[:, :-2], highest[:, 1:-1]), highest[:, 2:])
+        peaks = np.where((found >= highest) & (found > threshold), found, -np.inf).reshape(n, -1)
+        count = min(count, peaks.shape[1])
+        best = np.argsort(-peaks, axis=1, kind="stable")[:, :count]
+        at, direction = np.unravel_index(best, (channels, cells))
+        theta = np.concatenate([waves.grid[at][..., None], waves.cosines[direction]], axis=2)
+        return theta, np.isfinite(np.take_along_axis(peaks, best, axis=1))
 
 
 def _elu(x: Any) -> Any:
     return dr.select(x > 0, x, dr.exp(dr.minimum(x, 0)) - 1)
 
 
-def _patches(x: Any, around: Any) -> Any:
-    """Values of each cell's neighbours, [neighbours * channels, columns]."""
+def _patches(x: Any, around: Any, cells: int) -> Any:
+    """Values of each cell's neighbours, [neighbours * channels, columns]; zero outside the lattice."""
     channels, total = x.shape
-    cells = dr.width(around["cells"])
-    count = dr.width(around["index"]) // cells
+    count = dr.width(around) // cells
     slot = dr.arange(mi.UInt32, count * channels * total)
     column, rest = slot % total, slot // total
-    channel, neighbour = rest % channels, rest // channels
-    at = neighbour * cells + column % cells
-    inside = dr.gather(mi.Bool, around["inside"], at)
-    source = channel * total + (column // cells) * cells + dr.gather(mi.UInt32, around["index"], at)
-    return type(x)(dr.gather(type(x.array), x.array, source, inside), (count * channels, total))
+    channel, number = rest % channels, rest // channels
+    neighbour = dr.gather(mi.UInt32, around, number * cells + column % cells)
+    source = channel * total + (column // cells) * cells + neighbour
+    return type(x)(dr.gather(type(x.array), x.array, source, neighbour < cells), (count * channels, total))
 
 
-def around_of(waves: Waves) -> dict[str, Any]:
-    """Neighbours of cells on the device: ``index`` and ``inside`` [neighbours * cells], and ``cells``, as long."""
-    table = neighbours(waves.lattice)
-    around = {
-        "index": to_uint(np.maximum(table, 0)),
-        "inside": on_device(table >= 0, mi.Bool),
-        "cells": dr.zeros(mi.UInt32, len(waves.cosines)),
-    }
-    dr.make_opaque(around)
-    return around
-
-
-class PathFinder:
-    """Proposals of paths by a fitted network on the grid of a wave model."""
-
-    def __init__(self, waves: Waves, network: PathMap) -> None:
-        self.waves, self.network = waves, network
-        self._around, self._table = around_of(waves), neighbours(waves.lattice)
-
-    def propose(self, h: Complex, count: int, threshold: float) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Up to ``count`` paths of each uplink: parameters [n, count, p] and which of them rise above ``threshold``."""
-        n, channels, cells = len(h), len(self.waves.grid), len(self.waves.cosines)
-        found = self.network(_side_by_side(maps_of(self.waves, h)), self._around).numpy()
-        found = found.reshape(channels, n, cells).transpose(1, 0, 2)
-        padded = np.full((n, channels + 2, cells + 1), -np.inf, np.float32)
-        padded[:, 1:-1, :-1] = found
-        # The last cell is the outside, to which -1 points.
-        highest = padded[:, :, self._table].max(axis=2)
-        highest = np.maximum(np.maximum(highest[:, :-2], highest[:, 1:-1]), highest[:, 2:])
-        peaks = np.where((found >= highest) & (found > threshold), found, -np.inf).reshape(n, -1)
-        count = min(count, peaks.shape[1])
-        best = np.argsort(-peaks, axis=1, kind="stable")[:, :count]
-        at, direction = np.unravel_index(best, (channels, cells))
-        theta = np.concatenate([self.waves.grid[at][..., None], self.waves.cosines[direction]], axis=2)
-        return theta, np.isfinite(np.take_along_axis(peaks, best, axis=1))
-
-
-def _side_by_side(maps: NDArray[np.float32]) -> Any:
+def side_by_side(maps: NDArray[np.float32]) -> Any:
     """Maps [n, channels, cells] as a tensor [channels, n * cells]."""
     return to_tensor(maps.transpose(1, 0, 2).reshape(maps.shape[1], -1))
-
-
-def fit_paths(
-    waves: Waves,
-    bands: Bands,
-    simulation: Simulation,
-    width: int,
-    config: LoopConfig,
-    seed: int,
-    session: FitSession,
-) -> PathMap:
-    """Simulate channels and learn the maps of their paths by the squared error."""
-    session.report("simulating channels", 0.0)
-    rng = np.random.default_rng(seed)
-    seen, truth = simulate(waves, simulation, bands, rng)
-    channels, cells = seen.shape[1:]
-    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
-    around = around_of(waves)
-    # One column a map, so that a batch is a choice of columns.
-    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
-    data = flat | {"around": around}
-    dr.make_opaque(data)
-
-    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return opaque_rows(rows)
-
-    def chosen(maps: Any, rows: Any) -> Any:
-        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
-        return dr.reshape(x, (channels, dr.width(rows) * cells))
-
-    def loss(network: PathMap, data: Any, rows: Any) -> Any:
-        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
-        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
-
-    asked, wanted = _side_by_side(seen[:judges]), _side_by_side(truth[:judges]).numpy()
-
-    def score(network: PathMap) -> float:
-        return float(np.square(network(asked, around).numpy() - wanted).mean())
-
-    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
-    network = Network("paths", PathMap(waves, width, rng), loss, data, draw, *rows, score, "mean squared error")
-    trained: PathMap = train_network(network, config, (seed,), session)[0]
-    return trained

@@ -34,8 +34,6 @@ ACCURACY = 1e-26
 """Share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums."""
 CONVERGED = 1e-9
 """Relative fall of the residual's energy below which a refinement has converged."""
-PARTS = ("gains", "residual", "atoms", "gram")
-"""Attributes of `Solved`."""
 
 
 @dataclass
@@ -147,7 +145,7 @@ def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: in
     for _ in range(steps):
         if not len(active):
             break
-        now = Solved(*(getattr(solved, name)[active] for name in PARTS))
+        now = Solved(*(values[active] for values in vars(solved).values()))
         normal, right = waves.normal(theta[active], now)
         diagonal = np.arange(normal.shape[1])
         scale = np.maximum(normal[:, diagonal, diagonal], 0)
@@ -163,8 +161,8 @@ def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: in
         converged = better & (left > (1 - CONVERGED) * energy[active])
         kept = active[better]
         theta[kept] = trial[better]
-        for name in PARTS:
-            getattr(solved, name)[kept] = getattr(tried, name)[better]
+        for values, found in zip(vars(solved).values(), vars(tried).values(), strict=True):
+            values[kept] = found[better]
         energy[kept] = left[better]
         damping[active] = np.where(better, damping[active] / 5, damping[active] * 8).clip(1e-12, 1e6)
         done = converged | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)

@@ -13,8 +13,8 @@ pseudo-inverses and nonlinear least squares problems whose variables separate", 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,69 +59,6 @@ class Solved:
         return np.asarray(np.square(np.abs(self.residual)).sum(axis=(1, 2)))
 
 
-class Waves(ABC):
-    """A wave model; parameters of paths are [n, paths, p], present paths marked in [n, paths].
-
-    Attributes:
-        freedom: real numbers that describe a path, gains included.
-        grid: distances of the grid, ascending, metres.
-        cosines: directions of the grid [cells, p - 1].
-        lattice: indices of these on the lattice of directions, [cells, p - 1].
-    """
-
-    freedom: int
-    grid: FloatArray
-    cosines: FloatArray
-    lattice: NDArray[np.int64]
-
-    @abstractmethod
-    def power(self, residual: Complex) -> FloatArray:
-        """Power of a residual in each cell of the grid, [n, distances, cells]: a matched filter."""
-
-    @abstractmethod
-    def unit(self, theta: FloatArray) -> Complex:
-        """Uplink coefficients of paths of unit gain, [n, paths, f] or, with one gain for all antennas, antennas * f."""
-
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
-        atoms = self.unit(theta) * present[..., None]
-        count = atoms.shape[2]
-        left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
-        gram, diagonal = left @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
-        # The atoms of absent paths are zero: 1 on the diagonal keeps the matrix regular and their gains zero.
-        gram[:, diagonal, diagonal] += ~present
-        gains = _solve(gram, left @ right, ridge, count)
-        return Solved(gains, h - (gains.transpose(0, 2, 1) @ atoms).reshape(h.shape), atoms, gram)
-
-    @abstractmethod
-    def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix [n, m, m] and right side [n, m] of a Gauss-Newton step of all m = paths * p parameters."""
-
-    @abstractmethod
-    def limit(self, theta: FloatArray) -> FloatArray:
-        """Parameters limited to the domain of the model."""
-
-    @abstractmethod
-    def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
-        """Coefficients [n, antennas, frequencies]."""
-
-
-def waves_of(kind: str, bands: Bands, max_distance_m: float) -> Waves:
-    """A wave model by name: ``plane``, ``spherical`` or ``free``."""
-    if kind == "free":
-        return FreeWaves(bands, max_distance_m)
-    return ArrayWaves(bands, max_distance_m, spherical=kind == "spherical")
-
-
-def distances(bands: Bands, max_distance_m: float) -> FloatArray:
-    """Distances of the first search, metres, also negative ones, within the range that the spacing resolves."""
-    width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
-    reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
-    step = speed_of_light / width / FINE
-    count = max(int(np.ceil(reach / step)), 1)
-    return np.linspace(-reach, reach, 2 * count + 1)
-
-
 def strongest(waves: Waves, residual: Complex) -> FloatArray:
     """The path [n, p] on a wave model's grid that explains most of a residual."""
     power = waves.power(residual)
@@ -145,27 +82,61 @@ def _turn(angle: FloatArray) -> Complex:
     return turned
 
 
-class FreeWaves(Waves):
-    """Paths with a delay that all antennas share and a gain for each antenna."""
+class Waves:
+    """Paths with a delay that all antennas share and a gain for each antenna; base of waves at known elements.
+
+    Parameters of paths are [n, paths, p], present paths marked in [n, paths].
+
+    Attributes:
+        freedom: real numbers that describe a path, gains included.
+        grid: distances of the grid, ascending, metres.
+        cosines: directions of the grid [cells, p - 1].
+        lattice: indices of these on the lattice of directions, [cells, p - 1].
+        spherical: whether waves are spherical.
+    """
+
+    spherical = False
 
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
         self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
         self.reference_hz = bands.reference_hz
-        self.grid = distances(bands, max_distance_m)
+        # Distances of the first search, also negative ones, within the range that the spacing resolves.
+        width = float(np.ptp(bands.uplink_hz)) + bands.spacing_hz
+        reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
+        count = max(int(np.ceil(reach / (speed_of_light / width / FINE))), 1)
+        self.grid = np.linspace(-reach, reach, 2 * count + 1)
         self.cosines, self.lattice = np.zeros((1, 0)), np.zeros((1, 0), np.int64)
         self.steering = np.exp(self.grid[:, None] * self.slope)
         self.freedom = 1 + 2 * bands.antennas
 
+    @cached_property
+    def around(self) -> NDArray[np.int64]:
+        """Cells around each cell of directions and the cell itself, [3^axes, cells]; ``cells`` outside the lattice."""
+        index = {tuple(point): number for number, point in enumerate(self.lattice)}
+        steps = np.array(list(np.ndindex(*(3,) * self.lattice.shape[1])), int) - 1
+        return np.array([[index.get(tuple(point + step), len(index)) for point in self.lattice] for step in steps])
+
     def power(self, residual: Complex) -> FloatArray:
-        """Power of a residual in each cell of the grid, [n, distances, cells]."""
+        """Power of a residual in each cell of the grid, [n, distances, cells]: a matched filter."""
         return np.asarray(np.square(np.abs(residual @ self.steering.conj().T)).sum(axis=1)[:, :, None])
 
     def unit(self, theta: FloatArray) -> Complex:
-        """Uplink coefficients of paths of unit gain, [n, paths, f]."""
+        """Uplink coefficients of paths of unit gain, [n, paths, f] or, with one gain for all antennas, antennas * f."""
         return np.asarray(np.exp(theta * self.slope))
 
+    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
+        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
+        atoms = self.unit(theta) * present[..., None]
+        count = atoms.shape[2]
+        left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
+        gram, diagonal = left @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
+        # The atoms of absent paths are zero: 1 on the diagonal keeps the matrix regular and their gains zero.
+        gram[:, diagonal, diagonal] += ~present
+        gains = _solve(gram, left @ right, ridge, count)
+        return Solved(gains, h - (gains.transpose(0, 2, 1) @ atoms).reshape(h.shape), atoms, gram)
+
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix and right side of a Gauss-Newton step."""
+        """Normal matrix [n, m, m] and right side [n, m] of a Gauss-Newton step of all m = paths * p parameters."""
         tilt = solved.atoms * self.slope
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
         products = tilt.conj() @ tilt.transpose(0, 2, 1)
@@ -188,10 +159,11 @@ class ArrayWaves(Waves):
     """Paths with a gain, a distance and a direction, at an array of known elements."""
 
     def __init__(self, bands: Bands, max_distance_m: float, spherical: bool) -> None:
+        super().__init__(bands, max_distance_m)
         assert bands.elements_m is not None
         self.elements, self.spherical = bands.elements_m, spherical
         self.square = np.square(self.elements).sum(axis=1)
-        self.frequencies, self.reference_hz = bands.uplink_hz, bands.reference_hz
+        self.frequencies = bands.uplink_hz
         axes = self.elements.shape[1]
         self.freedom = 3 + axes
         self.far = max_distance_m
@@ -206,13 +178,11 @@ class ArrayWaves(Waves):
         cosines = np.stack([p[where[:, axis]] for axis, p in enumerate(points)], axis=-1) if axes else np.zeros((1, 0))
         visible = np.square(cosines).sum(axis=1) <= 1.01
         self.cosines, self.lattice = cosines[visible], where[visible]
-        grid = distances(bands, max_distance_m)
         if spherical:
             # Curvature changes with 1 / d near the array, delay with d far from it.
             bends = 1 / np.linspace(1 / max_distance_m, 1 / max(self.near, 1e-3), 9)[1:]
-            grid = np.sort(np.concatenate([grid[grid > max(self.near, 1e-3)], bends]))
-        self.grid = grid
-        self._steering = [self._towards(d) for d in (grid if spherical else grid[:1])]
+            self.grid = np.sort(np.concatenate([self.grid[self.grid > max(self.near, 1e-3)], bends]))
+        self._steering = [self._towards(d) for d in (self.grid if spherical else self.grid[:1])]
 
     def _towards(self, distance_m: float) -> Complex:
         """Matched filters at one distance in all directions, [antennas, directions], of unit length."""
@@ -315,3 +285,10 @@ class ArrayWaves(Waves):
     def evaluate(self, theta: FloatArray, gains: Complex, frequencies_hz: FloatArray) -> Complex:
         """Coefficients [n, antennas, frequencies]."""
         return np.asarray(np.einsum("nk,nkaf->naf", gains[..., 0], self.atoms(theta, frequencies_hz)))
+
+
+def waves_of(kind: str, bands: Bands, max_distance_m: float) -> Waves:
+    """A wave model by name: ``plane``, ``spherical`` or ``free``."""
+    if kind == "free":
+        return Waves(bands, max_distance_m)
+    return ArrayWaves(bands, max_distance_m, spherical=kind == "spherical")

@@ -1,29 +1,34 @@
-"""Repeatability: comparison of subprocesses, and the backend of ``--deterministic``."""
+"""Repeatability: equal bits of fits, equal steps on other backends, and the backend of ``--deterministic``."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
-from small_fits import QUICK, official, settings
-from wrf_mi_bench.determinism import GRADIENT, IMAGE, cuda_works, different, distance, other_llvms
-from wrf_mi_bench.subprocess_job import Job, SubprocessJobFailed, subprocess_job
+from small_fits import QUICK, official, settings, stop_after
+from step_job import step_in_process
 
 from wrf_mi import backend
+from wrf_mi.backend.probe import try_llvm
 from wrf_mi.cli import train as cli_train
 from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError, Record
-from wrf_mi.runs.api import resume, train
+from wrf_mi.core.files import stored_arrays
+from wrf_mi.parallel import run_module
+from wrf_mi.runs.api import Interrupted, resume, train
+from wrf_mi.scene.make import make_scene
 from wrf_mi.training.trainer import Trainer
 
 FIT = (
     *(*QUICK, "steps=30", "checkpoint_every=10"),
     *("density.every=12", "density.start=0", "density.stop=1", "density.growth_fraction=0.3"),
 )
-STEP = ("initial.gaussians=8", "batch=4")
+IMAGE = 1e-5
+"""Bound on the largest difference of an image, relative to its largest pixel."""
+GRADIENT = 1e-3
+"""Bound on the relative difference in norm of a step's gradient, each group, as in the stress benchmark."""
 
 
 @pytest.fixture
@@ -33,51 +38,67 @@ def gpu_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "_active", cuda)
 
 
-def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path) -> None:
-    """One trains in one go, one stops, and a third goes on: parameters, moments, test rows and new positions."""
-    job = Job("field", str(folder), FIT, deterministic=True)
-    whole = subprocess_job(job)
-    assert different(whole, subprocess_job(replace(job, stop=17))) == []
-    assert {"score", "model.npz: param/position", "predictions.npz: prediction", "new.npz: prediction"} <= set(whole)
-    assert whole["model.npz: param/position"].shape[1] > 8
+def arrays_of(run: Path) -> dict[str, np.ndarray]:
+    """Fitted arrays and predictions of a run, without times."""
+    files = [run / name for name in ("model.npz", "paths.npz", "predictions.npz") if (run / name).exists()]
+    loaded = {f"{file.name}: {key}": values for file in files for key, values in stored_arrays(file).items()}
+    return {name: values for name, values in loaded.items() if not name.endswith("seconds")}
 
 
-def test_any_bit_that_differs_is_found() -> None:
-    one = {"zero": np.zeros(2), "nan": np.array([np.nan]), "count": np.arange(3)}
-    assert different(one, {name: values.copy() for name, values in one.items()}) == []
-    assert different(one, one | {"zero": np.array([0.0, -0.0])}) == ["zero"]
-    assert different(one, one | {"zero": np.array([0.0, 5e-324])}) == ["zero"]
-    assert different(one, one | {"count": np.arange(3, dtype=np.int32)}) == ["count"]
-    assert different(one, {"nan": one["nan"], "zero": one["zero"], "more": np.zeros(1)}) == ["count", "more"]
+def assert_same_bits(one: Path, other: Path) -> None:
+    found, expected = arrays_of(one), arrays_of(other)
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert (found[name].dtype, found[name].tobytes()) == (values.dtype, values.tobytes()), name
 
 
-def test_distance_of_two_steps() -> None:
-    one = {"image": np.array([0.5, -2.0]), "gradient/a": np.array([3.0, 4.0]), "gradient/b": np.zeros(2)}
-    other = {"image": np.array([0.5, -1.9]), "gradient/a": np.array([3.0, 4.5]), "gradient/b": np.zeros(2)}
-    assert distance(one, other) == {"image": pytest.approx(0.05), "gradient": pytest.approx(0.1)}
+def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path, tmp_path: Path) -> None:
+    """One trains without a stop, one stops here and is resumed by another process."""
+    words = [word for setting in FIT for word in ("--set", setting)]
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    assert run_module("wrf_mi.cli", ["train", str(folder), "--deterministic", *words, "--out", str(whole)])[0] == 0
+    with pytest.raises(Interrupted):
+        train(folder, resumed, settings=[*FIT, "deterministic=true"], stop=stop_after(17))
+    assert run_module("wrf_mi.cli", ["train", "--resume", str(resumed)])[0] == 0
+    assert_same_bits(whole, resumed)
+    assert stored_arrays(whole / "model.npz")["param/position"].shape[1] > 8
 
 
-def test_failed_subprocess_job_states_its_error() -> None:
-    with pytest.raises(SubprocessJobFailed, match=r"nothing of nowhere ended with status 1: KeyError: 'nothing'"):
-        subprocess_job(Job("nothing", "nowhere"))
+@pytest.mark.parametrize("model", ["physics", "ray-tracing"])
+def test_physics_and_paths_do_not_depend_on_the_number_of_threads(
+    model: str, flat_folder: Path, tmp_path: Path
+) -> None:
+    scene = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
+    for threads in (1, 2):
+        backend.set_threads(threads)
+        train(flat_folder, tmp_path / f"on-{threads}", model, scene=scene)
+    assert_same_bits(tmp_path / "on-1", tmp_path / "on-2")
+
+
+def assert_equal_steps(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    assert np.abs(one["image"] - other["image"]).max() < IMAGE * np.abs(one["image"]).max()
+    for name, values in one.items():
+        assert np.linalg.norm(values - other[name]) <= GRADIENT * np.linalg.norm(values), name
+
+
+def other_llvms() -> list[Path]:
+    """Usable LLVM libraries of other major versions than this process uses."""
+    major = (backend.init().llvm_version or "").split(".")[0]
+    verdicts = {library.path: try_llvm(library) for library in backend.find_llvm(ignore_variable=True)}
+    return [path for path, one in verdicts.items() if one.usable and one.version.split(".")[0] != major]
 
 
 @pytest.mark.skipif(not other_llvms(), reason="one version of LLVM here")
-def test_another_llvm_gives_equal_steps(folder: Path) -> None:
-    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
-    for path in other_llvms().values():
-        found = distance(one, subprocess_job(Job("step", str(folder), STEP, threads=1), path))
-        assert found["image"] < IMAGE
-        assert found["gradient"] < GRADIENT
+def test_another_llvm_gives_equal_steps(folder: Path, tmp_path: Path) -> None:
+    one = step_in_process(folder, tmp_path / "one.npz")
+    for path in other_llvms():
+        assert_equal_steps(one, step_in_process(folder, tmp_path / "other.npz", llvm=path))
 
 
 @pytest.mark.gpu
-def test_gpu_gives_equal_steps(folder: Path) -> None:
-    assert cuda_works()
-    one = subprocess_job(Job("step", str(folder), STEP, threads=1))
-    found = distance(one, subprocess_job(Job("step", str(folder), STEP, backend="cuda")))
-    assert found["image"] < IMAGE
-    assert found["gradient"] < GRADIENT
+def test_gpu_gives_equal_steps(folder: Path, tmp_path: Path) -> None:
+    one = step_in_process(folder, tmp_path / "one.npz")
+    assert_equal_steps(one, step_in_process(folder, tmp_path / "other.npz", "cuda"))
 
 
 def test_deterministic_fits_take_one_thread_of_the_cpu(one_gateway: Record) -> None:
