@@ -14,8 +14,8 @@ from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.surfaces import Surfaces, scene_surfaces
 from wrf_mi.tracing.walls import moved_planes, plane_centres
 
-SECOND_ORDER = 5e-6
-"""Metres and rad: a rotation of 1 mrad squared, times 5 m."""
+SECOND_ORDER = 5e-5
+"""Metres and rad: a rotation of 1.4 mrad times a displacement of 37 mm, or its square times 5 m."""
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ Paths are found once with the stated scene. Then, each on the training rows alon
 1. *choice*: every surface tries common materials, every plane shifts (`wrf_mi.correction.search`);
 2. *least squares*: materials, planes and antennas, with priors (`wrf_mi.correction.least_squares`).
 
-Both are first done without a quarter of the training rows, held out in clusters. On these rows the stated scene, changed
-materials alone, and materials with planes are compared; the best is kept and fitted again to all training rows.
-A scene that measurements cannot improve is returned as it was.
+Both are done in rounds, first without a quarter of the training rows, held out in clusters. On these rows the stated
+scene, changed materials alone, and materials with planes are compared; the best is kept and fitted again to all
+training rows. A scene that measurements cannot improve is returned as it was.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ PARTS = (MATERIALS, PLANES, FRAME, "gain", "pose", "patterns")
 LEAST_PATHS = 10
 """Fewest paths of a surface or plane that is changed."""
 ROUNDS = 4
-"""Largest number of rounds of choices and least squares: planes that are off hide the right material, and conversely."""
+"""Largest number of rounds: planes that are off hide the right material, and conversely."""
+REFINING_STEPS = 3
+"""Largest number of least-squares steps of one plane while shifts are compared."""
 FLAT = 10.0
 """Standard deviation of the logarithm of a gain, and of its phase in rad: no prior knowledge."""
 
@@ -74,7 +76,8 @@ class CorrectionOptions:
         tilt_sd_rad: that of its tilts, rad.
         frame_sd_m: that of the common displacement of all planes against the devices, metres.
         frame_sd_rad: that of their common rotation, rad.
-        material_sd: that of the logarithm of a material's permittivity - 1; conductivities have twice, thicknesses half.
+        material_sd: that of the logarithm of a material's permittivity - 1; its conductivity has twice, its thickness
+            half of it.
         pose_sd_m: that of a receiver's position, metres.
         pose_sd_rad: that of its orientation, rad.
         pattern_sd: that of a pattern's coefficient.
@@ -338,14 +341,16 @@ class _Fit:
         options, misfit = self.options, self.misfit
         shifts, materials = list[Choice](), list[Choice]()
         if PLANES in parts or FRAME in parts:
-            free_m = options.shift_sd_m * (PLANES in parts), options.frame_sd_m * (FRAME in parts)
-            shifts = shift_choices(misfit, self.planes, float(np.hypot(*free_m)), self.frequency_hz)
+            alone, common = PLANES in parts, FRAME in parts
+            sd_m = float(np.hypot(options.shift_sd_m * alone, options.frame_sd_m * common))
+            sd_rad = float(np.hypot(options.tilt_sd_rad * alone, options.frame_sd_rad * common))
+            shifts = shift_choices(misfit, self.planes, sd_m, sd_rad, self.frequency_hz)
         if MATERIALS in parts:
             materials = material_choices(misfit, self.slabs, self.frequency_hz)
         choices = joint_choices(materials, shifts, misfit.plane_of_slab)
         for round_ in range(ROUNDS):
             what = f"{stage.replace('+', ', ')}: choices, round {round_ + 1}"
-            vector, taken = choose(misfit, vector, choices, self._progress(what))
+            vector, taken = choose(misfit, vector, choices, self._refined, self._progress(what))
             if round_ and not taken:
                 break
             for choice in choices:
@@ -358,6 +363,26 @@ class _Fit:
             vector = found.vector
         self.means[stage] = mean
         return found
+
+    def _refined(self, start: FloatArray, places: IntArray) -> FloatArray:
+        """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
+        misfit, vector, mean = self.misfit, start.copy(), start.copy()
+        for name in (SHIFT, TILT):
+            mean[misfit.parts[name]] = self.stated[misfit.parts[name]]
+
+        def whole(part: FloatArray) -> FloatArray:
+            vector[places] = part
+            return vector
+
+        prior, nothing = self.prior(mean, places), lambda place: None
+        found = solve(
+            lambda part: misfit.residual(whole(part)),
+            lambda part: misfit.jacobian(whole(part), places, nothing),
+            start[places],
+            prior,
+            REFINING_STEPS,
+        )
+        return whole(found.vector)
 
     def _progress(self, what: str) -> Callable[[int, int], None]:
         return lambda done, of: self.on_stage(what, done / max(of, 1))

@@ -26,6 +26,8 @@ FREEDOM = 4.0
 MEDIAN_OF_MEAN = 0.8
 """Median of a row's mean squared residual in units of the variance: that of a chi-squared variable of 3 to 10 degrees
 of freedom, divided by its mean, is 0.79 to 0.93."""
+LEAST_VARIANCE = 1e-10
+"""Smallest variance of a residual in a unit of about 1: reports are rounded to single precision."""
 TRIALS = 8
 """Largest number of damping factors tried in a step, each `HARDER` times the one before."""
 HARDER = 8.0
@@ -56,16 +58,16 @@ class Noise:
         square = float(np.square(product).sum())
         count = float(np.trace(product)) ** 2 / square if square > 0 else 1.0
         variance = float(np.median(np.square(seen).mean(axis=1))) / MEDIAN_OF_MEAN if len(seen) else 1.0
-        return cls(max(variance, np.finfo(float).tiny), min(max(count, 1.0), float(residual.shape[1])))
+        return cls(max(variance, LEAST_VARIANCE), min(max(count, 1.0), float(residual.shape[1])))
 
     def cost(self, residual: FloatArray) -> float:
         """Negative logarithm of the likelihood of residuals [rows, values]."""
         return float((FREEDOM + self.values) / 2 * np.log1p(self._excess(residual)).sum())
 
     def weights(self, residual: FloatArray) -> FloatArray:
-        """Weights [rows] of squared residuals, 1 / s^2 times at most (FREEDOM + n_eff) / FREEDOM; 0 without observation.
+        """Weights [rows] of squared residuals: (FREEDOM + n_eff) / FREEDOM / s^2 at most, 0 without observation.
 
-        Divided by the number of values: sums over all values are then sums over independent ones.
+        They are divided by values per independent value: sums over all values are then sums over independent ones.
         """
         share = self.values / residual.shape[1] / self.variance
         seen = np.isfinite(residual).all(axis=1)

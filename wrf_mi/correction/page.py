@@ -33,7 +33,7 @@ from .search import ABSENT
 
 PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
 SUPPORTED = 0.5
-"""Largest ratio of a standard deviation after the correction to the one before at which a quantity counts as measured."""
+"""Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
 
 
 def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:
@@ -236,8 +236,8 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         f"{'' if MATERIALS in facts['kept'] else ', or no change of materials was kept'}.",
         f'- "Measured" are quantities whose standard deviation fell below {SUPPORTED:.0%} of the one before; '
         "`x/ 1.2` is a factor of one standard deviation.",
-        "- Standard deviations are those of the Fisher information and the prior, with the paths as found in the stated "
-        "scene. Surfaces that the scan missed are not in them.",
+        "- Standard deviations are those of the Fisher information and the prior, with the paths as found in the "
+        "stated scene. Surfaces that the scan missed are not in them.",
         "",
     ]
     return "\n".join(lines)

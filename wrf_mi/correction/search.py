@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -17,7 +18,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tracing.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, SURFACE, name_of
 from ..tracing.materials import itu_constants
-from ..tracing.plane_parameters import SHIFT
+from ..tracing.plane_parameters import SHIFT, TILT
 from .least_squares import Noise
 from .misfit import Misfit
 
@@ -31,6 +32,8 @@ GAIN = 0.5
 SWEEPS = 3
 JOINT = 10
 """Number of planes whose material and shift are chosen together."""
+REFINED = 4
+"""Number of shifts, the best with their best materials, that are compared after least-squares steps."""
 STEP = 1 / 16
 """Step of the shifts, wavelengths: paths change by up to an eighth."""
 FARTHEST = 2.0
@@ -53,6 +56,11 @@ class Choice:
     values: Mapping[str, FloatArray]
     deviation: FloatArray
 
+    @property
+    def joint(self) -> bool:
+        """Whether material and shift are chosen together."""
+        return bool(np.isinf(self.deviation).any() and np.isfinite(self.deviation).any())
+
     def cost(self, vector: FloatArray) -> float:
         """Negative logarithm of the prior of a vector's values, without its constant."""
         return float(np.square(vector[self.places] / self.deviation).sum() / 2)
@@ -71,15 +79,16 @@ def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list
     return [Choice(names[slab], np.add(first, slab), values, np.full(3, np.inf)) for slab in hit]
 
 
-def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, frequency_hz: float) -> list[Choice]:
-    """Choices of shifts of the planes ``hit`` within `FARTHEST` standard deviations of the prior."""
+def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, frequency_hz: float) -> list[Choice]:
+    """Choices of shifts of the planes ``hit``, without a tilt, within `FARTHEST` standard deviations of the prior."""
     step_m = STEP * speed_of_light / frequency_hz
     most = int(FARTHEST * sd_m / step_m)
     shifts = step_m * np.arange(-most, most + 1)
-    values = {f"{1e3 * shift:+.0f} mm": np.array([shift]) for shift in shifts}
-    first = misfit.parts[SHIFT].start
-    deviation = np.array([sd_m])
-    return [Choice(f"plane {plane}", np.array([first + plane]), values, deviation) for plane in hit] if most else []
+    values = {f"{1e3 * shift:+.0f} mm": np.array([shift, 0, 0]) for shift in shifts}
+    shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
+    deviation = np.array([sd_m, sd_rad, sd_rad])
+    places = {plane: np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in hit}
+    return [Choice(f"plane {plane}", place, values, deviation) for plane, place in places.items()] if most else []
 
 
 def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int]) -> list[Choice]:
@@ -108,7 +117,11 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_o
 
 
 def choose(
-    misfit: Misfit, vector: FloatArray, choices: Sequence[Choice], on_choice: Callable[[int, int], None]
+    misfit: Misfit,
+    vector: FloatArray,
+    choices: Sequence[Choice],
+    refine: Callable[[FloatArray, IntArray], FloatArray],
+    on_choice: Callable[[int, int], None],
 ) -> tuple[FloatArray, dict[str, str]]:
     """Coordinate descent over choices, in sweeps until none changes.
 
@@ -116,28 +129,34 @@ def choose(
         misfit: residuals of a vector.
         vector: start [p].
         choices: choices in the order in which they are tried.
+        refine: ``refine(vector, places)``: the vector after some least-squares steps of the entries ``places``.
         on_choice: called with the number of choices tried and their number.
 
     Returns:
         The vector, and the alternative taken by each choice that changed.
     """
-    vector, taken = np.array(vector, float), dict[str, str]()
+    vector, taken, first = np.array(vector, float), dict[str, str](), itemgetter(0)
     residual = misfit.residual(vector)
     for sweep in range(SWEEPS):
         noise, changed = Noise.of(residual), False
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
-            least, found = noise.cost(residual) + choice.cost(vector) - GAIN, None
+            tried = []
             for name, values in choice.values.items():
                 there = vector.copy()
                 there[choice.places] = values
-                tried = misfit.residual(there)
-                cost = noise.cost(tried) + choice.cost(there)
-                if cost < least:
-                    least, found = cost, (name, there, tried)
-            if found is not None:
-                taken[choice.what], vector, residual = found
-                changed = True
+                tried.append((noise.cost(misfit.residual(there)) + choice.cost(there), name, there))
+            if choice.joint:
+                # A plane that is tilted, too, fits at the right shift only once its tilts do.
+                by_shift = {
+                    name.rpartition(",")[2]: (cost, name, there) for cost, name, there in sorted(tried, key=first)[::-1]
+                }
+                for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
+                    better = refine(there, choice.places)
+                    tried.append((noise.cost(misfit.residual(better)) + choice.cost(better), name, better))
+            least, name, there = min(tried, key=first)
+            if least < noise.cost(residual) + choice.cost(vector) - GAIN:
+                taken[choice.what], vector, residual, changed = name, there, misfit.residual(there), True
         if not changed:
             break
     return vector, taken

@@ -140,8 +140,8 @@ def materials_text(materials: Materials) -> str:
     """The text of a ``materials.yml``."""
     head = (
         "# Radio materials of this scene (of ITU-R P.2040, or perfect). rules: of each kind of surface; surfaces: the\n"
-        "# kind of each, or a material of its own; constants: further materials, by relative permittivity, conductivity\n"
-        "# (S/m) and thickness (m). Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# kind of each, or a material of its own; constants: relative permittivity, conductivity (S/m) and thickness\n"
+        "# (m) of further materials. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
     facts = {key: dict(part) for key, part in vars(materials).items() if part or key != "constants"}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)
