@@ -40,9 +40,9 @@ def correct_command(a: Arguments) -> int:
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
     given = {"depth": a.depth, "rays": a.rays, "shift_sd_m": a.shift_sd}
-    parts = {} if a.fit is None else {"parts": tuple(a.fit.split(","))}
+    parts = CorrectionOptions().parts if a.fit is None else tuple(a.fit.split(","))
     options = with_settings(
-        CorrectionOptions(**parts), [f"{key}={value}" for key, value in given.items() if value is not None]
+        CorrectionOptions(parts), [f"{key}={value}" for key, value in given.items() if value is not None]
     )
     record = load_record(a.dataset, progress=sys.stderr.isatty())
     splits = make_splits(record, a.split, a.seed, a.n_train)

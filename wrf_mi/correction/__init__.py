@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .correct import Correction, CorrectionOptions, correct_scene
+from .correct import Correction, correct_scene
+from .options import CorrectionOptions
 from .page import write_page
 
 __all__ = ["Correction", "CorrectionOptions", "correct_scene", "write_page"]

@@ -8,9 +8,6 @@ from ..core.angles import FloatArray
 from ..tracing.surfaces import Surfaces
 from ..tracing.walls import plane_centres
 
-FRAME = "frame"
-"""Name of the part of a correction."""
-
 
 def rigid_motions(surfaces: Surfaces) -> FloatArray:
     """Derivatives of the planes' shifts [q], then tilts [q, 2] row by row, by a rigid motion of the scene: [3 q, 6].

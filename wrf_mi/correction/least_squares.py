@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 
@@ -104,7 +105,7 @@ class Solution:
 
 def solve(
     residual: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], NDArray[np.floating]],
     start: FloatArray,
     prior: Prior,
     steps: int,
@@ -144,10 +145,10 @@ def solve(
         if before - after < CONVERGED * abs(before):
             break
     information, _ = _normal(derivative, found, noise)
-    return Solution(vector, np.linalg.inv(information + prior.precision), noise)
+    return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)
 
 
-def _normal(derivative: FloatArray, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Fisher information [p, p] and gradient [p]."""
     weight = noise.weights(residual)
     columns = derivative.shape[-1]

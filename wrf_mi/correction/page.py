@@ -27,8 +27,10 @@ from ..tasks import task_of
 from ..tracing.corrected_scene import material_constants, moved_triangles, write_corrected_scene
 from ..tracing.material_parameters import SURFACE, name_of
 from ..tracing.plane_parameters import SHIFT, TILT
-from .correct import LEAST_PATHS, MATERIALS, Correction
-from .frame import FRAME, rigid_motion
+from .correct import Correction
+from .fit import LEAST_PATHS
+from .frame import rigid_motion
+from .options import FRAME, MATERIALS
 from .search import ABSENT
 
 PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"

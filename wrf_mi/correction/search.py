@@ -32,7 +32,7 @@ GAIN = 0.5
 SWEEPS = 3
 JOINT = 10
 """Number of planes whose material and shift are chosen together."""
-REFINED = 4
+REFINED = 8
 """Number of shifts, the best with their best materials, that are compared after least-squares steps."""
 STEP = 1 / 16
 """Step of the shifts, wavelengths: paths change by up to an eighth."""
@@ -47,7 +47,7 @@ class Choice:
     Attributes:
         what: name for reports.
         places: entries of the vector that it has.
-        values: alternatives by name, values of these entries.
+        values: alternatives by name, values of these entries; NaN: as the other planes let expect.
         deviation: standard deviation of each entry's prior about zero; infinite: alternatives are equally likely.
     """
 
@@ -80,11 +80,11 @@ def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list
 
 
 def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, frequency_hz: float) -> list[Choice]:
-    """Choices of shifts of the planes ``hit``, without a tilt, within `FARTHEST` standard deviations of the prior."""
+    """Choices of shifts of planes, with the tilts of the frame, within `FARTHEST` standard deviations of the prior."""
     step_m = STEP * speed_of_light / frequency_hz
     most = int(FARTHEST * sd_m / step_m)
     shifts = step_m * np.arange(-most, most + 1)
-    values = {f"{1e3 * shift:+.0f} mm": np.array([shift, 0, 0]) for shift in shifts}
+    values = {f"{1e3 * shift:+.0f} mm": np.array([shift, np.nan, np.nan]) for shift in shifts}
     shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
     deviation = np.array([sd_m, sd_rad, sd_rad])
     places = {plane: np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in hit}
@@ -120,6 +120,7 @@ def choose(
     misfit: Misfit,
     vector: FloatArray,
     choices: Sequence[Choice],
+    expect: Callable[[FloatArray, IntArray], FloatArray],
     refine: Callable[[FloatArray, IntArray], FloatArray],
     on_choice: Callable[[int, int], None],
 ) -> tuple[FloatArray, dict[str, str]]:
@@ -129,6 +130,7 @@ def choose(
         misfit: residuals of a vector.
         vector: start [p].
         choices: choices in the order in which they are tried.
+        expect: ``expect(vector, places)``: entries ``places`` by all others, in place of alternatives' NaN.
         refine: ``refine(vector, places)``: the vector after some least-squares steps of the entries ``places``.
         on_choice: called with the number of choices tried and their number.
 
@@ -141,10 +143,10 @@ def choose(
         noise, changed = Noise.of(residual), False
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
-            tried = []
+            tried, expected = [], expect(vector, choice.places)
             for name, values in choice.values.items():
                 there = vector.copy()
-                there[choice.places] = values
+                there[choice.places] = np.where(np.isnan(values), expected, values)
                 tried.append((noise.cost(misfit.residual(there)) + choice.cost(there), name, there))
             if choice.joint:
                 # A plane that is tilted, too, fits at the right shift only once its tilts do.

@@ -130,7 +130,7 @@ def write_corrected_scene(
     triangles = moved_triangles(surfaces, parameters)
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
     stated, fitted = material_constants(slabs, {}), material_constants(slabs, parameters)
-    changed = ~np.isclose(fitted, stated, rtol=UNCHANGED, atol=0).all(axis=1)
+    changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
     parts, entries, constants, thickness = [], {}, {}, {}
     for index, name in enumerate(surfaces.names):
         faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])

@@ -99,8 +99,8 @@ class SlabMaterials:
                 return given
             entries = []
             for value, parameter in zip(constant, found, strict=True):
-                fixed = parameter is None
-                entries.append(float_type(float(value)) if fixed else least + dr.exp(float_type(parameter.array)))
+                fixed = float_type(float(value))
+                entries.append(fixed if parameter is None else least + dr.exp(float_type(parameter.array)))
             return dr.concat(entries)
 
         return (

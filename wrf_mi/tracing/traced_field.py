@@ -56,10 +56,10 @@ class TracedOptions:
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
-        thickness: whether thicknesses are parameters, too.
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the scene's materials, add up
             to less than this share of the amplitudes of all; 0: none.
+        thickness: whether thicknesses of materials are parameters, too.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -67,9 +67,9 @@ class TracedOptions:
     gain: float = 1.0
     tx_antenna: Antenna = ANTENNA
     materials: MaterialGrouping = "named"
-    thickness: bool = False
     planes: bool = False
     faint: float = 0.0
+    thickness: bool = False
 
     def __post_init__(self) -> None:
         """Check the options of the search.
