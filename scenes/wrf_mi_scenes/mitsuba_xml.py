@@ -63,27 +63,34 @@ PERFECT_CONDUCTIVITY = 1e13
 PERFECT_THICKNESS_M = 0.1
 
 
-def scene_xml(materials: Mapping[str, str]) -> str:
+Constants = Mapping[str, Mapping[str, float]]
+"""``relative_permittivity``, ``conductivity`` (S/m) and ``thickness`` (m) of materials by their names."""
+PERFECT_CONSTANTS = {
+    "relative_permittivity": 1.0,
+    "conductivity": PERFECT_CONDUCTIVITY,
+    "thickness": PERFECT_THICKNESS_M,
+}
+
+
+def scene_xml(materials: Mapping[str, str], constants: Constants = MappingProxyType({})) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
 
     Sionna RT replaces the BSDFs ``mat-itu_*`` by its ITU radio materials; Mitsuba uses plain two-sided diffuse BSDFs.
-    `PERFECT` is no material of ITU-R P.2040, so it is a BSDF of Sionna RT with explicit constants, which Mitsuba knows
+    `PERFECT` and materials with constants are not of ITU-R P.2040, so they are BSDFs of Sionna RT, which Mitsuba knows
     after ``import sionna.rt``.
 
     Args:
-        materials: radio material (``itu_*`` or `PERFECT`) of each part, by the part's name.
+        materials: radio material (``itu_*``, `PERFECT` or a key of ``constants``) of each part, by the part's name.
+        constants: constants of further materials.
     """
+    known = {PERFECT: PERFECT_CONSTANTS, **constants}
     lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
     for material in dict.fromkeys(materials.values()):
         colour = COLOURS.get(material, OTHER_COLOUR)
-        if material == PERFECT:
-            lines += [
-                f'    <bsdf type="radio-material" id="mat-{PERFECT}">',
-                '        <float name="relative_permittivity" value="1"/>',
-                f'        <float name="conductivity" value="{PERFECT_CONDUCTIVITY:g}"/>',
-                f'        <float name="thickness" value="{PERFECT_THICKNESS_M:g}"/>',
-                "    </bsdf>",
-            ]
+        if material in known:
+            lines.append(f'    <bsdf type="radio-material" id="mat-{material}">')
+            lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in known[material].items()]
+            lines.append("    </bsdf>")
             continue
         lines += [
             f'    <bsdf type="twosided" id="mat-{material}">',

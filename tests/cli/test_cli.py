@@ -52,7 +52,19 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
 
 
 def test_commands_are_complete() -> None:
-    expected = {"doctor", "data", "mesh", "train", "trace", "sweep", "evaluate", "predict", "compress", "compare"}
+    expected = {
+        "doctor",
+        "data",
+        "mesh",
+        "correct",
+        "train",
+        "trace",
+        "sweep",
+        "evaluate",
+        "predict",
+        "compress",
+        "compare",
+    }
     expected |= {"bench", "demo"}
     assert {name[0] for name in commands(build_parser()) if name} == expected
 

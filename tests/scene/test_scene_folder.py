@@ -114,7 +114,7 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> No
         ("surfaces: {table: iron}", r"surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
         ("thickness_m: {itu_wood: -1}", r"thickness_m: itu_wood is -1; give metres above 0"),
         ("thickness_m: {itu_wood: thin}", r"thickness_m: itu_wood is 'thin'; give metres above 0"),
-        ("walls: {}", r"give the keys rules, surfaces and thickness_m, no others"),
+        ("walls: {}", r"give the keys rules, surfaces, thickness_m, constants, no others"),
         ("rules: itu_wood", r"rules must be a mapping"),
         ("rules: {", r"not YAML"),
     ],

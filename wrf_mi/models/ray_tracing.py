@@ -1,7 +1,7 @@
 """The model ``ray-tracing``: paths of a scene, optionally calibrated on the training rows.
 
 paths.npz         in the run folder: every path, to be used again for other materials (`wrf_mi.tracing.load_trace`)
-corrected/        where planes were calibrated: the corrected scene, a folder that plain Sionna RT opens
+corrected/        where planes or materials were calibrated: the corrected scene, a folder that plain Sionna RT opens
 convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all tried settings
 
 For signal strengths an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows. With
@@ -183,8 +183,8 @@ def _graph_problem(problem: Problem) -> Problem:
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 
-def _moves_planes(problem: Problem) -> bool:
-    return "planes" in (problem.settings.calibration or "").split(",")
+def _changes_scene(problem: Problem) -> bool:
+    return bool({"planes", "materials"} & set((problem.settings.calibration or "").split(",")))
 
 
 def fit(problem: Problem, split: Split, session: Session) -> Fitted:
@@ -195,7 +195,7 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     """
     if problem.settings.calibration is not None:
         found = fit_field(_graph_problem(problem), split, session)
-        if _moves_planes(problem):
+        if _changes_scene(problem):
             write_corrected_scene(session.folder / CORRECTED, problem.opened_scene, found.params, replace=True)
         kept = load(found.arrays(), problem, session.folder)
         kept.train_seconds = found.train_seconds
@@ -283,7 +283,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         return
     if problem.settings.calibration is not None:
         check_field(_graph_problem(problem), splits)
-        if _moves_planes(problem):
+        if _changes_scene(problem):
             check_materials(problem.opened_scene)
     assert problem.opened_scene is not None
 

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 import yaml
 from numpy.typing import ArrayLike
-from wrf_mi_scenes.mitsuba_xml import scene_xml
+from wrf_mi_scenes.mitsuba_xml import PERFECT, scene_xml
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_atomically
@@ -107,7 +107,7 @@ def write_scene(
         for surface in surfaces:
             mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
             mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
-        write_atomically(part / XML_FILE, scene_xml(full.by_surface()))
+        write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
@@ -134,21 +134,35 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
         raise InputError(f"{folder}: surface {odd[0]!r} has {which}; write the scene anew")
     full = materials.complete(materials.surfaces)
-    if _materials_in(xml) != full.by_surface():
+    if _materials_in(xml) != _stated(full):
         logger.info("%s: materials changed in %s, written anew", xml, MATERIALS_FILE)
         try:
-            write_atomically(xml, scene_xml(full.by_surface()))
+            write_atomically(xml, scene_xml(full.by_surface(), full.constants))
         except OSError as error:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
     return SceneFolder(folder, xml, full, facts.get("counts", {}))
 
 
-def _materials_in(xml: Path) -> dict[str, str]:
-    """Material of each shape of a scene file, by the shape's name."""
+def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
+    """Material of each surface, and constants of those that are used and of the scene's own."""
+    used = materials.by_surface()
+    own = {name: values for name, values in materials.constants.items() if name in used.values()}
+    return used, {name: {key: float(f"{value:.9g}") for key, value in values.items()} for name, values in own.items()}
+
+
+def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
+    """Material of each shape of a scene file by the shape's name, and constants of materials of its own."""
     try:
-        shapes = ElementTree.parse(xml).getroot().findall("shape")
-    except (OSError, ElementTree.ParseError):
-        return {}
-    references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in shapes}
-    return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}
+        root = ElementTree.parse(xml).getroot()
+        own = {
+            bsdf.get("id", "").removeprefix("mat-"): {
+                value.get("name", ""): float(value.get("value", "nan")) for value in bsdf.findall("float")
+            }
+            for bsdf in root.findall("bsdf[@type='radio-material']")
+        }
+    except (OSError, ElementTree.ParseError, ValueError):
+        return {}, {}
+    own.pop(PERFECT, None)
+    references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in root.findall("shape")}
+    return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}, own

@@ -6,18 +6,24 @@ perfect conductor:
     rules: {floor: itu_concrete, ceiling: itu_ceiling_board, wall: itu_plasterboard, other: itu_wood}
     surfaces: {floor: floor, wall_01: wall, wall_02: itu_glass}
     thickness_m: {itu_concrete: 0.25, itu_plasterboard: 0.1}
+
+Materials of one's own have constants, which hold at every frequency, and names that do not begin with ``itu``:
+
+    surfaces: {wall_03: panel}
+    constants: {panel: {relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08}}
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
-from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_THICKNESS_M
+from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, PERFECT_THICKNESS_M, Constants
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 
 from ..core import InputError
@@ -25,6 +31,8 @@ from ..datasets.folder_files import read_yaml
 from .surfaces import KINDS
 
 FILE = "materials.yml"
+KEYS = ("rules", "surfaces", "thickness_m", "constants")
+NAME = re.compile(r"\w+", re.ASCII)
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
 """Default slab thickness of every material, metres."""
 RULES: Mapping[str, str] = {
@@ -43,17 +51,19 @@ class Materials:
     Attributes:
         rules: material ``itu_*`` or ``perfect`` of each kind of surface; by default those of `RULES`.
         surfaces: kind, or material, of each surface by its name.
-        thickness_m: slab thickness of each material in metres; by default those of `THICKNESS_M`.
+        thickness_m: slab thickness of each material of `THICKNESS_M` in metres; by default the one there.
+        constants: materials of the scene's own.
     """
 
     rules: Mapping[str, str] = field(default_factory=dict)
     surfaces: Mapping[str, str] = field(default_factory=dict)
     thickness_m: Mapping[str, float] = field(default_factory=dict)
+    constants: Constants = field(default_factory=dict)
 
     def of(self, name: str, kind: str) -> str:
         """Material of a surface, by its entry or else by its kind's rule."""
         entry = self.surfaces.get(name, kind)
-        return entry if entry in THICKNESS_M else {**RULES, **self.rules}[entry]
+        return entry if entry in THICKNESS_M or entry in self.constants else {**RULES, **self.rules}[entry]
 
     def by_surface(self) -> dict[str, str]:
         """Material of each listed surface by its name."""
@@ -68,26 +78,31 @@ class Materials:
         entries = {name: self.surfaces.get(name, kind) for name, kind in kinds.items()}
         full = replace(self, rules={**RULES, **self.rules}, surfaces=entries)
         used = dict.fromkeys([*full.rules.values(), *(full.of(name, "other") for name in entries)])
-        return replace(full, thickness_m={m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used})
+        stated = {m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used if m not in self.constants}
+        return replace(full, thickness_m=stated)
 
 
 def read_materials(path: str | Path) -> Materials:
     """Read and check a ``materials.yml``, or that of a scene folder.
 
     Raises:
-        InputError: missing, not YAML, an unknown kind or material, or a thickness that is not positive.
+        InputError: missing, not YAML, an unknown kind or material, or a thickness or constant out of range.
     """
     file = Path(path)
     file = file / FILE if file.is_dir() else file
     content = read_yaml(file)
-    if content is None or not set(content) <= {"rules", "surfaces", "thickness_m"}:
-        raise InputError(f"{file}: give the keys rules, surfaces and thickness_m, no others")
-    parts = {key: content.get(key) or {} for key in ("rules", "surfaces", "thickness_m")}
+    if content is None or not set(content) <= set(KEYS):
+        raise InputError(f"{file}: give the keys {', '.join(KEYS)}, no others")
+    parts = {key: content.get(key) or {} for key in KEYS}
     for key, part in parts.items():
         if not isinstance(part, dict):
             raise InputError(f"{file}: {key} must be a mapping, such as {{wall: itu_brick}}")
 
-    def check(material: Any, where: str, also: Sequence[str] = ()) -> None:
+    for name, values in parts["constants"].items():
+        _check_constants(file, name, values)
+    own = tuple(parts["constants"])
+
+    def check(material: Any, where: str, also: Sequence[str] = own) -> None:
         if material not in (*also, *THICKNESS_M):
             known = ", ".join([*also, *THICKNESS_M])
             raise InputError(f"{file}: {where}: unknown material {material!r}; known are {known}")
@@ -97,19 +112,36 @@ def read_materials(path: str | Path) -> Materials:
             raise InputError(f"{file}: rules: no kind {kind!r}; known are {', '.join(KINDS)}")
         check(material, f"rules: {kind}")
     for name, entry in parts["surfaces"].items():
-        check(entry, f"surfaces: {name}", KINDS)
+        check(entry, f"surfaces: {name}", (*KINDS, *own))
     for material, thickness in parts["thickness_m"].items():
-        check(material, "thickness_m")
-        if isinstance(thickness, bool) or not isinstance(thickness, int | float) or not 0 < thickness < math.inf:
+        check(material, "thickness_m", ())
+        if not _is_number(thickness) or thickness <= 0:
             raise InputError(f"{file}: thickness_m: {material} is {thickness!r}; give metres above 0")
     return Materials(**parts)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_constants(file: Path, name: Any, values: Any) -> None:
+    where = f"{file}: constants: {name}"
+    if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*THICKNESS_M, *KINDS) or name[:3] == "itu":
+        raise InputError(f"{where}: choose a name of letters, digits and _ that is no kind and does not begin with itu")
+    if not isinstance(values, dict) or set(values) != set(PERFECT_CONSTANTS):
+        raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}")
+    least = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
+    for key, value in values.items():
+        if not _is_number(value) or value < least[key] or (key == "thickness" and value <= 0):
+            raise InputError(f"{where}: {key} is {value!r}; give a number from {least[key]:g} upwards")
 
 
 def materials_text(materials: Materials) -> str:
     """The text of a ``materials.yml``."""
     head = (
         "# Radio materials of this scene (of ITU-R P.2040, or perfect). rules: of each kind of surface; surfaces: the\n"
-        "# kind of each, or a material of its own. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# kind of each, or a material of its own; constants: relative permittivity, conductivity (S/m) and thickness\n"
+        "# (m) of further materials. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
-    facts = {key: dict(part) for key, part in vars(materials).items()}
+    facts = {key: dict(part) for key, part in vars(materials).items() if part or key != "constants"}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

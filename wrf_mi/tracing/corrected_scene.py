@@ -1,20 +1,23 @@
-"""Scene folder with planes as training has moved them, which Sionna RT opens."""
+"""Scene folder with planes and materials as training has changed them, which Sionna RT opens."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..scene.folder import write_scene
 from ..scene.materials import THICKNESS_M, Materials
-from ..scene.surfaces import SAME_CORNER_M, Surface
+from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
+from .material_parameters import SURFACE, MaterialGrouping, SlabMaterials, name_of, read_materials, slabs_of_faces
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
@@ -22,6 +25,10 @@ from .walls import moved_planes, plane_centres
 FLAT = 0.1
 """Share of the largest singular value below which planes at a corner count as parallel: those within 11 degrees do not
 determine the corner's position along them."""
+UNCHANGED = 1e-4
+"""Relative change of a constant below which a material keeps its name: less than any measurement supports."""
+QUANTITIES = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
+"""Trainable constants of a slab, and the least value of each (`wrf_mi.tracing.material_parameters`)."""
 
 
 def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
@@ -65,51 +72,93 @@ def check_materials(scene: Any) -> None:
     """Refuse a scene that `write_corrected_scene` cannot write.
 
     Raises:
-        InputError: a material that is not of ITU-R P.2040.
+        InputError: a material that is not a slab.
     """
+    slabs = read_materials(scene).names
     for name, thing in scene.objects.items():
-        if (material := thing.radio_material.name) not in THICKNESS_M:
-            raise InputError(f"object {name}: material {material} is not one of ITU-R P.2040; a folder needs one")
+        if (material := thing.radio_material.name) not in slabs:
+            raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
+
+
+def material_constants(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
+    """Relative permittivity, conductivity in S/m and thickness in metres of n slabs, [n, 3], from ``parameters`` where
+    they have them.
+    """
+    values = np.stack([slabs.permittivity, slabs.conductivity, slabs.thickness_m], axis=1).astype(float)
+    for column, (quantity, least) in enumerate(QUANTITIES.items()):
+        for index, name in enumerate([SURFACE] if slabs.grouping == "surface" else slabs.names):
+            if (found := parameters.get(name_of(name, quantity))) is not None:
+                rows = slice(None) if name == SURFACE else index
+                values[rows, column] = least + np.exp(np.ravel(np.asarray(found, float)))
+    return values
 
 
 def write_corrected_scene(
-    folder: str | Path, scene: Any, parameters: Mapping[str, NDArray[Any]], replace: bool = False
+    folder: str | Path,
+    scene: Any,
+    parameters: Mapping[str, NDArray[Any]],
+    *,
+    grouping: MaterialGrouping = "named",
+    kinds: Mapping[str, Kind] = MappingProxyType({}),
+    absent: Collection[int] = (),
+    replace: bool = False,
 ) -> Path:
-    """Write a scene with moved planes as a scene folder.
+    """Write a scene with moved planes and changed materials as a scene folder.
 
-    Materials are those of the scene by name, with their thickness; trained constants of materials are not written, as
-    the folder's format has none.
+    Objects whose surfaces differ in material become several. Materials that have not changed keep their names; others
+    have constants, which hold at the carrier that the scene is set to.
 
     Args:
         folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
-        parameters: see `moved_triangles`; others are ignored.
+        parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
+            `wrf_mi.tracing.material_parameters`); others are ignored.
+        grouping: that of the parameters of materials.
+        kinds: kinds of objects by name; by default ``other``.
+        absent: slabs, in the order of their parameters, whose surfaces are left out.
         replace: replace an existing folder.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: a material that is not of ITU-R P.2040, or a folder that exists or cannot be written.
+        InputError: a material that is not a slab, no surface is left, or a folder that exists or cannot be written.
         ValueError: see `moved_triangles`.
     """
     check_materials(scene)
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
-    parts, kinds, thickness = [], {}, {}
+    slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
+    stated, fitted = material_constants(slabs, {}), material_constants(slabs, parameters)
+    changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
+    parts, entries, constants, thickness = [], {}, {}, {}
     for index, name in enumerate(surfaces.names):
-        material = scene.objects[name].radio_material
-        corners = triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]].reshape(-1, 3)
-        vertices, faces = np.unique(corners, axis=0, return_inverse=True)
-        parts.append(Surface(name, "other", vertices, faces.reshape(-1, 3)))
-        kinds[name] = material.name
-        thickness[material.name] = float(np.ravel(material.thickness)[0])
+        faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])
+        present = [slab for slab in np.unique(slab_of_face[faces]) if slab not in absent]
+        for number, slab in enumerate(present):
+            part = name if len(present) == 1 else f"{name}_{number + 1:02d}"
+            corners = triangles[faces[slab_of_face[faces] == slab]].reshape(-1, 3)
+            vertices, indices = np.unique(corners, axis=0, return_inverse=True)
+            parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
+            material = scene.objects[name].radio_material.name
+            if changed[slab] or material not in THICKNESS_M:
+                material = f"fitted_{(part if grouping == 'surface' else material).replace('-', '_')}"
+                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
+            else:
+                thickness[material] = float(fitted[slab, 2])
+            entries[part] = material
+    facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants)
+    carrier = f"{float(scene.frequency[0]) / 1e9:.6g} GHz"
     return write_scene(
         folder,
         parts,
         frame="that of the scene it was made from",
-        source="a scene whose planes training has moved",
-        materials=Materials(surfaces=kinds, thickness_m=thickness),
-        description="A scene with corrected planes",
+        source=f"a scene corrected by measurements at {carrier}, where the constants of its materials hold",
+        materials=facts,
+        description="A scene corrected by measurements",
         replace=replace,
     )
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -1,10 +1,10 @@
 """Radio materials as parameters without bounds.
 
-Relative permittivity 1 + exp(x) and conductivity exp(y) in S/m: a step of an optimiser in x or y changes both by a
-factor, and permittivity > 1, conductivity > 0 hold by construction.
+Relative permittivity 1 + exp(x), conductivity exp(y) in S/m and thickness exp(z) in metres: a step of an optimiser
+changes each by a factor, and permittivity > 1, conductivity > 0, thickness > 0 hold by construction.
 
-A scene has both for each of its named materials or, started from those, for each of its surfaces, the faces of an
-object in a plane.
+A scene has them for each of its named materials or, started from those, for each of its surfaces, the faces of an
+object in a plane. The thickness is a parameter only where it is asked for.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ MaterialGrouping = Literal["named", "surface"]
 
 
 def name_of(material: str, quantity: str) -> str:
-    """A material's parameter: ``material.<name>.permittivity`` or ``.conductivity``; `SURFACE` for all surfaces."""
+    """A material's parameter: ``material.<name>.permittivity``, ``.conductivity`` or ``.thickness``; `SURFACE` for all
+    surfaces.
+    """
     return f"{PREFIX}{material}.{quantity}"
 
 
@@ -59,18 +61,19 @@ class SlabMaterials:
     reflected: FloatArray
     grouping: MaterialGrouping = "named"
 
-    def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Parameters x and y of each material [1], or of all surfaces [n]."""
-        x = np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)).astype(np.float32)
-        y = np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)).astype(np.float32)
+    def parameters(self, thickness: bool = False) -> dict[str, NDArray[np.float32]]:
+        """Parameters x, y and, where asked for, z: of each material [1], or of all surfaces [n]."""
+        values = {
+            "permittivity": np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)),
+            "conductivity": np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)),
+        }
+        if thickness:
+            values["thickness"] = np.log(self.thickness_m)
+        columns = {quantity: column.astype(np.float32) for quantity, column in values.items()}
         if self.grouping == "surface":
-            names = name_of(SURFACE, "permittivity"), name_of(SURFACE, "conductivity")
-            return dict(zip(names, (x, y), strict=True)) if len(x) else {}
-        values = {}
-        for k, name in enumerate(self.names):
-            values[name_of(name, "permittivity")] = x[k : k + 1]
-            values[name_of(name, "conductivity")] = y[k : k + 1]
-        return values
+            return {name_of(SURFACE, quantity): column for quantity, column in columns.items() if len(column)}
+        each = [(name, k, quantity) for k, name in enumerate(self.names) for quantity in columns]
+        return {name_of(name, quantity): columns[quantity][k : k + 1] for name, k, quantity in each}
 
     def constants(self, float_type: Any) -> list[Any]:
         """Stated permittivity, conductivity, thickness and reflected share, [n] each, on the device."""
@@ -78,30 +81,32 @@ class SlabMaterials:
             on_device(c, float_type) for c in (self.permittivity, self.conductivity, self.thickness_m, self.reflected)
         ]
 
-    def tables(self, parameters: Mapping[str, Any], stated: Sequence[Any]) -> tuple[Any, Any]:
-        """Relative permittivity and conductivity [n], from parameters where there are any. Differentiable.
+    def tables(self, parameters: Mapping[str, Any], stated: Sequence[Any]) -> tuple[Any, Any, Any]:
+        """Relative permittivity, conductivity and thickness [n], from parameters where there are any. Differentiable.
 
         Args:
             parameters: Dr.Jit tensors by the names of `parameters`.
-            stated: permittivity and conductivity of `constants`, whose float type is that of the result.
+            stated: the first three of `constants`, whose float type is that of the result.
         """
 
-        def table(quantity: str, constant: FloatArray, given: Any, least: float) -> Any:
+        def table(quantity: str, constant: FloatArray, given: Any, least: float = 0.0) -> Any:
             float_type: Any = type(given)
             if self.grouping == "surface":
                 whole = parameters.get(name_of(SURFACE, quantity))
                 return given if whole is None else least + dr.exp(float_type(whole.array))
+            found = [parameters.get(name_of(name, quantity)) for name in self.names]
+            if all(parameter is None for parameter in found):
+                return given
             entries = []
-            for name, value in zip(self.names, constant, strict=True):
-                parameter = parameters.get(name_of(name, quantity))
-                entries.append(
-                    float_type(float(value)) if parameter is None else least + dr.exp(float_type(parameter.array))
-                )
-            return dr.concat(entries) if entries else dr.zeros(float_type, 0)
+            for value, parameter in zip(constant, found, strict=True):
+                fixed = float_type(float(value))
+                entries.append(fixed if parameter is None else least + dr.exp(float_type(parameter.array)))
+            return dr.concat(entries)
 
         return (
             table("permittivity", self.permittivity, stated[0], 1.0),
-            table("conductivity", self.conductivity, stated[1], 0.0),
+            table("conductivity", self.conductivity, stated[1]),
+            table("thickness", self.thickness_m, stated[2]),
         )
 
 

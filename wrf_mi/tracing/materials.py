@@ -11,7 +11,8 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M
+import numpy as np
+from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M, THICKNESS_M
 
 from ..core import InputError
 
@@ -90,3 +91,22 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
             ", ".join(sorted(constant)),
         )
     scene.frequency = frequency_hz
+
+
+def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:
+    """Relative permittivity, conductivity (S/m) and default thickness (m) of materials of ITU-R P.2040 by name.
+
+    Materials that are not known at the frequency are left out; below 1 GHz see `BELOW_1_GHZ`.
+    """
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES, itu_material
+
+    found = {}
+    for name, ranges_ghz in ITU_MATERIALS_PROPERTIES.items():
+        if any(low <= frequency_hz / 1e9 <= high for low, high in ranges_ghz):
+            permittivity, conductivity = (float(np.ravel(value)[0]) for value in itu_material(name, frequency_hz))
+        elif name in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
+            permittivity, conductivity = BELOW_1_GHZ[name]
+        else:
+            continue
+        found[name] = permittivity, conductivity, THICKNESS_M[f"itu_{name}"]
+    return found

@@ -59,6 +59,7 @@ class TracedOptions:
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the scene's materials, add up
             to less than this share of the amplitudes of all; 0: none.
+        thickness: whether thicknesses of materials are parameters, too.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -68,6 +69,7 @@ class TracedOptions:
     materials: MaterialGrouping = "named"
     planes: bool = False
     faint: float = 0.0
+    thickness: bool = False
 
     def __post_init__(self) -> None:
         """Check the options of the search.
@@ -195,7 +197,7 @@ class TracedField:
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
-        values = self.slabs.parameters() | pose_parameters(self.receiver)
+        values = self.slabs.parameters(self.options.thickness) | pose_parameters(self.receiver)
         values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
         if self.options.pattern_degree:
             names = self.pattern_name, TX_PATTERN
@@ -230,7 +232,7 @@ class TracedField:
             row = dr.gather(mi.UInt32, rows, slot // self._each)
             chains = chains.select(row * self._each + slot % self._each)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        tables = (*self.slabs.tables(parameters, self._constants[:2]), *self._constants[2:])
+        tables = (*self.slabs.tables(parameters, self._constants[:3]), self._constants[3])
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)

@@ -1,0 +1,192 @@
+"""Correction of scenes with known errors, from channels; and of scenes without."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene, true_scene
+from wrf_mi_scenes import scenes
+
+from wrf_mi.cli.main import main
+from wrf_mi.core import InputError
+from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.datasets import make_splits
+from wrf_mi.scene.folder import read_scene_folder
+from wrf_mi.synthetic import load_record
+from wrf_mi.tasks import instrument_of, task_of
+from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing.corrected_scene import material_constants
+from wrf_mi.tracing.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.tracer import RayTracer
+
+PLANE_M, PLANE_RAD = 1e-3, 1e-3
+STEP = 2e-4
+"""Of derivatives: in it, extremes of spectra do not change places."""
+PERMITTIVITY = 0.1
+"""Relative."""
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Correction, Any, np.ndarray, np.ndarray, Path]:
+    folder = tmp_path_factory.mktemp("recovery")
+    true, shift, tilt = true_scene(folder)
+    record = channels(true, 160)
+    stated = stated_scene(folder / "stated")
+    found = correct_scene(stated, record, make_splits(record, "official")[0], CorrectionOptions(steps=10))
+    return found, record, shift, tilt, folder
+
+
+def test_planes_are_recovered_from_channels(corrected: Any) -> None:
+    found, _, shift, tilt, _ = corrected
+    moved = found.vector[found.misfit.parts[SHIFT]]
+    turned = found.vector[found.misfit.parts[TILT]].reshape(tilt.shape)
+    np.testing.assert_allclose(moved, shift, atol=PLANE_M)
+    np.testing.assert_allclose(turned, tilt, atol=PLANE_RAD)
+
+
+def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Path) -> None:
+    """Of every surface but the board of metal, whose permittivity no wave feels."""
+    found, *_ = corrected
+    slabs = found.misfit.sides[0].slabs
+    true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
+    expected = (
+        Misfit(found.misfit.record, found.misfit.rows[:2], true, search_options(1, 4096, 0.0, 0), lambda name: True)
+        .sides[0]
+        .slabs
+    )
+    assert slabs.names == expected.names
+    felt = [not name.startswith("board") for name in slabs.names]
+    ratio = material_constants(slabs, found.parameters)[felt, 0] / expected.permittivity[felt]
+    assert np.mean(np.abs(ratio - 1) < PERMITTIVITY) >= 0.8
+
+
+def test_standard_deviations_cover_the_errors(corrected: Any) -> None:
+    """Errors of the planes are within four standard deviations, which are below those stated before."""
+    found, _, shift, _, _ = corrected
+    part = found.misfit.parts[SHIFT]
+    error = np.abs(found.vector[part] - shift)
+    assert (error < 4 * found.deviation[part] + 1e-4).all()
+    assert (found.deviation[part] < found.prior[part] / 2).all()
+
+
+def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) -> None:
+    """Channels at test positions, traced anew in the written scene, are 20 dB better than in the stated one."""
+    found, record, _, _, folder = corrected
+    facts = write_page(found, folder / "corrected")
+    test = record.official[1]
+    score = {}
+    for name in ("stated", "corrected"):
+        tracer = RayTracer(folder / name, instrument_of(record), TraceOptions(transmission=True, max_depth=3))
+        score[name] = np.median(task_of(record).score(tracer(record.tx_pos_m[test])[0], record.observation[0, test]))
+    assert score["corrected"] > score["stated"] + 20
+    from sionna import rt
+
+    assert len(rt.load_scene(str(folder / "corrected" / "scene.xml"), merge_shapes=False).objects) == 7
+    assert {"correction.md", "correction.json", "correction.png"} <= {p.name for p in (folder / "corrected").iterdir()}
+    assert facts["kept"] == "materials, planes, frame"
+    board = read_scene_folder(folder / "corrected").materials.constants["fitted_board"]
+    assert board["conductivity"] > 1e5
+
+
+def test_a_scene_without_errors_stays_as_good(tmp_path: Path) -> None:
+    """Held-out scores are never below those of the stated scene."""
+    scene = stated_scene(tmp_path / "scene")
+    record = channels(scene, 60, snr_db=15)
+    options = CorrectionOptions(steps=2, depth=2)
+    found = correct_scene(scene, record, make_splits(record, "official")[0], options)
+    mean = {stage: np.nanmean(score) for stage, score in found.scores.items()}
+    assert mean[found.kept] >= mean[""]
+
+
+def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
+    """A record of a task, the scene it is from, and a number of rows."""
+    if task == "spectrum":
+        record = load_record("laboratory")
+        return record, open_scene("laboratory", instrument_of(record).carrier_hz), 5
+    record = channels(scene, 12)
+    if task == "rssi":
+        power_db = 10 * np.log10(np.square(np.abs(record.observation)).mean(axis=2)).astype(np.float32)
+        power_db[0, 0] = np.nan
+        carrier = np.array([CARRIER_HZ])
+        record = replace(record, task="rssi", observation=power_db, frequencies_hz=carrier)
+    return record, open_scene(scene, CARRIER_HZ), len(record)
+
+
+@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
+def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) -> None:
+    """To 1 %, or the rounding of float32 reports, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
+    record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
+    options = search_options(2, 4096, 0.0, 1)
+    misfit = Misfit(record, np.arange(rows), scene, options, lambda name: True)
+    planes, slabs = misfit.counts()
+    place_of = {"plane": int(planes.argmax()), "material": int(slabs.argmax())}  # those that most paths meet
+    size = {TILT: 2}
+    columns = np.array(
+        [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
+    )
+    slopes = misfit.jacobian(misfit.start, columns, lambda place: None)
+    seen = np.isfinite(misfit.observed).all(axis=1)
+    assert (slopes[~seen] == 0).all()
+    for place, column in enumerate(columns):
+        step = np.eye(1, len(misfit.start), column)[0] * STEP
+        expected = (misfit.residual(misfit.start + step) - misfit.residual(misfit.start - step))[seen] / (2 * STEP)
+        rounding = (8e-6 if task == "rssi" else 4e-7) / STEP
+        np.testing.assert_allclose(slopes[seen, :, place], expected, atol=rounding + 0.01 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fit", "walls"], "'walls' is not a part; choose of materials, planes, frame, gain, pose, patterns"),
+        (["--split", "blocked"], "a scene is corrected by one split; choose a fold, such as blocked:0"),
+        (["--depth", "0"], "setting depth: 0 is out of range"),
+        (["--out", "."], "exists; remove it, choose another folder, or give --replace"),
+    ],
+)
+def test_command_refuses_in_one_line(arguments: list[str], message: str, tmp_path: Path, capsys: Any) -> None:
+    out = [] if "--out" in arguments else ["--out", str(tmp_path / "corrected")]
+    assert main(["correct", "laboratory", "laboratory", *out, *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "corrected").exists()
+
+
+def test_command_corrects_by_spectra(tmp_path: Path, capsys: Any) -> None:
+    """Materials of the laboratory, all stated as wood: held-out scores rise."""
+    stated = tmp_path / "stated"
+    shutil.copytree(scenes()["laboratory"].folder, stated)
+    file = stated / scenes()["laboratory"].xml.name
+    text = file.read_text()
+    file.write_text(re.sub(r'<ref id="mat-itu_\w+"', '<ref id="mat-itu_wood"', text))
+    words = ["correct", str(stated), "laboratory", "--out", str(tmp_path / "corrected"), "--fit", "materials"]
+    assert main([*words, "--depth", "2", "--rays", "4096", "--n-train", "60", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    scores = facts["held_out_scores"]
+    assert facts["kept"] == "materials"
+    assert scores["materials"]["mean"] > scores["as stated"]["mean"] + 0.02
+    assert "SSIM of" in (tmp_path / "corrected" / "correction.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"parts": ("walls",)}, r"'walls' is not a part; choose of materials"), ({"parts": ()}, r"nothing to change")],
+)
+def test_unknown_parts_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        CorrectionOptions(**options)
+
+
+def test_few_rows_are_refused(tmp_path: Path) -> None:
+    scene = stated_scene(tmp_path / "scene")
+    record = channels(scene, 18)
+    with pytest.raises(InputError, match=r"training rows are too few to hold some out"):
+        correct_scene(scene, record, make_splits(record, "official", n_train=5)[0])

@@ -1,0 +1,94 @@
+"""``wrf-mi correct``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from .options import DATASET, Arguments, add_command, add_n_train
+from .output import print_json
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``correct`` to the commands."""
+    parser = add_command(commands, "correct", correct_command, "correct a scene by measurements")
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
+    add("dataset", metavar="DATASET", help=DATASET)
+    add("--out", required=True, metavar="SCENE2", help="scene folder to make")
+    parts = "what is changed, from materials,planes,frame,gain,pose,patterns"
+    add("--fit", metavar="LIST", help=f"{parts} (default: the first three; gain, too, for signal strengths)")
+    add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
+    add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
+    add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
+    add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
+    add("--split", default="official", help="as for train (default: official); test rows are not used")
+    add_n_train(parser)
+    add("--seed", type=int, default=0, metavar="N", help="seed of split and held-out rows (default: 0)")
+    add("--replace", action="store_true", help="replace an existing scene folder")
+
+
+def correct_command(a: Arguments) -> int:
+    """Correct a scene, and write its page."""
+    from ..core import InputError
+    from ..core.settings import with_settings
+    from ..correction import CorrectionOptions, correct_scene, write_page
+    from ..datasets import make_splits
+    from ..synthetic import load_record
+
+    if Path(a.out).exists() and not a.replace:  # before the work, not after it
+        raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
+    given = {"depth": a.depth, "rays": a.rays, "shift_sd_m": a.shift_sd}
+    parts = CorrectionOptions().parts if a.fit is None else tuple(a.fit.split(","))
+    options = with_settings(
+        CorrectionOptions(parts), [f"{key}={value}" for key, value in given.items() if value is not None]
+    )
+    record = load_record(a.dataset, progress=sys.stderr.isatty())
+    splits = make_splits(record, a.split, a.seed, a.n_train)
+    if len(splits) > 1:
+        raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
+    with _Stages() as stages:
+        found = correct_scene(a.scene, record, splits[0], options, a.material, stages.show)
+        facts = write_page(found, a.out, a.replace)
+    if a.json:
+        print_json({"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}})
+        return 0
+    print(f"{facts['score']} of {facts['held_out']} held-out rows   median    mean")
+    for stage, score in facts["held_out_scores"].items():
+        print(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{'  kept' if stage == facts['kept'] else ''}")
+    print(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
+    print(f"scene: {a.out}\npage: {a.out}/correction.md")
+    return 0
+
+
+class _Stages:
+    """What is done and how much of it, on standard error: a bar on a terminal, else a line for each stage."""
+
+    def __enter__(self) -> _Stages:
+        from rich.console import Console
+        from rich.progress import Progress
+
+        console = Console(stderr=True)
+        self._bar = Progress(console=console, transient=True) if console.is_terminal else None
+        self._what = ""
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, what: str, share: float) -> None:
+        """Show a stage and the share of it that is done."""
+        if what != self._what:
+            self._what = what
+            if self._bar is None:
+                print(f"correct: {what}", file=sys.stderr, flush=True)
+            else:
+                for task in self._bar.task_ids:
+                    self._bar.remove_task(task)
+                self._task = self._bar.add_task(what, total=1.0)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=share)

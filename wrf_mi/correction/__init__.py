@@ -1,0 +1,9 @@
+"""A scene corrected by measurements: materials, planes, frame and antennas, with their standard deviations."""
+
+from __future__ import annotations
+
+from .correct import Correction, correct_scene
+from .options import CorrectionOptions
+from .page import write_page
+
+__all__ = ["Correction", "CorrectionOptions", "correct_scene", "write_page"]

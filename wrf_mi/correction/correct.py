@@ -1,0 +1,172 @@
+"""Correction of a scene by measurements.
+
+Paths are found once with the stated scene. Then, each on the training rows alone:
+
+1. *choice*: every surface tries common materials, every plane shifts (`wrf_mi.correction.search`);
+2. *least squares*: materials, planes and antennas, with priors (`wrf_mi.correction.least_squares`).
+
+Both are done in rounds, first without a quarter of the training rows, held out in clusters. On these rows the stated
+scene, changed materials alone, and materials with planes are compared; the best is kept and fitted again to all
+training rows. A scene that measurements cannot improve is returned as it was.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Record, Split
+from ..core.angles import FloatArray
+from ..core.carriers import carriers_text
+from ..core.types import IntArray
+from ..datasets.observations import check_observations
+from ..scene.folder import read_scene_folder
+from ..scene.materials import FILE as MATERIALS_FILE
+from ..scene.surfaces import KINDS, Kind
+from ..tasks import instrument_of, task_of
+from ..tracing import open_scene
+from ..tracing.corrected_scene import check_materials
+from ..tracing.solve import Prepared
+from ..training.reach import hold_out_groups
+from .fit import LEAST_PATHS, Fit
+from .misfit import Misfit, search_options
+from .options import DEFAULTS, CorrectionOptions, OnStage
+
+
+@dataclass
+class Correction:
+    """A corrected scene.
+
+    Attributes:
+        scene: the stated scene (``sionna.rt.Scene``).
+        misfit: residuals over all training rows.
+        kept: what was kept: ``""`` (nothing), or the changed parts.
+        vector: parameters [p] of `Misfit`.
+        deviation: their standard deviations [p], 0 of those that were held.
+        prior: standard deviations before the correction [p].
+        free: indices of the changed entries.
+        materials: material that each changed surface took first, by its name.
+        scores: scores of the rows held out while choosing, by stage.
+        kinds: kinds of the scene's objects.
+        options: options.
+        seconds: duration.
+        facts: sizes for the page.
+    """
+
+    scene: Any
+    misfit: Misfit
+    kept: str
+    vector: FloatArray
+    deviation: FloatArray
+    prior: FloatArray
+    free: IntArray
+    materials: Mapping[str, str]
+    scores: Mapping[str, FloatArray]
+    kinds: Mapping[str, Kind]
+    options: CorrectionOptions
+    seconds: float = 0.0
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def parameters(self) -> dict[str, NDArray[np.float32]]:
+        """Parameters by the names of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
+        return self.misfit.named(self.vector)
+
+
+def correct_scene(
+    scene: str | Path,
+    record: Record,
+    split: Split,
+    options: CorrectionOptions = DEFAULTS,
+    material: str | None = None,
+    on_stage: OnStage = lambda what, share: None,
+) -> Correction:
+    """Correct a scene by the training rows of a split.
+
+    Args:
+        scene: see `wrf_mi.tracing.open_scene`.
+        record: measurements of any task, positions known.
+        split: its training and validation rows are used, its test rows are not.
+        options: what is changed, and what is known before.
+        material: radio material of a bare mesh.
+        on_stage: called as the correction goes on.
+
+    Raises:
+        InputError: data or a scene that cannot be used, or no path to any receiver.
+    """
+    begun = time.perf_counter()
+    task, name = task_of(record), record.name
+    if not task.receiver_with_scene:
+        raise InputError(f"{name}: no receiver model reports {task.name} from paths")
+    if record.carriers_hz is not None:
+        raise InputError(f"{name}: {carriers_text(record.carriers_hz)}; correct a scene at one carrier")
+    check_observations(record, split, complete=task.image)
+    if task.in_decibel and "gain" not in options.parts:
+        options = replace(options, parts=(*options.parts, "gain"))
+    opened = open_scene(scene, instrument_of(record).carrier_hz, material=material)
+    check_materials(opened)
+    prepared = Prepared(opened)
+    prepared.check(record.tx_pos_m, record.receivers)
+    groups = hold_out_groups(split, record.tx_pos_m)
+    if groups is split:
+        raise InputError(f"{name}: {len(split.train)} training rows are too few to hold some out; give more")
+    held = np.setdiff1d(groups.validation, split.validation)
+    known = np.setdiff1d(split.all_train, held)
+
+    def misfit(rows: IntArray, what: str) -> Misfit:
+        on_stage(what, 0.0)
+        search = search_options(options.depth, options.rays, options.faint, options.pattern_degree)
+        if "patterns" not in options.parts:
+            search = replace(search, pattern_degree=0)
+        return Misfit(record, rows, opened, search, options.changes, prepared)
+
+    first = misfit(known, "tracing")
+    if not any(side.exists.any() for side in first.sides):
+        raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
+    others = misfit(held, "tracing")
+    trial = Fit(first, options, on_stage)
+    if not len(trial.free("+".join(options.parts))):
+        raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
+    chosen = trial.all_parts()
+    sign = 1 if task.higher_is_better else -1
+    stages = {"": trial.stated, **{key: found.vector for key, found in chosen.items()}}
+    scores = {key: others.scores(vector) for key, vector in stages.items()}
+    kept = max(scores, key=lambda key: sign * float(np.nanmean(scores[key])))
+    whole = misfit(split.all_train, "tracing")
+    final = Fit(whole, options, on_stage)
+    vector, deviation = final.stated, np.zeros(len(final.stated))
+    if kept:
+        solution = final.refit(kept, chosen[kept].vector, trial.means[kept])
+        vector = solution.vector
+        deviation[final.free(kept)] = np.sqrt(np.diag(solution.covariance))
+    kinds = _kinds(scene)
+    return Correction(
+        opened,
+        whole,
+        kept,
+        vector,
+        deviation,
+        final.prior_deviation,
+        final.free(kept) if kept else np.zeros(0, np.int64),
+        {what: material for (stage, what), material in trial.taken.items() if stage == kept},
+        scores,
+        kinds,
+        options,
+        time.perf_counter() - begun,
+        {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
+    )
+
+
+def _kinds(scene: str | Path) -> dict[str, Kind]:
+    """Kinds of the surfaces of a scene folder by name; none for other scenes."""
+    folder = Path(scene)
+    if not (folder / MATERIALS_FILE).is_file():
+        return {}
+    entries = read_scene_folder(folder).materials.surfaces
+    return {name: entry for name, entry in entries.items() if entry in KINDS}

@@ -1,0 +1,196 @@
+"""Rounds of choices and least squares over the rows of one misfit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..tracing.material_parameters import PREFIX
+from ..tracing.plane_parameters import SHIFT, TILT
+from .frame import rigid_motions
+from .least_squares import Prior, Solution, solve
+from .misfit import Misfit
+from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
+from .search import Choice, choose, joint_choices, material_choices, shift_choices
+
+LEAST_PATHS = 10
+"""Fewest paths of a surface or plane that is changed."""
+ROUNDS = 4
+"""Largest number of rounds: planes that are off hide the right material, and conversely."""
+REFINING_STEPS = 3
+"""Largest number of least-squares steps of one plane while shifts are compared."""
+
+
+class Fit:
+    """Choice and least squares over the rows of one misfit."""
+
+    def __init__(self, misfit: Misfit, options: CorrectionOptions, on_stage: OnStage) -> None:
+        self.misfit, self.options, self.on_stage = misfit, options, on_stage
+        self.stated = misfit.start.copy()
+        self.taken: dict[tuple[str, str], str] = {}
+        self.means: dict[str, FloatArray] = {}
+        self.frequency_hz = misfit.sides[0].frequency_hz
+        planes, slabs = misfit.counts()
+        self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
+        self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
+        self.planes = self.planes[np.argsort(-planes[self.planes], kind="stable")]
+        self.prior_deviation = np.ones(len(self.stated))
+        for name, part in misfit.parts.items():
+            self.prior_deviation[part] = options.deviation(name)
+        for r, side in enumerate(misfit.sides):
+            if side.gain_name in misfit.parts:
+                self._match_gain(r)
+
+    def _match_gain(self, r: int) -> None:
+        """The stated gain matches mean magnitudes, as least squares of a phase need."""
+        misfit = self.misfit
+        whole = misfit.residual(self.stated) + misfit.observed
+        count = len(misfit.rows)
+        report, seen = (values[r * count : (r + 1) * count] for values in (whole, misfit.observed))
+        known = np.isfinite(seen).all(axis=1)
+        shape = misfit.models[r].shape
+        if known.any():
+            pair = (values[known].reshape(-1, *shape) for values in (report, seen))
+            self.stated[misfit.parts[misfit.sides[r].gain_name].start] += misfit.models[r].missing_gain(*pair)
+
+    def free(self, kept: str) -> IntArray:
+        """Entries of the vector that a stage changes: those of surfaces and planes that enough paths meet."""
+        parts = kept.split("+")
+        free = []
+        for name, part in self.misfit.parts.items():
+            entries = np.arange(part.start, part.stop)
+            if name.startswith(PREFIX):
+                free.append(entries[self.slabs] if MATERIALS in parts else entries[:0])
+            elif name in (SHIFT, TILT):
+                size = len(entries) // len(self.misfit.sides[0].surfaces.normal)
+                moved = entries.reshape(-1, size)[self.planes].ravel()
+                free.append(moved if PLANES in parts or FRAME in parts else entries[:0])
+            else:
+                free.append(entries)
+        return np.sort(np.concatenate(free))
+
+    def prior(self, mean: FloatArray, free: IntArray) -> Prior:
+        """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
+        covariance = np.diag(np.square(self.prior_deviation))
+        if FRAME in self.options.parts and SHIFT in self.misfit.parts:
+            motions = rigid_motions(self.misfit.sides[0].surfaces)
+            deviation = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
+            places = self._planes_of_vector
+            covariance[np.ix_(places, places)] += (motions * deviation**2) @ motions.T
+        return Prior(mean[free], np.linalg.inv(covariance[np.ix_(free, free)]))
+
+    def all_parts(self) -> dict[str, Solution]:
+        """Solutions by the names of their parts: with materials alone, and with planes."""
+        parts, frame = self.options.parts, [part for part in (PLANES, FRAME) if part in self.options.parts]
+        stages = ["+".join(parts)]
+        if MATERIALS in parts and frame:
+            stages.insert(0, "+".join(part for part in parts if part not in frame))
+        return {stage: self._alternate(stage) for stage in stages}
+
+    def _alternate(self, stage: str) -> Solution:
+        """Rounds of choices and least squares, until a round changes no choice."""
+        vector, mean, parts = self.stated, self.stated.copy(), stage.split("+")
+        options, misfit = self.options, self.misfit
+        shifts, materials = list[Choice](), list[Choice]()
+        if PLANES in parts or FRAME in parts:
+            alone, common = PLANES in parts, FRAME in parts
+            sd_m = float(np.hypot(options.shift_sd_m * alone, options.frame_sd_m * common))
+            sd_rad = float(np.hypot(options.tilt_sd_rad * alone, options.frame_sd_rad * common))
+            shifts = shift_choices(misfit, self.planes, sd_m, sd_rad, self.frequency_hz)
+        if MATERIALS in parts:
+            materials = material_choices(misfit, self.slabs, self.frequency_hz)
+        choices = joint_choices(materials, shifts, misfit.plane_of_slab)
+        for round_ in range(ROUNDS):
+            what = f"{stage.replace('+', ', ')}: choices, round {round_ + 1}"
+            vector, taken = choose(misfit, vector, choices, self._expected, self._refined, self._progress(what))
+            if round_ and not taken:
+                break
+            for choice in choices:
+                # Least squares stay near the materials that were chosen, and near the planes as stated.
+                chosen = choice.places[np.isinf(choice.deviation)]
+                if choice.what in taken and len(chosen):
+                    mean[chosen] = vector[chosen]
+                    self.taken[stage, choice.what] = taken[choice.what].partition(",")[0]
+            found = self._solve(stage, vector, mean)
+            vector = found.vector
+        self.means[stage] = mean
+        return found
+
+    def _expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
+        """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
+        expected = vector[places].copy()
+        if FRAME in self.options.parts and SHIFT in self.misfit.parts:
+            planes = self._planes_of_vector
+            known = np.isin(planes, np.setdiff1d(self.free(PLANES), places))
+            weight = known / np.square(self.prior_deviation[planes])
+            motions = rigid_motions(self.misfit.sides[0].surfaces)
+            before = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
+            information = motions.T @ (weight[:, None] * motions) + np.diag(before**-2.0)
+            motion = np.linalg.solve(information, motions.T @ (weight * vector[planes]))
+            here = dict(zip(planes, motions @ motion, strict=True))
+            expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
+        return expected
+
+    @property
+    def _planes_of_vector(self) -> IntArray:
+        """Entries of the planes' shifts, then tilts."""
+        return np.concatenate([np.arange(p.start, p.stop) for p in map(self.misfit.parts.get, (SHIFT, TILT)) if p])
+
+    def _refined(self, start: FloatArray, places: IntArray) -> FloatArray:
+        """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
+        misfit, vector, mean = self.misfit, start.copy(), start.copy()
+        for name in (SHIFT, TILT):
+            mean[misfit.parts[name]] = self.stated[misfit.parts[name]]
+
+        def whole(part: FloatArray) -> FloatArray:
+            vector[places] = part
+            return vector
+
+        prior, nothing = self.prior(mean, places), lambda place: None
+        found = solve(
+            lambda part: misfit.residual(whole(part)),
+            lambda part: misfit.jacobian(whole(part), places, nothing),
+            start[places],
+            prior,
+            REFINING_STEPS,
+        )
+        return whole(found.vector)
+
+    def _progress(self, what: str) -> Callable[[int, int], None]:
+        return lambda done, of: self.on_stage(what, done / max(of, 1))
+
+    def _solve(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
+        """Least squares of a stage's entries; the whole vector."""
+        free, misfit = self.free(stage), self.misfit
+        prior = self.prior(mean, free)
+        what = f"least squares of {len(free)} parameters"
+        steps = self.options.steps
+
+        def whole(part: FloatArray) -> FloatArray:
+            vector = start.copy()
+            vector[free] = part
+            return vector
+
+        done = 0
+
+        def jacobian(part: FloatArray) -> NDArray[np.float32]:
+            def column(place: int) -> None:
+                self.on_stage(what, min((done + place / max(len(free), 1)) / (steps + 1), 1.0))
+
+            return misfit.jacobian(whole(part), free, column)
+
+        def on_step(step: int, cost: float) -> None:
+            nonlocal done
+            done = step
+
+        found = solve(lambda part: misfit.residual(whole(part)), jacobian, start[free], prior, steps, on_step)
+        return replace(found, vector=whole(found.vector))
+
+    def refit(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
+        """Least squares of a stage over these rows, from a solution over some of them."""
+        return self._solve(stage, start, mean)

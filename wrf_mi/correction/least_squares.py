@@ -1,0 +1,157 @@
+"""Least squares with correlated, heavy-tailed errors and a Gaussian prior, in NumPy.
+
+The residuals r_i of a row i (the pixels of a spectrum, the subcarriers of a channel) are correlated, and rows that the
+model cannot explain (behind furniture that no scan saw) have large ones. A row counts as n_eff independent values of
+variance s^2, and its log-likelihood is that of Student's t distribution with `FREEDOM` degrees of freedom:
+
+    -log L = sum_i (FREEDOM + n_eff) / 2 log(1 + n_eff m_i / (FREEDOM s^2)),   m_i = mean of r_i^2
+
+with n_eff = tr(R)^2 / tr(R^2) of the covariance R of the residuals, the participation ratio of its eigenvalues.
+
+Source: Gauss-Newton with iterated weights, Nocedal and Wright, "Numerical Optimization" (2006), section 10.3; t
+distribution, Lange, Little and Taylor, "Robust Statistical Modeling Using the t Distribution", JASA 84 (1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.angles import FloatArray
+
+FREEDOM = 4.0
+"""Degrees of freedom of the rows' distribution: a row of ten times the median squared error weighs a quarter."""
+MEDIAN_OF_MEAN = 0.8
+"""Median of a row's mean squared residual in units of the variance: that of a chi-squared variable of 3 to 10 degrees
+of freedom, divided by its mean, is 0.79 to 0.93."""
+LEAST_VARIANCE = 1e-10
+"""Smallest variance of a residual in a unit of about 1: reports are rounded to single precision."""
+TRIALS = 8
+"""Largest number of damping factors tried in a step, each `HARDER` times the one before."""
+HARDER = 8.0
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
+"""Damping of the first step and the smallest, relative to the diagonal."""
+CONVERGED = 1e-3
+"""Relative decrease of the cost below which no further step is taken."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Size and correlation of the residuals of a row.
+
+    Attributes:
+        variance: s^2, in squares of the residuals' unit.
+        values: n_eff, number of independent values in a row.
+    """
+
+    variance: float
+    values: float
+
+    @classmethod
+    def of(cls, residual: FloatArray) -> Noise:
+        """Noise of residuals [rows, values]; a row without observation is NaN."""
+        seen = residual[np.isfinite(residual).all(axis=1)]
+        # The smaller of the two products of the matrix with its transpose: their squares have equal traces.
+        product = seen.T @ seen if seen.shape[1] <= len(seen) else seen @ seen.T
+        square = float(np.square(product).sum())
+        count = float(np.trace(product)) ** 2 / square if square > 0 else 1.0
+        variance = float(np.median(np.square(seen).mean(axis=1))) / MEDIAN_OF_MEAN if len(seen) else 1.0
+        return cls(max(variance, LEAST_VARIANCE), min(max(count, 1.0), float(residual.shape[1])))
+
+    def cost(self, residual: FloatArray) -> float:
+        """Negative logarithm of the likelihood of residuals [rows, values]."""
+        return float((FREEDOM + self.values) / 2 * np.log1p(self._excess(residual)).sum())
+
+    def weights(self, residual: FloatArray) -> FloatArray:
+        """Weights [rows] of squared residuals: (FREEDOM + n_eff) / FREEDOM / s^2 at most, 0 without observation.
+
+        They are divided by values per independent value: sums over all values are then sums over independent ones.
+        """
+        share = self.values / residual.shape[1] / self.variance
+        seen = np.isfinite(residual).all(axis=1)
+        return np.where(seen, share * (FREEDOM + self.values) / FREEDOM / (1 + self._excess(residual)), 0)
+
+    def _excess(self, residual: FloatArray) -> FloatArray:
+        mean = np.where(np.isfinite(residual).all(axis=1), np.square(residual).mean(axis=1), 0)
+        return np.asarray(self.values * mean / (FREEDOM * self.variance))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior of p parameters: mean [p] and inverse covariance [p, p]."""
+
+    mean: FloatArray
+    precision: FloatArray
+
+    def cost(self, vector: FloatArray) -> float:
+        """Negative logarithm of the density, without its constant."""
+        away = vector - self.mean
+        return float(away @ self.precision @ away) / 2
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Most probable parameters [p], their covariance [p, p] (inverse of the Fisher information and the prior's
+    precision), and the noise of the residuals.
+    """
+
+    vector: FloatArray
+    covariance: FloatArray
+    noise: Noise
+
+
+def solve(
+    residual: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], NDArray[np.floating]],
+    start: FloatArray,
+    prior: Prior,
+    steps: int,
+    on_step: Callable[[int, float], None] = lambda step, cost: None,
+) -> Solution:
+    """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise of its beginning has it.
+
+    Args:
+        residual: residuals [rows, values] of parameters [p], model minus observation; NaN without observation.
+        jacobian: their derivatives [rows, values, p], or 0 without observation.
+        start: parameters [p].
+        prior: prior of the parameters.
+        steps: largest number of steps.
+        on_step: called with the number of a step, from 1, and the cost after it.
+    """
+    vector, damping = np.asarray(start, float), FIRST_DAMPING
+    found = residual(vector)
+    noise = Noise.of(found)
+    derivative = jacobian(vector)
+    for step in range(1, steps + 1):
+        before = noise.cost(found) + prior.cost(vector)
+        information, slope = _normal(derivative, found, noise)
+        whole = information + prior.precision
+        downhill = -slope - prior.precision @ (vector - prior.mean)
+        for _ in range(TRIALS):
+            there = vector + np.linalg.solve(whole + damping * np.diag(np.diag(whole)), downhill)
+            tried = residual(there)
+            after = noise.cost(tried) + prior.cost(there)
+            if after < before:
+                break
+            damping *= HARDER
+        else:
+            break
+        vector, found, damping = there, tried, max(damping / HARDER, LEAST_DAMPING)
+        on_step(step, after)
+        noise, derivative = Noise.of(found), jacobian(vector)
+        if before - after < CONVERGED * abs(before):
+            break
+    information, _ = _normal(derivative, found, noise)
+    return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)
+
+
+def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Fisher information [p, p] and gradient [p]."""
+    weight = noise.weights(residual)
+    columns = derivative.shape[-1]
+    scaled = (derivative * np.sqrt(weight)[:, None, None].astype(derivative.dtype)).reshape(-1, columns)
+    values = (np.where(weight[:, None] > 0, residual, 0) * np.sqrt(weight)[:, None]).ravel()
+    return (scaled.T @ scaled).astype(float), (scaled.T @ values.astype(derivative.dtype)).astype(float)

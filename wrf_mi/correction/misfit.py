@@ -1,0 +1,207 @@
+"""Residuals of traced reports over the rows of a record, and their derivatives by parameters of the scene.
+
+Spectra are compared on a lattice of at most `LATTICE` directions, as an array of few elements has few independent
+ones; both sides are scaled to their extremes there. Channels are divided by the root mean square of a row's, as their
+score is relative, and of a median row's, as rows in deep fades have errors too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.device import to_tensor
+from ..backend.recorded import Recorded
+from ..core import Record
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..graph.receivers import RECEIVERS, Form, ReceiverModel
+from ..receivers import minmax_scale
+from ..tasks import task_of
+from ..tasks.conditions import placed_receivers
+from ..tracing import TraceOptions
+from ..tracing.solve import Prepared
+from ..tracing.traced_field import TracedField, TracedOptions
+
+LATTICE = (12, 40)
+"""Most elevations and azimuths of the lattice of directions."""
+FLOOR = 0.5
+"""Share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels."""
+
+
+class Misfit:
+    """Reports of the paths of some rows, as a function of a vector of parameters.
+
+    Args:
+        record: measurements of any task.
+        rows: rows that are compared.
+        scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier.
+        options: options of the traced side.
+        wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
+        prepared: shared state of the scene.
+
+    Attributes:
+        sides: traced side of each receiver.
+        start: stated values of the vector [p].
+        parts: slice of each parameter in the vector, by name.
+        observed: observations [n_rx * rows, values] in the residuals' unit, NaN where nothing was received.
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        rows: IntArray,
+        scene: Any,
+        options: TracedOptions,
+        wanted: Callable[[str], bool],
+        prepared: Prepared | None = None,
+    ) -> None:
+        self.record, self.rows, task = record, rows, task_of(record)
+        self.receivers = placed_receivers(record, by_uplink=False)
+        self._image = task.image
+        shared = prepared or Prepared(scene)
+        heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
+        self.sides = [
+            TracedField(scene, record.tx_pos_m[rows], receiver, options, heading, prepared=shared)
+            for receiver in self.receivers
+        ]
+        shape = record.observation.shape[2:]
+        size, whole_size = (1, 1), (1, 1)
+        if task.image:
+            whole_size = int(shape[0]), int(shape[1])
+            self._strides = [_stride(length, most) for length, most in zip(shape, LATTICE, strict=True)]
+            size = whole_size[0] // self._strides[0], whole_size[1] // self._strides[1]
+        outputs = tuple(map(int, shape)) if task.is_complex else ()
+        form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs)
+        self.models: list[ReceiverModel] = [RECEIVERS[form.receiver].make(form, r) for r in self.receivers]
+        whole = Form(task.receiver_with_scene, whole_size, record.frequencies_hz, outputs)
+        self._whole: list[ReceiverModel] = [RECEIVERS[form.receiver].make(whole, r) for r in self.receivers]
+        values: dict[str, NDArray[np.float32]] = {}
+        for side in self.sides:
+            values |= {name: value for name, value in side.parameters().items() if wanted(name)}
+        self._shapes = {name: value.shape for name, value in values.items()}
+        bounds = np.cumsum([0, *(value.size for value in values.values())])
+        self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
+        self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)
+        self.observed, self._unit = self._observations()
+        self._reports = [self._recorded(r, tangent=False) for r in range(len(self.sides))]
+        self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
+
+    def _observations(self) -> tuple[FloatArray, FloatArray]:
+        """Observations and their units [n_rx * rows], in which residuals are."""
+        seen = self.record.observation[:, self.rows]
+        count = seen.shape[0] * seen.shape[1]
+        if self._image:
+            coarse = minmax_scale(seen[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
+            return coarse.reshape(count, -1), np.ones(count)
+        if np.iscomplexobj(seen):
+            pairs = np.ascontiguousarray(seen, np.complex128).view(float).reshape(count, -1)
+            power = np.square(pairs).sum(axis=1)
+            unit = np.sqrt(power + FLOOR**2 * np.nanmedian(power))
+            return pairs / unit[:, None], unit
+        return seen.astype(float).reshape(count, -1), np.ones(count)
+
+    def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
+        """Parameters of a vector [p] by name."""
+        return {
+            name: np.ascontiguousarray(vector[part].reshape(self._shapes[name]), np.float32)
+            for name, part in self.parts.items()
+        }
+
+    def _device(self, vector: FloatArray) -> dict[str, Any]:
+        return {name: to_tensor(value) for name, value in self.named(vector).items()}
+
+    def _recorded(self, number: int, tangent: bool) -> Recorded:
+        side, model = self.sides[number], self.models[number]
+
+        def report(params: Mapping[str, Any]) -> Any:
+            with dr.suspend_grad():
+                found = model(side(params), None)
+                dr.eval(found)
+            return found
+
+        def derivative(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
+            for name, value in params.items():
+                dr.enable_grad(value)
+                dr.set_grad(value, direction[name])
+            found = model(side(params), None)
+            dr.forward_to(found)
+            slope = dr.grad(found)
+            dr.eval(slope)
+            return slope
+
+        # Arrays that are made from NumPy's memory at first use must exist before a recording.
+        model.arrays(mi.Float)
+        report(self._device(self.start))
+        return Recorded(derivative if tangent else report, partial(_arrays, side, model))
+
+    def residual(self, vector: FloatArray) -> FloatArray:
+        """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
+        params = self._device(vector)
+        found = [np.asarray(report(params).numpy(), float).reshape(len(self.rows), -1) for report in self._reports]
+        return np.concatenate(found) / self._unit[:, None] - self.observed
+
+    def jacobian(self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None]) -> NDArray[np.float32]:
+        """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
+        slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
+        params, count = self._device(vector), len(self.rows)
+        for place, column in enumerate(columns):
+            direction = self._device(np.eye(1, len(vector), column)[0])
+            for r, tangent in enumerate(self._tangents):
+                # Derivatives are switched on for these arrays, so each call has its own.
+                slope = tangent(dict(self._device(vector)) if place else params, direction).numpy()
+                slopes[r * count : (r + 1) * count, :, place] = slope.reshape(count, -1)
+            on_column(place)
+        slopes /= self._unit[:, None, None]
+        slopes[~np.isfinite(self.observed).all(axis=1)] = 0
+        return slopes
+
+    def scores(self, vector: FloatArray) -> FloatArray:
+        """Scores of the task of whole reports, [n_rx * rows]; NaN where nothing was received."""
+        task, params, found = task_of(self.record), self._device(vector), []
+        for side, model, seen in zip(self.sides, self._whole, self.record.observation, strict=True):
+            with dr.suspend_grad():
+                report = model(side(params), None).numpy()
+            truth = seen[self.rows]
+            pairs = np.asarray(report, float)
+            values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
+            found.append(task.score(values.reshape(truth.shape), truth))
+        return np.concatenate(found)
+
+    @property
+    def plane_of_slab(self) -> dict[str, int]:
+        """Plane of each slab, the surface of an object, by its name."""
+        return {name: int(name.rpartition("/")[2]) for name in self.sides[0].slabs.names}
+
+    def counts(self) -> tuple[IntArray, IntArray]:
+        """Number of paths that each plane reflects [q] and that meet each slab [n], over all receivers."""
+        first = self.sides[0]
+        planes, slabs = np.zeros(len(first.surfaces.normal), np.int64), np.zeros(len(first.slabs.names), np.int64)
+        for side in self.sides:
+            for level in side.chains.levels:
+                reflects, passes = (np.asarray(mask) & side.exists for mask in (level.reflects, level.transmits))
+                np.add.at(planes, np.asarray(level.plane)[reflects], 1)
+                np.add.at(slabs, np.asarray(level.material)[reflects | passes], 1)
+        return planes, slabs
+
+
+def _arrays(side: TracedField, model: ReceiverModel) -> Sequence[Any]:
+    return [side.arrays, model.arrays(mi.Float)]
+
+
+def _stride(length: int, most: int) -> int:
+    """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
+    found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
+    return found if 3 * (length // found) >= most else 1
+
+
+def search_options(depth: int, rays: int, faint: float, pattern_degree: int, thickness: bool = True) -> TracedOptions:
+    """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
+    trace = TraceOptions(transmission=True, max_depth=depth, rays=rays)
+    return TracedOptions(trace, pattern_degree, faint=faint, materials="surface", thickness=thickness, planes=True)

@@ -1,0 +1,289 @@
+"""A corrected scene as a folder: scene, page, picture and figures.
+
+The folder is a scene folder (`wrf_mi.scene.folder`), which plain Sionna RT and Mitsuba open, with three files more:
+
+correction.md    what was changed, by how much, how certain it is, and the scores before and after
+correction.json  the same for programs, all parameters among them
+correction.png   the scene, coloured by how far its surfaces were moved, and the scores of the held-out rows
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from ..core.angles import FloatArray
+from ..core.files import atomic_folder, write_atomically
+from ..tasks import task_of
+from ..tracing.corrected_scene import material_constants, moved_triangles, write_corrected_scene
+from ..tracing.material_parameters import SURFACE, name_of
+from ..tracing.plane_parameters import SHIFT, TILT
+from .correct import Correction
+from .fit import LEAST_PATHS
+from .frame import rigid_motion
+from .options import FRAME, MATERIALS
+from .search import ABSENT
+
+PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
+SUPPORTED = 0.5
+"""Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
+
+
+def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:
+    """Write a corrected scene and its page atomically.
+
+    Args:
+        correction: from `wrf_mi.correction.correct_scene`.
+        folder: the new scene folder.
+        replace: replace an existing folder.
+
+    Returns:
+        The content of ``correction.json``.
+
+    Raises:
+        InputError: a folder that exists or cannot be written, or no surface is left.
+    """
+    facts = _facts(correction)
+    with atomic_folder(Path(folder), replace=replace) as part:
+        write_corrected_scene(
+            part,
+            correction.scene,
+            correction.parameters if correction.kept else {},
+            grouping="surface",
+            kinds=correction.kinds,
+            absent=[index for index, one in enumerate(facts["materials"]) if one["absent"]],
+            replace=True,
+        )
+        write_atomically(part / FIGURES, json.dumps(facts, indent=1, default=_plain) + "\n")
+        write_atomically(part / PAGE, _text(correction, facts))
+        write_atomically(part / PICTURE, _picture(correction, facts))
+    return facts
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _facts(correction: Correction) -> dict[str, Any]:
+    """Everything that the page states."""
+    misfit, task = correction.misfit, task_of(correction.misfit.record)
+    changed = np.zeros(len(correction.vector), bool)
+    changed[correction.free] = True
+    values, parameters = misfit.named(correction.vector), {}
+    for name, part in misfit.parts.items():
+        parameters[name] = {
+            "value": values[name].ravel().tolist(),
+            "sd": correction.deviation[part].tolist(),
+            "sd_before": correction.prior[part].tolist(),
+            "changed": changed[part].tolist(),
+        }
+    scores = {
+        _stage(stage): {"mean": float(np.nanmean(score)), "median": float(np.nanmedian(score))}
+        for stage, score in correction.scores.items()
+    }
+    return {
+        "task": task.name,
+        "score": task.label,
+        "kept": _stage(correction.kept),
+        "held_out_scores": scores,
+        "seconds": correction.seconds,
+        **correction.facts,
+        "frame": _frame(correction),
+        "planes": _planes(correction),
+        "materials": _materials(correction),
+        "parameters": parameters,
+    }
+
+
+def _stage(stage: str) -> str:
+    return stage.replace("+", ", ") or "as stated"
+
+
+def _planes(correction: Correction) -> list[dict[str, Any]]:
+    """Each plane: objects, paths, movement and its standard deviation."""
+    misfit, surfaces = correction.misfit, correction.misfit.sides[0].surfaces
+    if SHIFT not in misfit.parts:
+        return []
+    count = len(surfaces.normal)
+    paths, things = misfit.counts()[0], surfaces.object_of(np.arange(len(surfaces.plane)))
+    shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
+    turned = correction.vector[tilt].reshape(count, 2)
+    turned_sd = correction.deviation[tilt].reshape(count, 2)
+    free = np.isin(np.arange(shift.start, shift.stop), correction.free)
+    ratio = correction.deviation[shift] / correction.prior[shift]
+    return [
+        {
+            "objects": sorted({surfaces.names[thing] for thing in things[surfaces.plane == plane]}),
+            "normal": surfaces.normal[plane].round(4).tolist(),
+            "paths": int(paths[plane]),
+            "shift_mm": 1e3 * float(correction.vector[shift][plane]),
+            "shift_sd_mm": 1e3 * float(correction.deviation[shift][plane]) if free[plane] else None,
+            "tilt_mrad": (1e3 * turned[plane]).tolist(),
+            "tilt_sd_mrad": (1e3 * turned_sd[plane]).tolist() if free[plane] else None,
+            "measured": bool(free[plane] and ratio[plane] <= SUPPORTED),
+        }
+        for plane in range(count)
+    ]
+
+
+def _materials(correction: Correction) -> list[dict[str, Any]]:
+    """Each surface: paths, constants before and after, standard deviations of their logarithms."""
+    misfit, slabs = correction.misfit, correction.misfit.sides[0].slabs
+    paths = misfit.counts()[1]
+    before = material_constants(slabs, {})
+    after = material_constants(slabs, correction.parameters) if correction.kept else before
+    parts = [misfit.parts.get(name_of(SURFACE, q)) for q in ("permittivity", "conductivity", "thickness")]
+    found = []
+    for index, name in enumerate(slabs.names):
+        places = [part.start + index for part in parts if part is not None]
+        free = bool(places) and places[0] in correction.free
+        sd = correction.deviation[places] if free else None
+        taken = correction.materials.get(name)
+        found.append(
+            {
+                "surface": name.partition("/")[0],
+                "paths": int(paths[index]),
+                "first_choice": taken,
+                "absent": taken == ABSENT and free and bool(after[index, 0] < 1.1),
+                "permittivity": [float(before[index, 0]), float(after[index, 0])],
+                "conductivity": [float(before[index, 1]), float(after[index, 1])],
+                "thickness_m": [float(before[index, 2]), float(after[index, 2])],
+                "sd_log": None if sd is None else sd.tolist(),
+                "measured": None if sd is None else (sd / correction.prior[places] <= SUPPORTED).tolist(),
+            }
+        )
+    return found
+
+
+def _frame(correction: Correction) -> dict[str, Any] | None:
+    """The common motion of the planes, and its standard deviations."""
+    misfit = correction.misfit
+    if FRAME not in correction.options.parts or not correction.kept or SHIFT not in misfit.parts:
+        return None
+    places = np.concatenate([np.arange(misfit.parts[n].start, misfit.parts[n].stop) for n in (SHIFT, TILT)])
+    free = np.isin(places, correction.free)
+    deviation = np.where(free, correction.deviation[places], np.inf)
+    motion, sd = rigid_motion(misfit.sides[0].surfaces, correction.vector[places], 1 / np.square(deviation))
+    return {
+        "translation_mm": (1e3 * motion[:3]).tolist(),
+        "translation_sd_mm": (1e3 * sd[:3]).tolist(),
+        "rotation_mrad": (1e3 * motion[3:]).tolist(),
+        "rotation_sd_mrad": (1e3 * sd[3:]).tolist(),
+    }
+
+
+def _text(correction: Correction, facts: dict[str, Any]) -> str:
+    """The page as Markdown."""
+    task = task_of(correction.misfit.record)
+    lines = [
+        "# A scene corrected by measurements",
+        "",
+        f"Data: {correction.misfit.record.name}, {facts['rows']} training rows, {facts['paths']} paths. "
+        f"Kept: {facts['kept']}. Duration: {facts['seconds']:.0f} s.",
+        "",
+        f"{task.label} of {facts['held_out']} training rows that were held out in clusters while choosing:",
+        "",
+        "| scene | median | mean |",
+        "| --- | ---: | ---: |",
+    ]
+    for stage, score in facts["held_out_scores"].items():
+        lines.append(f"| {stage} | {score['median']:.{task.digits}f} | {score['mean']:.{task.digits}f} |")
+    lines += ["", f"![surfaces and scores]({PICTURE})", ""]
+    if (frame := facts["frame"]) is not None:
+        lines += ["## Frame", "", "Common motion of all planes, about the mean of their centres.", ""]
+        lines += ["| | x | y | z |", "| --- | ---: | ---: | ---: |"]
+        for what, unit in (("translation", "mm"), ("rotation", "mrad")):
+            pairs = zip(frame[f"{what}_{unit}"], frame[f"{what}_sd_{unit}"], strict=True)
+            lines.append(f"| {what} ({unit}) | " + " | ".join(_with_sd(*pair) for pair in pairs) + " |")
+        lines.append("")
+    known = [plane for plane in facts["planes"] if plane["shift_sd_mm"] is not None]
+    if known and correction.kept:
+        lines += ["## Planes", "", "| objects | paths | shift (mm) | tilts (mrad) | measured |"]
+        lines.append("| --- | ---: | ---: | ---: | --- |")
+        for plane in sorted(known, key=lambda plane: -plane["paths"]):
+            tilts = ", ".join(_with_sd(*pair) for pair in zip(plane["tilt_mrad"], plane["tilt_sd_mrad"], strict=True))
+            shift = _with_sd(plane["shift_mm"], plane["shift_sd_mm"])
+            names = ", ".join(plane["objects"][:3]) + (" ..." if len(plane["objects"]) > 3 else "")
+            lines.append(f"| {names} | {plane['paths']} | {shift} | {tilts} | {'yes' if plane['measured'] else 'no'} |")
+        lines.append("")
+    fitted = [one for one in facts["materials"] if one["sd_log"] is not None]
+    if fitted:
+        lines += ["## Materials", "", "Constants hold at the carrier; a constant in parentheses is not identified."]
+        lines += ["", "| surface | paths | chosen | permittivity | conductivity (S/m) | thickness (m) |"]
+        lines.append("| --- | ---: | --- | ---: | ---: | ---: |")
+        for one in sorted(fitted, key=lambda one: -one["paths"]):
+            cells = []
+            for key, sd, sure in zip(
+                ("permittivity", "conductivity", "thickness_m"), one["sd_log"], one["measured"], strict=True
+            ):
+                value = f"{one[key][1]:.3g}" + (f" x/ {math.exp(sd):.2g}" if sure else "")
+                cells.append(value if sure else f"({value})")
+            taken = "absent, left out" if one["absent"] else one["first_choice"] or "as stated"
+            lines.append(f"| {one['surface']} | {one['paths']} | {taken} | " + " | ".join(cells) + " |")
+        lines.append("")
+    few = sum(one["sd_log"] is None for one in facts["materials"])
+    lines += [
+        "## What the data do not tell",
+        "",
+        f"- {few} of {len(facts['materials'])} surfaces are as stated: fewer than {LEAST_PATHS} paths meet them"
+        f"{'' if MATERIALS in facts['kept'] else ', or no change of materials was kept'}.",
+        f'- "Measured" are quantities whose standard deviation fell below {SUPPORTED:.0%} of the one before; '
+        "`x/ 1.2` is a factor of one standard deviation.",
+        "- Standard deviations are those of the Fisher information and the prior, with the paths as found in the "
+        "stated scene. Surfaces that the scan missed are not in them.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _with_sd(value: float, sd: float) -> str:
+    return f"{value:.1f} ± {sd:.1f}" if math.isfinite(sd) else "not fixed by any plane"
+
+
+def _picture(correction: Correction, facts: dict[str, Any]) -> bytes:
+    """The scene coloured by the shifts of its planes, and the held-out scores."""
+    surfaces = correction.misfit.sides[0].surfaces
+    triangles = moved_triangles(surfaces, correction.parameters if correction.kept else {})
+    shift = np.array([plane["shift_mm"] for plane in facts["planes"]]) if facts["planes"] else None
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    room: Any = figure.add_subplot(1, 2, 1, projection="3d")
+    shown = [
+        k
+        for k in range(len(triangles))
+        if correction.kinds.get(surfaces.names[surfaces.object_of(np.array([k]))[0]]) != "ceiling"
+    ]
+    most = max(1.0, float(np.abs(shift).max())) if shift is not None else 1.0
+    shades = ScalarMappable(Normalize(-most, most), "RdBu")
+    face = np.zeros(len(triangles)) if shift is None else shift[surfaces.plane]
+    colours = shades.to_rgba(face[shown], alpha=0.45)
+    room.add_collection3d(Poly3DCollection(triangles[shown], facecolors=colours, edgecolors="0.4", linewidths=0.3))
+    room.plot(*correction.misfit.record.tx_pos_m[correction.misfit.rows].T, ",", color="0.2")
+    for receiver in correction.misfit.receivers:
+        room.plot(*np.asarray(receiver.position_m)[:, None], "^", color="C1")
+    low, high = triangles.reshape(-1, 3).min(axis=0), triangles.reshape(-1, 3).max(axis=0)
+    for axis, a, b in zip("xyz", low, high, strict=True):
+        room.set(**{f"{axis}lim": (a, b), f"{axis}label": f"{axis} (m)"})
+    room.set_box_aspect(np.maximum(high - low, 0.1))
+    room.set_title("shifts of planes along their normals")
+    figure.colorbar(shades, ax=room, shrink=0.6, label="shift (mm)")
+    axes = figure.add_subplot(1, 2, 2)
+    for stage, score in correction.scores.items():
+        values: FloatArray = np.sort(score[np.isfinite(score)])
+        share = np.arange(1, len(values) + 1) / max(len(values), 1)
+        style = "-" if stage == correction.kept else "--"
+        axes.step(values, share, style, where="post", label=f"{_stage(stage)}{' (kept)' if style == '-' else ''}")
+    axes.set(xlabel=task_of(correction.misfit.record).label, ylabel="share of the held-out rows", ylim=(0, 1))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return buffer.getvalue()
