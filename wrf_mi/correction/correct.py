@@ -6,8 +6,9 @@ Paths are found once with the stated scene. Then, each on the training rows alon
 2. *least squares*: materials, planes and antennas, with priors (`wrf_mi.correction.least_squares`).
 
 Both are done in rounds, first without a quarter of the training rows, held out in clusters. On these rows the stated
-scene, changed materials alone, and materials with planes are compared; the best is kept and fitted again to all
-training rows. A scene that measurements cannot improve is returned as it was.
+scene, changed materials alone, and materials with planes are compared; more freedom is kept where it gains more than
+the standard error of the gain, and is fitted again to all training rows. A scene that measurements cannot improve is
+returned as it was.
 """
 
 from __future__ import annotations
@@ -134,10 +135,9 @@ def correct_scene(
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
     chosen = trial.all_parts()
-    sign = 1 if task.higher_is_better else -1
     stages = {"": trial.stated, **{key: found.vector for key, found in chosen.items()}}
     scores = {key: others.scores(vector) for key, vector in stages.items()}
-    kept = max(scores, key=lambda key: sign * float(np.nanmean(scores[key])))
+    kept = _kept(scores, task.higher_is_better)
     whole = misfit(split.all_train, "tracing")
     final = Fit(whole, options, on_stage)
     vector, deviation = final.stated, np.zeros(len(final.stated))
@@ -161,6 +161,20 @@ def correct_scene(
         time.perf_counter() - begun,
         {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
     )
+
+
+def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
+    """The last stage that improves on the one kept before by more than the standard error of the mean gain.
+
+    Fits with more freedom also fit what no surface explains; a gain within its error does not justify moving walls.
+    """
+    kept = ""
+    for stage, score in scores.items():
+        gain = (score - scores[kept]) * (1 if higher_is_better else -1)
+        gain = gain[np.isfinite(gain)]
+        if len(gain) > 1 and gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+            kept = stage
+    return kept
 
 
 def _kinds(scene: str | Path) -> dict[str, Kind]:
