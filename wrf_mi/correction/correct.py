@@ -47,7 +47,7 @@ class Correction:
     Attributes:
         scene: the stated scene (``sionna.rt.Scene``).
         misfit: residuals over all training rows.
-        kept: what was kept: ``""`` (nothing), or the changed parts.
+        kept: parts that were changed, joined by "+"; "" for none.
         vector: parameters [p] of `Misfit`.
         deviation: their standard deviations [p], 0 of those that were held.
         prior: standard deviations before the correction [p].
@@ -94,7 +94,7 @@ def correct_scene(
         scene: see `wrf_mi.tracing.open_scene`.
         record: measurements of any task, positions known.
         split: its training and validation rows are used, its test rows are not.
-        options: what is changed, and what is known before.
+        options: parts that may change, and the prior knowledge of them.
         material: radio material of a bare mesh.
         on_stage: called as the correction goes on.
 

@@ -31,21 +31,21 @@ class CorrectionOptions(CheckedSettings):
     """Options of a correction.
 
     Attributes:
-        parts: what is changed: any of `PARTS`.
+        parts: parts that may change, of `PARTS`.
         depth: largest number of interactions of a path, transmissions included.
         rays: number of rays that search from each receiver.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
         steps: largest number of least-squares steps.
         pattern_degree: degree of the antennas' patterns, where they are changed.
         shift_sd_m: standard deviation of a plane's position before the correction, metres.
-        tilt_sd_rad: that of its tilts, rad.
-        frame_sd_m: that of the common displacement of all planes against the devices, metres.
-        frame_sd_rad: that of their common rotation, rad.
-        material_sd: that of the logarithm of a material's permittivity - 1; its conductivity has twice, its thickness
-            half of it.
-        pose_sd_m: that of a receiver's position, metres.
-        pose_sd_rad: that of its orientation, rad.
-        pattern_sd: that of a pattern's coefficient.
+        tilt_sd_rad: standard deviation of a plane's tilts, rad.
+        frame_sd_m: standard deviation of the common displacement of all planes against the devices, metres.
+        frame_sd_rad: standard deviation of their common rotation, rad.
+        material_sd: standard deviation of the logarithm of a material's permittivity - 1; its conductivity has twice,
+            its thickness half of it.
+        pose_sd_m: standard deviation of a receiver's position, metres.
+        pose_sd_rad: standard deviation of a receiver's orientation, rad.
+        pattern_sd: standard deviation of a pattern's coefficient.
     """
 
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME)

@@ -113,7 +113,7 @@ def write_corrected_scene(
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
             `wrf_mi.tracing.material_parameters`); others are ignored.
-        grouping: that of the parameters of materials.
+        grouping: grouping of the parameters of materials.
         kinds: kinds of objects by name; by default ``other``.
         absent: slabs, in the order of their parameters, whose surfaces are left out.
         replace: replace an existing folder.

@@ -103,7 +103,7 @@ class Mlp(Module):
     Args:
         layers: hidden layers; the first may have named inputs.
         out: output layer; None: the last hidden layer is the output.
-        activation: of the hidden layers.
+        activation: activation of the hidden layers.
     """
 
     def __init__(self, layers: list[Linear], out: Linear | None, activation: Callable[[Any], Any] = relu) -> None:

@@ -149,7 +149,7 @@ def march(network: Nerf2Network, seen: Seen, condition: Any, samples: int) -> tu
 
     Args:
         network: both networks.
-        seen: of `look`.
+        seen: result of `look`.
         condition: features of transmitters for the radiance network, [features, batch].
         samples: S.
 

@@ -120,7 +120,7 @@ class CsiPhysics(PhysicsModel):
         visibility: predicts which of their paths exist.
         residual: the diffuse field of each receiver.
         sharpness: factor of the log odds in the predicted mean.
-        covariance: of all planes' parameters.
+        covariance: covariance of all planes' parameters.
         fit_facts: entries of `summary` about the fit.
     """
 

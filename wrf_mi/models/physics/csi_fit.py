@@ -44,7 +44,7 @@ class CsiSettings(CheckedSettings):
     """Settings of the fit of a CSI physics model.
 
     Attributes:
-        reflections: of a path at most.
+        reflections: largest number of reflections of a path.
         rays: rays from each receiver that search for chains of planes.
         reflection: amplitude reflection coefficient of planes a priori; negative: with a phase of pi.
         reflection_sd: standard deviation of its logarithm and of its phase (rad) from plane to plane; 0 fixes it.
