@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +98,12 @@ def _batch() -> tuple[Call, Call]:
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     pose, plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
     positions = transmitter_path(count)[rng.permutation(count)]
-    together, alone = (Recorded(partial(grey, trainer.field)) for _ in range(2))
     dr.eval(params)
+
+    def spectra(params: Any, tx_pos: Any, pose: Any, plane: Any) -> Any:
+        return grey(trainer.field, params, tx_pos, pose, plane)
+
+    together, alone = Recorded(spectra), Recorded(spectra)
 
     def ours() -> Any:
         return together(params, to_tensor(positions.T), pose, plane)
