@@ -142,7 +142,7 @@ def correct_scene(
     final = Fit(whole, options, on_stage)
     vector, deviation = final.stated, np.zeros(len(final.stated))
     if kept:
-        solution = final.refit(kept, chosen[kept].vector, trial.means[kept])
+        solution = final.solve(kept, chosen[kept].vector, trial.means[kept])
         vector = solution.vector
         deviation[final.free(kept)] = np.sqrt(np.diag(solution.covariance))
     kinds = _kinds(scene)

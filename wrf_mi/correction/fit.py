@@ -116,7 +116,7 @@ class Fit:
                 if choice.what in taken and len(chosen):
                     mean[chosen] = vector[chosen]
                     self.taken[stage, choice.what] = taken[choice.what].partition(",")[0]
-            found = self._solve(stage, vector, mean)
+            found = self.solve(stage, vector, mean)
             vector = found.vector
         self.means[stage] = mean
         return found
@@ -164,7 +164,7 @@ class Fit:
     def _progress(self, what: str) -> Callable[[int, int], None]:
         return lambda done, of: self.on_stage(what, done / max(of, 1))
 
-    def _solve(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
+    def solve(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
         """Least squares of a stage's entries; the whole vector."""
         free, misfit = self.free(stage), self.misfit
         prior = self.prior(mean, free)
@@ -190,7 +190,3 @@ class Fit:
 
         found = solve(lambda part: misfit.residual(whole(part)), jacobian, start[free], prior, steps, on_step)
         return replace(found, vector=whole(found.vector))
-
-    def refit(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
-        """Least squares of a stage over these rows, from a solution over some of them."""
-        return self._solve(stage, start, mean)

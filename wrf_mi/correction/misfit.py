@@ -150,12 +150,12 @@ class Misfit:
     def jacobian(self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None]) -> NDArray[np.float32]:
         """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
-        params, count = self._device(vector), len(self.rows)
+        count = len(self.rows)
         for place, column in enumerate(columns):
             direction = self._device(np.eye(1, len(vector), column)[0])
             for r, tangent in enumerate(self._tangents):
                 # Derivatives are switched on for these arrays, so each call has its own.
-                slope = tangent(dict(self._device(vector)) if place else params, direction).numpy()
+                slope = tangent(self._device(vector), direction).numpy()
                 slopes[r * count : (r + 1) * count, :, place] = slope.reshape(count, -1)
             on_column(place)
         slopes /= self._unit[:, None, None]
@@ -201,7 +201,7 @@ def _stride(length: int, most: int) -> int:
     return found if 3 * (length // found) >= most else 1
 
 
-def search_options(depth: int, rays: int, faint: float, pattern_degree: int, thickness: bool = True) -> TracedOptions:
+def search_options(depth: int, rays: int, faint: float, pattern_degree: int) -> TracedOptions:
     """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
     trace = TraceOptions(transmission=True, max_depth=depth, rays=rays)
-    return TracedOptions(trace, pattern_degree, faint=faint, materials="surface", thickness=thickness, planes=True)
+    return TracedOptions(trace, pattern_degree, faint=faint, materials="surface", thickness=True, planes=True)

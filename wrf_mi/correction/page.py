@@ -167,7 +167,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
 def _frame(correction: Correction) -> dict[str, Any] | None:
     """The common motion of the planes, and its standard deviations."""
     misfit = correction.misfit
-    if FRAME not in correction.options.parts or not correction.kept or SHIFT not in misfit.parts:
+    if FRAME not in correction.kept.split("+"):
         return None
     places = np.concatenate([np.arange(misfit.parts[n].start, misfit.parts[n].stop) for n in (SHIFT, TILT)])
     free = np.isin(places, correction.free)
