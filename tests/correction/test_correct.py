@@ -133,6 +133,7 @@ def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) 
         [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
     )
     slopes = misfit.jacobian(misfit.start, columns, lambda place: None)
+    assert [tangent.n_recordings for tangent in misfit._tangents] == [1] * len(misfit.sides)
     seen = np.isfinite(misfit.observed).all(axis=1)
     assert (slopes[~seen] == 0).all()
     for place, column in enumerate(columns):

@@ -80,7 +80,7 @@ class Fit:
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
             motions = rigid_motions(self.misfit.sides[0].surfaces)
             deviation = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
-            places = self._planes_of_vector
+            places = self.misfit.plane_entries
             covariance[np.ix_(places, places)] += (motions * deviation**2) @ motions.T
         return Prior(mean[free], np.linalg.inv(covariance[np.ix_(free, free)]))
 
@@ -125,7 +125,7 @@ class Fit:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
         expected = vector[places].copy()
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            planes = self._planes_of_vector
+            planes = self.misfit.plane_entries
             known = np.isin(planes, np.setdiff1d(self.free(PLANES), places))
             weight = known / np.square(self.prior_deviation[planes])
             motions = rigid_motions(self.misfit.sides[0].surfaces)
@@ -136,16 +136,11 @@ class Fit:
             expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
         return expected
 
-    @property
-    def _planes_of_vector(self) -> IntArray:
-        """Entries of the planes' shifts, then tilts."""
-        return np.concatenate([np.arange(p.start, p.stop) for p in map(self.misfit.parts.get, (SHIFT, TILT)) if p])
-
     def _refined(self, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         misfit, vector, mean = self.misfit, start.copy(), start.copy()
-        for name in (SHIFT, TILT):
-            mean[misfit.parts[name]] = self.stated[misfit.parts[name]]
+        planes = misfit.plane_entries
+        mean[planes] = self.stated[planes]
 
         def whole(part: FloatArray) -> FloatArray:
             vector[places] = part

@@ -26,6 +26,7 @@ from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
+from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_field import TracedField, TracedOptions
 
@@ -127,10 +128,12 @@ class Misfit:
             return found
 
         def derivative(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
-            for name, value in params.items():
+            # Gradients of the caller's arrays stay off: all columns share them, and one recording.
+            values = {name: dr.copy(value) for name, value in params.items()}
+            for name, value in values.items():
                 dr.enable_grad(value)
                 dr.set_grad(value, direction[name])
-            found = model(side(params), None)
+            found = model(side(values), None)
             dr.forward_to(found)
             slope = dr.grad(found)
             dr.eval(slope)
@@ -150,12 +153,11 @@ class Misfit:
     def jacobian(self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None]) -> NDArray[np.float32]:
         """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
-        count = len(self.rows)
+        count, params = len(self.rows), self._device(vector)
         for place, column in enumerate(columns):
             direction = self._device(np.eye(1, len(vector), column)[0])
             for r, tangent in enumerate(self._tangents):
-                # Derivatives are switched on for these arrays, so each call has its own.
-                slope = tangent(self._device(vector), direction).numpy()
+                slope = tangent(params, direction).numpy()
                 slopes[r * count : (r + 1) * count, :, place] = slope.reshape(count, -1)
             on_column(place)
         slopes /= self._unit[:, None, None]
@@ -173,6 +175,12 @@ class Misfit:
             values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
             found.append(task.score(values.reshape(truth.shape), truth))
         return np.concatenate(found)
+
+    @property
+    def plane_entries(self) -> IntArray:
+        """Entries of the vector that are the planes' shifts, then their tilts; none where planes are not parameters."""
+        parts = [self.parts[name] for name in (SHIFT, TILT) if name in self.parts]
+        return np.concatenate([np.zeros(0, np.int64), *(np.arange(part.start, part.stop) for part in parts)])
 
     @property
     def plane_of_slab(self) -> dict[str, int]:

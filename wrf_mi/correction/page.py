@@ -169,7 +169,7 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
     misfit = correction.misfit
     if FRAME not in correction.kept.split("+"):
         return None
-    places = np.concatenate([np.arange(misfit.parts[n].start, misfit.parts[n].stop) for n in (SHIFT, TILT)])
+    places = misfit.plane_entries
     free = np.isin(places, correction.free)
     deviation = np.where(free, correction.deviation[places], np.inf)
     motion, sd = rigid_motion(misfit.sides[0].surfaces, correction.vector[places], 1 / np.square(deviation))
