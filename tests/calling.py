@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from wrf_mi.cli.main import main
+from wrf_mi.runs.folder import FORMAT
 
 SMALL = ["initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "log_every=2", "validate_every=4", "steps=4"]
 SET = [part for setting in SMALL for part in ("--set", setting)]
@@ -86,7 +87,7 @@ def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[st
     np.savez(model, **{name: value for name, value in arrays.items() if name != key})
     refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
-    refused(asked, "model.npz: format 99, this version reads 3; use the version that wrote it", capsys)
+    refused(asked, f"model.npz: format 99, this version reads {FORMAT}; use the version that wrote it", capsys)
 
 
 IN_TURN = """

@@ -9,7 +9,6 @@ import numpy as np
 from wrf_mi.core import Receiver
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.render import splat
-from wrf_mi.gaussians.skip import Skip
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
@@ -39,6 +38,6 @@ def fields(seed: int, product: bool, low: float = 0.05, high: float = 0.999, cou
     )
 
 
-def image(gaussians: Gaussians, skip: Skip) -> np.ndarray:
-    re, im = splat(gaussians, POSE, perception_plane(*SIZE, Float64), skip)
+def image(gaussians: Gaussians) -> np.ndarray:
+    re, im = splat(gaussians, POSE, perception_plane(*SIZE, Float64))
     return re.numpy() + 1j * im.numpy()

@@ -18,7 +18,6 @@ from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.skip import NOTHING, Skip
 from wrf_mi.gaussians.tiles import Plane
 from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
@@ -165,7 +164,6 @@ class Traced(Evaluation):
         plane: Plane,
         sphere: bool,
         params: Mapping[str, Any],
-        skip: Skip = NOTHING,
     ) -> Complex:
         """Complex signal on directions, in the order of `wrf_mi.graph.evaluations.learned_field`."""
         poses = [pose, facing_down(pose)] if sphere else [pose]

@@ -7,7 +7,7 @@ Gaussians lie behind walls that pass at most the share p of the power on each of
     |sum_{k >= j} w_k S_k W_k T_k| <= sqrt(p) |T_j| M_j <= sqrt(p) M_j
 
 with M_j the largest |S_k| cut off, as their weights add up to less than one (alpha blending), or their sum (product
-blending, where |T| <= 1): the bound of `wrf_mi.gaussians.skip`, reduced by the walls. Derivatives by S_k, which
+blending, where |T| <= 1). Derivatives by S_k, which
 are w_k W_k T_k, are below sqrt(p) too.
 
 A Gaussian lies behind anything nearer than its distance less three of its largest standard deviations, low-pass

@@ -12,11 +12,9 @@ from traced_rooms import SHOEBOX, write_xml
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
-from wrf_mi.gaussians.skip import Skip
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.config import default_config
-from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.trainer import Trainer
 
 HZ = 920e6
@@ -145,14 +143,3 @@ def test_joint_field_uses_positions_instead_of_the_uplink(rooms: dict[str, Path]
     nowhere = replace(first, tx_pos_m=np.full_like(first.tx_pos_m, np.nan))
     with pytest.raises(InputError, match="room has no position in row 0"):
         trained(nowhere, rooms["known"])
-
-
-def test_skips_of_a_joint_prediction_stay_within_their_bound(rooms: dict[str, Path]) -> None:
-    record = measured("spectrum", rooms["whole"])
-    trainer = trained(record, rooms["known"], "receiver=pixel", "initial.signal=0.3")
-    own, ends = trainer.graph, (trainer.state.mean_params(), trainer.graph.receivers, *trainer.graph.form.size)
-    skipping = Predictor(own.field, *ends, Skip(contribution=0.3), graph=own, reach=trainer.reach())
-    everything = Predictor(own.field, *ends, graph=own, reach=trainer.reach())
-    row = record.tx_pos_m[:4]
-    change = np.abs(skipping(row, 0) - everything(row, 0)).max()
-    assert 0 < change <= 0.3

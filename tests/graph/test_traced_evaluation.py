@@ -306,10 +306,6 @@ def test_traced_run_with_a_scene_reproduces_its_score(tmp_path: Path) -> None:
 def test_untraceable_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set traced.shift=0 and traced.tilt=0, or evaluation=splatted"):
         behind_the_ceiling(tmp_path, shift=1e-3)
-    with pytest.raises(
-        InputError, match=r"skip.contribution and skip.early_stop_tolerance belong to evaluation=splatted"
-    ):
-        settings("evaluation=traced", "skip.early_stop_tolerance=0.01")
     with pytest.raises(InputError, match="'cast' is unknown; choose from splatted, traced"):
         Graph(MODELS["wrf-gs"], RECEIVERS[:1], Form("pixel", SIZE), evaluation="cast")
     record, _ = made_record(24)

@@ -21,6 +21,7 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.runs.api import evaluate_run, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.runs.folder import FORMAT
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks.scores import inside_interval, ssim
@@ -54,7 +55,7 @@ def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
     known = {"model": "physics", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
-    known |= {"format": 3, "task": "spectrum", "material": None, "deterministic": False}
+    known |= {"format": FORMAT, "task": "spectrum", "material": None, "deterministic": False}
     assert known.items() <= config.items()
     assert (config["settings"]["directions"], config["settings"]["lengths"]) == (20, 2)
     record, arrays = load(waves), stored(run)

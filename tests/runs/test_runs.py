@@ -20,6 +20,7 @@ from wrf_mi.backend import set_threads
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, load_split, make_splits, write_spectrum_folder
 from wrf_mi.runs.api import Interrupted, Run, evaluate_run, open_run, resume, train
+from wrf_mi.runs.folder import FORMAT
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.tasks.spectrum import Spectrum
 from wrf_mi.training.adam import NumericsError
@@ -269,11 +270,14 @@ def test_damaged_models_are_refused(finished: Path, tmp_path: Path) -> None:
 def test_damaged_configurations_are_refused(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path / "run")
     path = run / "config.yaml"
-    for content in ("settings: [1", "just text", "", "format: 3\ndataset: x\n"):
+    for content in ("settings: [1", "just text", "", f"format: {FORMAT}\ndataset: x\n"):
         path.write_text(content)
         with pytest.raises(InputError, match=r"config\.yaml: not readable") as caught:
             resume(run)
         assert "\n" not in str(caught.value)
+    path.write_text(f"format: {FORMAT - 1}\ndataset: x\n")
+    with pytest.raises(InputError, match=rf"config\.yaml: format {FORMAT - 1}, this version reads {FORMAT}"):
+        resume(run)
     with pytest.raises(InputError, match=r"no config\.yaml, so not a run folder"):
         resume(tmp_path)
 

@@ -16,13 +16,11 @@ from hypothesis.extra import numpy as hnp
 from made_fields import BATCH, COUNT, POSE, SIZE, Float64, fields, image
 from small_fits import settings as small
 
-from wrf_mi.backend import set_threads
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.removal import removal
-from wrf_mi.gaussians.skip import Skip
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compressed import COMPRESSION
@@ -31,7 +29,6 @@ from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.fields import make_field
 from wrf_mi.training.packed import LEVELS, pack_params, unpack_params
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.trainer import Trainer
 
 QUOTIENT_TOLERANCE = 1e-6
 """What lies behind is found by a quotient whose divisor goes down to 1e-3 here, in float64."""
@@ -50,7 +47,7 @@ def test_removal_equals_change_of_the_image_without_the_gaussian(product: bool) 
     gaussians = fields(4, product)
     plane = perception_plane(*SIZE, Float64)
     found = np.stack([removal(of_transmitter(gaussians, b), POSE, plane) for b in range(BATCH)])
-    whole = image(gaussians, Skip())
+    whole = image(gaussians)
     for i in range(0, COUNT, 5):
         without = fields(4, product)
         keep = Float64((np.arange(BATCH * COUNT) % COUNT != i).astype(float))
@@ -60,7 +57,7 @@ def test_removal_equals_change_of_the_image_without_the_gaussian(product: bool) 
         else:
             without.opacity = without.opacity * keep
         without.signal = [s * keep for s in without.signal]
-        expected = np.abs(image(without, Skip()) - whole).reshape(BATCH, -1).sum(axis=1)
+        expected = np.abs(image(without) - whole).reshape(BATCH, -1).sum(axis=1)
         np.testing.assert_allclose(found[:, i], expected, rtol=QUOTIENT_TOLERANCE, atol=1e-9)
     assert (found > 0).any()
 
@@ -215,17 +212,3 @@ def test_sizes_of_networks_are_settings() -> None:
     ):
         with pytest.raises(InputError, match="omit it"):
             field(*bad)
-
-
-def test_skip_settings_reach_predictions(run: Path, one_gateway: Record) -> None:
-    """Steps evaluate all, whatever is skipped in predictions."""
-    set_threads(1)  # several add in another order from run to run
-    split = make_splits(one_gateway, "official")[0]
-    say = {}
-    for rest in (0.0, 1.0):
-        trainer = Trainer(one_gateway, split, small("steps=3", f"skip.early_stop_tolerance={rest}"))
-        trainer.run()
-        say[rest] = trainer.state.params(), trainer.predictor()(one_gateway.tx_pos_m[:2])
-    for name, values in say[0.0][0].items():
-        np.testing.assert_array_equal(say[1.0][0][name], values, err_msg=name)
-    assert 0 < np.abs(say[1.0][1] - say[0.0][1]).max() <= 1.0 + 1e-3

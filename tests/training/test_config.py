@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import describe, settings_from, with_settings
-from wrf_mi.gaussians.skip import Skip
 from wrf_mi.training.config import PRESETS, TrainConfig
 from wrf_mi.training.fields import make_field
 
@@ -92,9 +91,6 @@ def configurations(draw: st.DrawFn) -> TrainConfig:
             # Gaussians start from one source.
             source = draw(st.sampled_from(SOURCES))
             values |= {other: "" for other in SOURCES if other != source}
-        if values.get("evaluation") == "traced":
-            # Only splatting skips.
-            values["skip"] = Skip()
         return kind(**values)
 
     return build(TrainConfig, "")

@@ -9,7 +9,6 @@ one Q: a further transmitter costs two products per pixel instead of a footprint
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -21,7 +20,7 @@ from .recurrence import ForwardState, Pair, ReverseState, accumulate, forward_st
 from .tiles import LANE_ROWS, Plane, TileLists
 
 RECORD = 16
-"""Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, signal, reach."""
+"""Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal."""
 
 GROUP = 4
 """Transmitters whose sums a lane keeps: more would not fit into its registers."""
@@ -168,14 +167,9 @@ def _blend_one(record: list[Any], fields: int, signals: list[Pair], lanes: Lanes
     return result
 
 
-def _brightest(t: list[Pair], product: bool) -> Any:
-    """Largest |T|^2 of a lane's pixels."""
-    return reduce(dr.maximum, [re * re + im * im if product else re * re for re, im in t])
-
-
 @dr.syntax
 def _forward(
-    table: Any, signals: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int, early: bool
+    table: Any, signals: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int
 ) -> tuple[Any, Any]:
     """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
     float_type, index_type = type(table), type(lists.index)
@@ -183,13 +177,9 @@ def _forward(
     size = group_size(batch) if shared else 1
     lanes = lanes_of(plane, lists, n, batch, shared)
     state = ForwardState.start(float_type, LANE_ROWS, size)
-    j, end = index_type(0), index_type(lanes.end)
-    while j < end:
+    j = index_type(0)
+    while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
-        if dr.hint(early, mode="scalar"):
-            # This Gaussian is the lane's last once it and all behind it can send no more than the tolerance.
-            reach = dr.gather(float_type, table, i * RECORD + fields + 2)
-            end = dr.select(_brightest(state.t, product) * reach * reach <= 1, j, end)
         record = read(table, i, fields if shared else fields + 2)
         sent = _read_signals(signals, lanes.group * n + i, size) if shared else [tuple(record[fields:])]
         state = _blend_one(record, fields, sent, lanes, state)
@@ -285,14 +275,13 @@ class _Blend(dr.CustomOp):
         shared: bool,
         columns: list[Any],
         signal: list[Any],
-        reach: Any | None,
     ) -> Any:
         self.arguments = (lists, plane, n, product, batch)
         self.count = len(columns)
-        self.table = pack([*columns, *([] if shared else signal), *([] if reach is None else [reach])])
+        self.table = pack([*columns, *([] if shared else signal)])
         self.signals = _pack_signals(signal, n, batch) if shared else None
         dr.eval(self.table, self.signals)
-        self.total = _forward(self.table, self.signals, *self.arguments, reach is not None)
+        self.total = _forward(self.table, self.signals, *self.arguments)
         dr.eval(self.total)
         return self.total
 
@@ -321,7 +310,6 @@ def blend(
     plane: Plane,
     batch: int,
     blending: list[Any],
-    reach: Any | None = None,
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel.
 
@@ -333,25 +321,13 @@ def blend(
         batch: number of transmitters.
         blending: one array of opacities in [0, 1) (alpha blending), or real and imaginary part of delta, |delta| < 1
             (product blending), as many numbers as footprints.
-        reach: bound of the signal of a Gaussian and all behind it (`wrf_mi.gaussians.skip.signal_bounds`) divided by
-            the tolerated error, [batch * n]; the walk of a pixel then ends once T times it is below 1. None: all
-            Gaussians are visited.
 
     Returns:
         Real and imaginary part of R, arrays [batch * height * width], row-major. Differentiable in
         footprints, signal and ``blending``.
-
-    Raises:
-        ValueError: gradients of walks that end early, which are not bounded.
     """
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)
-    if reach is not None and dr.grad_enabled(columns, signal):
-        raise ValueError(
-            "blend: walks that end early give no gradients; leave skip.early_stop_tolerance at 0 in training"
-        )
     shared = batch > 1 and dr.width(footprints.radius) == n
-    result: tuple[Any, Any] = dr.custom(
-        _Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal, reach
-    )
+    result: tuple[Any, Any] = dr.custom(_Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal)
     return result

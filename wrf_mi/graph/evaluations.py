@@ -18,7 +18,6 @@ from ..core.registry import resolve
 from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
-from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
 from ..tracing.field_calculator import Complex
 from .settings import SPLATTED, TRACED, TracedConfig
@@ -53,7 +52,6 @@ class Evaluation:
         plane: Plane,
         sphere: bool,
         params: Mapping[str, Any],
-        skip: Skip = NOTHING,
     ) -> Complex:
         """Real and imaginary part [batch * directions], see `learned_field`.
 
@@ -63,9 +61,8 @@ class Evaluation:
             plane: pixels of a hemisphere.
             sphere: the lower hemisphere too.
             params: parameters of the graph by name, those of the scene's materials among them.
-            skip: parts that are not evaluated; ``traced`` evaluates all.
         """
-        return learned_field(gaussians, pose, plane, sphere, skip)
+        return learned_field(gaussians, pose, plane, sphere)
 
     def release(self) -> None:
         """Drop the references that the last call kept for its reverse pass."""
@@ -88,9 +85,7 @@ def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluat
     return made
 
 
-def learned_field(
-    gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False, skip: Skip = NOTHING
-) -> Complex:
+def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:
     """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
 
     Args:
@@ -98,16 +93,15 @@ def learned_field(
         pose: pose of the receiver.
         plane: pixels of a hemisphere.
         sphere: the lower hemisphere too, as seen by the receiver after half a turn about its x axis.
-        skip: parts that are not evaluated, with bounds on the error of each direction's signal.
 
     Returns:
         Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
         hemisphere, then those of the lower one, see `hemisphere_pair`.
     """
-    upper = splat(gaussians, pose, plane, skip)
+    upper = splat(gaussians, pose, plane)
     if not sphere:
         return upper
-    lower = splat(gaussians, facing_down(pose), plane, skip)
+    lower = splat(gaussians, facing_down(pose), plane)
     tensor_type: Any = dr.tensor_t(type(upper[0]))
     shape = (gaussians.batch, plane.pixels)
     re, im = (

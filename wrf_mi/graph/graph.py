@@ -29,7 +29,6 @@ from ..gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
 from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component
-from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
 from ..tracing.options import TraceOptions
 from ..tracing.polarization import check_polarization
@@ -207,7 +206,6 @@ class Graph:
         number: int,
         side: TracedField | None,
         learned: bool = True,
-        skip: Skip = NOTHING,
         chunked: bool = False,
     ) -> Report:
         """Reports of a receiver as a function of parameters, for transmitters of a traced side.
@@ -216,7 +214,6 @@ class Graph:
             number: number of the receiver.
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
-            skip: parts of the Gaussians that are not evaluated.
             chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
         """
         model, receiver = self.models[number], self.receivers[number]
@@ -228,7 +225,7 @@ class Graph:
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if moves else batch.pose
             gaussians = self.gaussians(params, batch, paths, chunked)
-            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params, skip))
+            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params))
 
         return report
 

@@ -34,7 +34,7 @@ from ..models import Model, known_model
 from ..models.model import Arrays
 from ..training.trainer import check_rows
 
-FORMAT = 3
+FORMAT = 4
 """Version of ``config.yaml`` and ``model.npz``."""
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
 OLD = ("hybrid.npz", "fitted.npz")

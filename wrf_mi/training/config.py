@@ -13,9 +13,8 @@ from pydantic import Field
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
 from ..gaussians.encoding import unambiguous_scale
-from ..gaussians.skip import Skip
 from ..graph.receivers import AUTO
-from ..graph.settings import SPLATTED, TRACED, EvaluationName, TracedConfig
+from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
 from .loop_config import AdamConfig, LoopConfig
 
 AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
@@ -189,9 +188,8 @@ class TrainConfig(LoopConfig):
             ``"auto"``: array with a scene, else pixel. For signal strengths ``"power"``, for channels ``"csi"``.
         evaluation: evaluation of Gaussians in steps and predictions: ``"splatted"``, or ``"traced"`` by ``mi.render``
             with the Mitsuba plugins, where walls of a scene attenuate what lies behind them; a step then takes several
-            times as long, and nothing is skipped.
+            times as long.
         view: directions of an antenna, where observations are not spectra.
-        skip: contributions that predictions omit, and the largest error of a grey; steps evaluate all.
         traced: paths that are trained together with the Gaussians, where a scene is given.
     """
 
@@ -208,7 +206,6 @@ class TrainConfig(LoopConfig):
     receiver: str = AUTO
     evaluation: EvaluationName = SPLATTED
     view: ViewConfig = field(default_factory=ViewConfig)
-    skip: Skip = field(default_factory=Skip)
     traced: TracedConfig = field(default_factory=TracedConfig)
 
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
@@ -230,10 +227,6 @@ class TrainConfig(LoopConfig):
         nearest, farthest = self.initial.nearest_m, self.initial.farthest_m
         if nearest > farthest:
             raise InputError(f"setting initial.nearest_m: {nearest} is beyond initial.farthest_m, {farthest}")
-        if self.evaluation == TRACED and self.skip.error:
-            raise InputError(
-                "settings skip.contribution and skip.early_stop_tolerance belong to evaluation=splatted; set them to 0"
-            )
 
 
 PAPER = (

@@ -22,7 +22,6 @@ from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.chunks import CHUNK_SIZE
 from ..gaussians.parameters import Gaussians
-from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
@@ -49,9 +48,8 @@ class Predictor:
         receivers: the receivers to predict for.
         height: rows of a spectrum.
         width: columns of a spectrum.
-        skip: contributions that are not evaluated.
         operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear map
-            from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction. It ignores ``skip``.
+            from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction.
         store: folder in which operators are stored; None: in memory only.
         graph: graph of the field, these receivers and a scene; None: the field alone, with pixel receivers.
         reach: region in which the Gaussians are used; None: everywhere.
@@ -64,7 +62,6 @@ class Predictor:
         receivers: Sequence[Receiver],
         height: int,
         width: int,
-        skip: Skip = NOTHING,
         operator: bool = False,
         store: Path | None = None,
         graph: Graph | None = None,
@@ -77,7 +74,7 @@ class Predictor:
         self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
         self._poses = [device_pose(r) for r in self.receivers]
         self._plane = perception_plane(height, width, mi.Float)
-        self._field, self._skip, self._count = field, skip, -1
+        self._field, self._count = field, -1
         self._by_operator, self._store = operator and self._pixels and getattr(field, "static_geometry", False), store
         self._reports: dict[int | None, Recorded] = {}
         self._together = 1 if self._pixels else TOGETHER
@@ -138,7 +135,7 @@ class Predictor:
     ) -> Any:
         """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         learned = side is None or weight is None or bool(np.any(weight))
-        report, pose = self.graph.report(receiver, side, learned, self._skip), self._poses[receiver]
+        report, pose = self.graph.report(receiver, side, learned), self._poses[receiver]
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
 
     def of_side(
@@ -170,11 +167,11 @@ class Predictor:
         """
         pose, count = self._poses[receiver], condition.shape[1]
         if self._count * self._together > CHUNK_SIZE:
-            report = self.graph.report(receiver, None, skip=self._skip, chunked=True)
+            report = self.graph.report(receiver, None, chunked=True)
             return evaluated(report, self._params, condition, receiver, pose, self._plane, weight=weight)
         key = None if self._pixels else receiver  # one recording serves the pixels of all receivers
         if key not in self._reports:
-            report = self.graph.report(receiver, None, skip=self._skip)
+            report = self.graph.report(receiver, None)
 
             def predicted(params: Params, batch: Batch) -> Any:
                 with dr.suspend_grad():

@@ -23,7 +23,6 @@ from ..core import Receiver
 from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
-from ..gaussians.skip import NOTHING, Skip
 from ..gaussians.tiles import Plane
 from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Field, Report
@@ -45,9 +44,9 @@ def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
     return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
 
 
-def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane, skip: Skip = NOTHING) -> Any:
+def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane) -> Any:
     """Spectrum |R| of the pixel receiver, [batch * height * width], row-major, of transmitters [3, batch] in metres."""
-    re, im = splat(field.gaussians(params, tx_pos), pose, plane, skip)
+    re, im = splat(field.gaussians(params, tx_pos), pose, plane)
     return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
 
 

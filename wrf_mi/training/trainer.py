@@ -244,7 +244,7 @@ class Trainer(TrainingLoop):
         if self._predictor is None:
             params, graph = self.state.mean_params(), self.graph
             size = graph.form.size
-            self._predictor = Predictor(graph.field, params, graph.receivers, *size, self.config.skip, graph=graph)
+            self._predictor = Predictor(graph.field, params, graph.receivers, *size, graph=graph)
         else:
             self._predictor.update(self.state.mean)
         self._predictor.reach = self.reach()
