@@ -57,18 +57,18 @@ def result(case: str, median: float) -> dict[str, object]:
 
 
 def test_table_has_a_line_for_each_result() -> None:
-    text = table([result("wrf-gs-official", 0.91), result("demo", 0.97)])
+    text = table([result("wrf-gs+-paper", 0.91), result("demo", 0.97)])
     assert len(text.splitlines()) == 4
     assert (
-        "| WRF-GS, authors' split | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB |"
+        "| WRF-GS+, L = 9 as the paper | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB |"
         in text
     )
 
 
 def test_results_come_in_the_order_of_the_cases(tmp_path: Path) -> None:
-    for case in ("demo", "wrf-gs-official"):
+    for case in ("demo", "wrf-gs+-paper"):
         (tmp_path / f"{case}.json").write_text(json.dumps(result(case, 0.9)))
-    assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs-official", "demo"]
+    assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs+-paper", "demo"]
 
 
 def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:

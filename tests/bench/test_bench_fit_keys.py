@@ -19,7 +19,7 @@ def other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_key, "versions", lambda: before() | {"drjit": "0.1"})
 
 
-@pytest.mark.parametrize("name", ["wrf-gs-official", "flat-plan"])
+@pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])
 def test_case_folder_depends_on_data_and_versions(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
     monkeypatch.setattr(bench, "dataset_files", lambda dataset: [data])
