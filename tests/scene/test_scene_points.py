@@ -71,10 +71,13 @@ def test_coordinates_that_are_not_metres_are_refused(factor: float, message: str
         check_extent(sampled(closed_box(), 1000) * factor, "scan.ply")
 
 
-def test_metres_far_from_the_origin_and_with_strays_pass() -> None:
+def test_metres_far_from_the_origin_pass_with_one_stray_but_not_with_many() -> None:
     points = sampled(closed_box(), 1000) + GRID
     points[0] += 5000.0
     check_extent(points, "scan.ply")
+    points[:100] += 5000.0
+    with pytest.raises(InputError, match="give --units mm"):
+        check_extent(points, "scan.ply")
 
 
 @pytest.mark.parametrize(

@@ -135,11 +135,15 @@ def test_the_mirrored_flat_is_refused(tmp_path: Path) -> None:
                 make_scene(mirrored, tmp_path / "scene", height_m=2.7, positions=flat / name)
 
 
-def test_positions_in_two_rooms_pass_through_their_door(tmp_path: Path) -> None:
+def test_positions_pass_through_the_door_between_two_rooms_and_not_through_walls(tmp_path: Path) -> None:
     """Positions in any order, as many as fill both rooms."""
     rng = np.random.default_rng(3)
     xy = rng.uniform([0.3, 0.3], [5.7, 3.7], (500, 2))
     xy = xy[np.abs(xy[:, 0] - 3.5) > 0.3]
     grid = write_grid(tmp_path / "map.npz", "top", TWO_ROOMS_M, np.array([[1.0, 1.0], [2.5, 3.0], [4.5, 1.4]]))
     positions = write_positions(tmp_path / "places.csv", xy)
-    make_scene(grid, tmp_path / "scene", height_m=2.5, positions=positions)
+    made = make_scene(grid, tmp_path / "scene", height_m=2.5, positions=positions)
+    assert made.counts["surfaces"] == len(TWO_ROOMS_M) + 2  # floor and ceiling
+    shifted = write_positions(tmp_path / "shifted.csv", xy + np.array([0.0, 1.5]))
+    with pytest.raises(InputError, match="cross walls"):
+        make_scene(grid, tmp_path / "refused", height_m=2.5, positions=shifted)
