@@ -1,20 +1,16 @@
 """Walls of a flat from a robot's map."""
 
-import os
 from pathlib import Path
 
 import pytest
+from changed_folders import DATA, needs
 
 from wrf_mi.scene.plan import layout_walls
 from wrf_mi.scene.plan_sources import PlanGrid, read_layout
 from wrf_mi.scene.plan_walls import find_walls
 
-DATA = os.environ.get("WRF_MI_DATA")
 
-
-@pytest.mark.skipif(
-    not DATA or not Path(DATA, "flat-ble", "lidar").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/lidar/"
-)
+@needs("flat-ble/lidar")
 def test_walls_from_a_robots_map_agree_with_the_layout():
     from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 

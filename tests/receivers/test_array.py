@@ -1,10 +1,8 @@
 """Array response and Bartlett spectrum against closed forms, and against measured spectra."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from changed_folders import DATA, needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import speed_of_light
@@ -40,10 +38,7 @@ ARRAYS = {
     "coinciding": np.array([[0.2, 0, 0], [0.2, 0, 0], [-0.2, 0, 0], [-0.2, 0, 0.0]]),
 }
 
-DATA = os.environ.get("WRF_MI_DATA")
-needs_data = pytest.mark.skipif(
-    not DATA or not Path(DATA, "rfid-lab").is_dir(), reason="WRF_MI_DATA names no folder with rfid-lab/"
-)
+needs_data = needs("rfid-lab")
 
 
 def test_planar_array_is_a_centred_grid():
@@ -98,7 +93,7 @@ def test_minmax_scale_maps_constant_images_to_zero():
 @pytest.mark.parametrize(("first_row", "obeys"), [(0, True), (1, False)])
 def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, obeys: bool):
     """Squared, they lie in the span of the array's 49 lag harmonics; with elevations 1 to 90 they would not."""
-    squared = load(Path(DATA or "", "rfid-lab")).observation[0].astype(float).reshape(200, -1) ** 2
+    squared = load(DATA / "rfid-lab").observation[0].astype(float).reshape(200, -1) ** 2
     u = unit_vectors(np.radians(np.arange(360))[None, :], np.radians(np.arange(90) + first_row)[:, None])
     lags = np.array([(a, b) for a in range(-3, 4) for b in range(-3, 4) if (a, b) > (0, 0)])
     phase = 2 * np.pi * FREQUENCY_HZ / speed_of_light * SPACING_M * (u.reshape(-1, 3)[:, :2] @ lags.T)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from changed_folders import needs
 
 from wrf_mi.core import InputError, unit_vectors
 from wrf_mi.core.arrays import planar_array
@@ -21,10 +19,7 @@ HEIGHT, WIDTH = 30, 120
 PHASE_DEG = np.array([0, 50, -20, 70, 0, -60, 30, 10, -80, 45, -35, 15, 0, 60, -10, -25])
 AMPLITUDE = np.array([1.3, 0.7, 1.0, 0.8, 1.2, 1.1, 0.9, 1.0, 0.8, 1.2, 0.7, 1.1, 0.9, 1.0, 1.3, 0.8])
 
-DATA = os.environ.get("WRF_MI_DATA")
-needs_data = pytest.mark.skipif(
-    not DATA or not Path(DATA, "rfid-lab").is_dir(), reason="WRF_MI_DATA names no folder with rfid-lab/"
-)
+needs_data = needs("rfid-lab")
 
 
 def walk(rows: int = 50) -> tuple[np.ndarray, np.ndarray]:

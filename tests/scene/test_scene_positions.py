@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import shapely
 import trimesh
 from calling import call
+from changed_folders import DATA, needs
 from made_plans import TWO_ROOMS_M, grid_of
 
 from wrf_mi.core import InputError
@@ -18,7 +18,6 @@ from wrf_mi.scene.plan_sources import read_layout
 from wrf_mi.scene.positions import conflicts, read_positions
 from wrf_mi.scene.surfaces import Surface
 
-DATA = os.environ.get("WRF_MI_DATA")
 OFFICE_M = np.array([[0, 0], [9, 0], [9, 3], [5, 3], [5, 7], [0, 7], [0, 0]], float)
 """An office whose wings have different widths; with `PARTITIONS_M`."""
 PARTITIONS_M = (np.array([[0, 3], [1, 3]]), np.array([[2, 3], [5, 3]]), np.array([[6.5, 0], [6.5, 1.5]]))
@@ -121,11 +120,9 @@ def test_positions_from_a_file(tmp_path: Path) -> None:
         read_positions(tmp_path / "none.csv")
 
 
-@pytest.mark.skipif(
-    not DATA or not Path(DATA, "flat-ble").is_dir(), reason="WRF_MI_DATA names no folder with flat-ble/"
-)
+@needs("flat-ble")
 def test_the_mirrored_flat_is_refused(tmp_path: Path) -> None:
-    flat = Path(str(DATA), "flat-ble")
+    flat = DATA / "flat-ble"
     vertices = read_layout(flat / "layout.csv")
     for name in ("calibration_df.csv", "test_robot_df.csv"):
         make_scene(flat / "layout.csv", tmp_path / name, height_m=2.7, positions=flat / name)

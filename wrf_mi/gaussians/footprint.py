@@ -62,6 +62,11 @@ def dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
     return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
 
 
+def cross(a: list[Any], b: list[Any]) -> list[Any]:
+    """Vector product of two vectors, each three arrays."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
 def tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
     """Two unit vectors perpendicular to n and to each other (Duff et al. 2017, J. Comput. Graph. Techn. 6)."""
     x, y, z = n

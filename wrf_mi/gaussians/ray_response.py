@@ -24,7 +24,7 @@ from typing import Any
 
 import drjit as dr
 
-from .footprint import Pose, centre_distance, dot, principal_axes, tangent_basis
+from .footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
 from .footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from .parameters import Gaussians
 
@@ -82,10 +82,6 @@ def _combine(weights: list[Any], vectors: list[list[Any]]) -> list[Any]:
     return [dot(weights, [v[i] for v in vectors]) for i in range(3)]
 
 
-def _cross(a: list[Any], b: list[Any]) -> list[Any]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
 def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     """Responses of Gaussians along a receiver's rays. Differentiable in position, scale, rotation and pose.
 
@@ -126,7 +122,7 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
     a, b = _perpendicular(*([c * distance for c in _combine(row, whiten)] for row in (first, second)))
     g3 = [c / length for c in _combine(third, whiten)]
     # Dual vectors of a and b in the tangent plane give the lean.
-    to_first, to_second = _cross(b, safe), _cross(safe, a)
+    to_first, to_second = cross(b, safe), cross(safe, a)
     determinant = dot(a, to_first)
     mahalanobis = length * distance
     mask: Any = dr.mask_t(single)

@@ -19,7 +19,7 @@ from scipy.constants import speed_of_light
 
 from ..core import Antenna
 from ..core.antenna import ANTENNA
-from ..gaussians.footprint import Pose, dot, tangent_basis
+from ..gaussians.footprint import Pose, cross, dot, tangent_basis
 from .slab import slab
 
 ALONG = 1e-12
@@ -156,12 +156,12 @@ def _interact(
     c = slab(cosine, permittivity, conductivity, thickness_m, frequency_hz)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
-    across = _cross(before, level.normal)
+    across = cross(before, level.normal)
     square = dot(across, across)
     oblique: Any = square > ALONG
     scale = dr.rsqrt(dr.select(oblique, square, 1))
     across = [dr.select(oblique, c * scale, a) for c, a in zip(across, tangent_basis(before)[0], strict=True)]
-    along_before, along_after = _cross(across, before), _cross(across, after)
+    along_before, along_after = cross(across, before), cross(across, after)
     (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
     s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
     p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
@@ -185,7 +185,3 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     """
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

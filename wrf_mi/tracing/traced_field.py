@@ -30,6 +30,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..gaussians.footprint import Pose
+from ..gaussians.recurrence import times
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
@@ -242,10 +243,10 @@ class TracedField:
         if self.gain_name in parameters:
             amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
         sine, cosine = dr.sincos(phase)
-        gain = _times(paths.gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
+        gain = times(paths.gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
         for name, direction in ((self.pattern_name, paths.arrival), (TX_PATTERN, paths.departure)):
             if name in parameters:
-                gain = _times(gain, pattern_factor(parameters[name], direction))
+                gain = times(gain, pattern_factor(parameters[name], direction))
         return TracedPaths(gain, paths.length_m, paths.arrival, batch, self._each)
 
     def pose(self, parameters: Mapping[str, Any], float_type: Any = mi.Float) -> Pose:
@@ -333,7 +334,3 @@ def _spread(pose: Pose, count: int) -> Pose:
     table = dr.concat([*pose.position, *(c for row in pose.to_world for c in row)])
     wide = [dr.gather(Float64, table, dr.full(mi.UInt32, i, count)) for i in range(12)]
     return Pose(wide[:3], [wide[3:6], wide[6:9], wide[9:12]])
-
-
-def _times(a: Complex, b: Complex) -> Complex:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
@@ -18,12 +16,6 @@ from wrf_mi.tasks.scores import summary
 
 EXACT = 1e-9
 """Systems of a few dozen rows, condition 1e4, in float64."""
-
-DATA = Path(os.environ.get("WRF_MI_DATA", "/nowhere"))
-
-
-def needs(name: str) -> pytest.MarkDecorator:
-    return pytest.mark.skipif(not (DATA / name).is_dir(), reason=f"WRF_MI_DATA names no folder with {name}/")
 
 
 def chosen(model: Kriged) -> dict[str, float]:

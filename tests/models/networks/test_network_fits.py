@@ -6,7 +6,6 @@ and held-out spectra are predicted better than by the mean training spectrum (0.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from changed_folders import needs
 from scipy.constants import speed_of_light
 from small_fits import network_settings
 
@@ -39,12 +39,6 @@ MRI_DB = 4.17
 """Median absolute error of a log-distance fit on flat-ble."""
 SAME = 1e-5
 """Sums in float32 whose order may differ."""
-
-DATA = Path(os.environ.get("WRF_MI_DATA", "/nowhere"))
-
-
-def needs(name: str) -> pytest.MarkDecorator:
-    return pytest.mark.skipif(not (DATA / name).is_dir(), reason=f"WRF_MI_DATA names no folder with {name}/")
 
 
 SMALL: dict[str, tuple[Model, Any]] = {

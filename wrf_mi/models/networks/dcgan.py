@@ -34,8 +34,9 @@ from pydantic import Field
 from ...backend.device import to_float, to_tensor
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
+from ...gaussians.parameters import logistic
 from ...training.loop_config import AdamConfig
-from .layers import GAIN, Linear, Module, columns, feature_count, relu, sigmoid
+from .layers import GAIN, Linear, Module, columns, feature_count, relu
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 
@@ -257,7 +258,7 @@ class Generator(Module):
         x = dr.reshape(x, (self.channels, grid.columns))
         for norm, layer in zip(self.norm, self.layers, strict=True):
             x, grid = finer(layer(relu(norm(x, grid)), grid), grid)
-        return sigmoid(resized(x, grid, *self.shape)[0])
+        return logistic(resized(x, grid, *self.shape)[0])
 
     def spectra(self, where: Any) -> Any:
         """Spectra without noise, a flat array, from features of positions [features, m]."""

@@ -118,11 +118,6 @@ class Mlp(Module):
         return x if self.out is None else self.out(x)
 
 
-def sigmoid(x: Any) -> Any:
-    """1 / (1 + exp(-x))."""
-    return dr.rcp(1 + dr.exp(-x))
-
-
 def columns(x: Any, picked: Any) -> Any:
     """Columns of a tensor [size, n] by index, [size, batch]."""
     # `dr.take` drops the axis for a single index.

@@ -31,7 +31,8 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 
 from ...core.settings import Count, Positive
-from .layers import Linear, Mlp, Module, feature_count, relu, sigmoid, with_encoding
+from ...gaussians.parameters import logistic
+from .layers import Linear, Mlp, Module, feature_count, relu, with_encoding
 
 LEAK = 0.01
 """Slope of the leaky ReLU below zero, PyTorch's default."""
@@ -178,8 +179,8 @@ def strength(x: Any) -> Any:
 
 
 def phase(x: Any) -> Any:
-    """2 pi sigmoid, radians."""
-    return 2 * dr.pi * sigmoid(x)
+    """2 pi times the logistic function, radians."""
+    return 2 * dr.pi * logistic(x)
 
 
 def constant_parts(

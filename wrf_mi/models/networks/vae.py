@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from ...backend.device import to_tensor
 from ...core.settings import Count, Positive, Share
 from ...core.types import IntArray
-from .layers import Linear, Mlp, Module, columns, feature_count, sigmoid
+from ...gaussians.parameters import logistic
+from .layers import Linear, Mlp, Module, columns, feature_count
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, opaque_rows
 
@@ -82,7 +83,7 @@ class Decoder(Mlp):
 
     def spectra(self, where: Any) -> Any:
         """Spectra at the prior's mean, z = 0, a flat array, from features of positions [features, m]."""
-        pixels = sigmoid(self(latent=dr.zeros(type(where), (self.size, where.shape[1])), position=where))
+        pixels = logistic(self(latent=dr.zeros(type(where), (self.size, where.shape[1])), position=where))
         return dr.moveaxis(pixels, 0, 1).array
 
 
@@ -116,7 +117,7 @@ def elbo_loss(vae: Vae, data: Any, given: Any, s: VaeSettings) -> Any:
     divergence = normal_divergence(mean, log_variance)
     # One product for both, since the decoder's last matrix is the large one.
     latent, both = dr.concat([latent, given["prior"]], axis=1), dr.concat([where, where], axis=1)
-    greys, batch = sigmoid(vae.p(latent=latent, position=both)), mean.shape[1]
+    greys, batch = logistic(vae.p(latent=latent, position=both)), mean.shape[1]
     error = dr.mean(dr.square(greys[:, :batch] - truth), axis=None)
     free = dr.mean(dr.square(greys[:, batch:] - truth), axis=None)
     likelihood = ((1 - s.prior_share) * error + s.prior_share * free) / (2 * s.noise * s.noise)
