@@ -254,7 +254,7 @@ def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
     return stored(CASES), stored(CHECKS)
 
 
-CHECK_NOTE = "Checks against what others made, or against what a part is held to:"
+CHECK_NOTE = "Checks against other programs, or against bounds:"
 
 NOTE = (
     "SSIM is scikit-image's, over test rows; *IDW* is inverse-distance weighting of the four nearest training spectra "

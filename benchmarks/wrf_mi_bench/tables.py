@@ -130,7 +130,7 @@ def tables(
 ) -> list[dict[str, Any]]:
     """Measure all rows that are not stored yet and write tables and pictures.
 
-    A row whose command fails is reported and left out; the others go on.
+    A row whose command fails is reported and omitted; the other rows are measured.
 
     Returns:
         All stored rows.

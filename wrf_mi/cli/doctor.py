@@ -121,7 +121,7 @@ def install_llvm() -> None:
 
 
 def doctor_command(a: Arguments) -> int:
-    """Report on this machine, after installing LLVM where that is asked for."""
+    """Report on this machine; with ``--install-llvm`` LLVM is installed first."""
     if a.install_llvm:
         install_llvm()
     found = report()

@@ -33,7 +33,7 @@ def add_parser(commands: Any) -> None:
 
 
 def train_command(a: Arguments) -> int:
-    """Fit any model, or go on with a stopped fit."""
+    """Fit any model, or continue a stopped fit."""
     if a.help_settings:
         print(_settings_text())
         return 0

@@ -32,7 +32,7 @@ class Layout:
         task: task of its records (`wrf_mi.core.Record`).
         reader: ``module:function`` of type `Read`, or the function.
         files: names of files; a folder with any of them has this layout.
-        suffixes: endings of files that are read by themselves, alone or in a folder without any layout's ``files``.
+        suffixes: endings of files that are data sets, alone or in a folder without any layout's ``files``.
     """
 
     name: str
@@ -81,5 +81,5 @@ def layout_of(path: Path) -> Layout:
 
 
 def is_data(path: Path) -> bool:
-    """Whether a path is a folder, or a file that a layout reads by itself."""
+    """Whether a path is a folder, or a file that is a data set of a layout."""
     return path.is_dir() or (path.is_file() and any(path.suffix in layout.suffixes for layout in layouts()))

@@ -93,7 +93,7 @@ def ray_bundles(direction: list[Any], height: int, width: int) -> Bundles:
         place=on_device(np.flatnonzero(inside)[np.argsort(lanes[inside])], index_type),
         bundle=dr.arange(index_type, lanes.shape[1]) // (size // tile[2]),
         axis=axis,
-        # A single ray is its own axis; else float32 directions are good to 1e-7.
+        # A single ray is its own axis; else float32 directions are accurate to 1e-7.
         margin_rad=margin + 1e-5 if size > 1 else 0.0,
     )
     dr.eval(result.direction, result.ray, result.active, result.place, result.bundle)

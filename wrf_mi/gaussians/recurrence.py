@@ -30,7 +30,7 @@ Pair = tuple[Any, Any]
 SMALLEST_FACTOR = 1e-4
 """|b| below this is replaced in the derivative's quotient Q / b, of which both then vanish.
 
-In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is good to 1e-3 at this bound.
+In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is accurate to 1e-3 at this bound.
 """
 
 

@@ -8,8 +8,8 @@ and r_-l = conj(r_l). So P is linear in the real vector (r_0, sqrt2 Re r_l, sqrt
 has as many numbers as the array has differences: (2 a - 1)(2 b - 1) of a regular a x b array, 49 of a 4 x 4. Signals
 that are not coherent add in r, not in h: lags also describe the mean of many snapshots.
 
-Lags are unique only where the directions tell them apart: neighbours half a wavelength apart or less, and in the plane,
-as elements of a planar array do not tell u_z from -u_z.
+Lags are unique only where the directions distinguish them: neighbours half a wavelength apart or less, and in the
+plane, as elements of a planar array do not distinguish u_z from -u_z.
 
 Source: Van Trees, "Optimum Array Processing" (2002), sections 3.1.3 and 5.1 (difference co-array).
 """
@@ -29,7 +29,7 @@ from ..core.types import IntArray
 SAME_LAG = 1e-6
 """Differences closer than this share of the array's extent are one lag: positions in files have six digits."""
 LEAST_CONDITION = 1e-7
-"""Singular values below this share of the greatest: the directions do not tell the lags apart."""
+"""Singular values below this share of the greatest: the directions do not distinguish the lags."""
 
 
 class Lags:

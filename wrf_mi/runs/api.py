@@ -179,7 +179,7 @@ def train(
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
         on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
-        stop: called wherever nothing would be lost; True ends the run, and `resume` goes on with it.
+        stop: called wherever nothing would be lost; True ends the run, and `resume` continues it.
         scheduler: computes parts of the work of models that have some (ray tracing), with the same result; None: this
             process. Its workers must see the scene under the same name.
         progress: show bars on standard error where the tracer takes time.
@@ -189,7 +189,7 @@ def train(
 
     Raises:
         InputError: data, scene, settings or folder that cannot be used; nothing is left on the disk.
-        Interrupted: ``stop`` ended the run; go on with `resume`.
+        Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
     """
     folder = Path(out)
@@ -220,7 +220,7 @@ def resume(
     progress: bool = False,
     record: Record | None = None,
 ) -> Run:
-    """Go on with a stopped run; what is fitted is only scored again. Arguments as those of `train` and `open_run`.
+    """Continue a stopped run; fitted parts are only scored again. Arguments as those of `train` and `open_run`.
 
     Raises:
         InputError: not a run folder, or one of version 0.1.

@@ -5,7 +5,7 @@
     OUT/scores.csv, scores.md, scores.json      the table
 
 Each run is ``wrf-mi train`` in a subprocess, here or on the workers of a scheduler. A finished run is kept, a stopped
-run goes on from its checkpoint. A folder made with other data, scenes or versions of packages is refused.
+run continues from its checkpoint. A folder made with other data, scenes or versions of packages is refused.
 """
 
 from __future__ import annotations

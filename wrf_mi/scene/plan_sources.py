@@ -40,7 +40,7 @@ class PlanGrid:
 
     Attributes:
         occupied: cells where something stands, shape [rows, columns].
-        free: cells seen empty, same shape; without any, nothing is known about openings and hidden places.
+        free: cells seen empty, same shape; without any, openings and hidden places are unknown.
         resolution_m: side of a cell.
         origin_m: lower left corner, shape [2].
     """
@@ -88,7 +88,7 @@ def grid_from_probability(
 
 
 def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: str = "points") -> PlanGrid:
-    """A grid of the cells that hold points [n, 2]; none is free, since points do not tell what was seen empty.
+    """A grid of the cells that hold points [n, 2]; none is free, since points do not show which cells are empty.
 
     Raises:
         InputError: no points, or more cells than `LARGEST_GRID_CELLS`.

@@ -28,7 +28,7 @@ LARGEST_RMS_M = 0.3
 SPREAD = 0.05
 """Least ratio of the second to the first extent of pairs; with less they lie on a line."""
 SMALLEST_EXTENT_M = 0.1
-"""Least extent of pairs; with less they tell no rotation."""
+"""Least extent of pairs; with less they determine no rotation."""
 SAME_M = 0.3
 """Largest rms distance between the points in two poses that count as equal."""
 MOST_POINTS = 1500

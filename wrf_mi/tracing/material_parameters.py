@@ -4,7 +4,7 @@ Relative permittivity 1 + exp(x), conductivity exp(y) in S/m and thickness exp(z
 changes each by a factor, and permittivity > 1, conductivity > 0, thickness > 0 hold by construction.
 
 A scene has them for each of its named materials or, started from those, for each of its surfaces, the faces of an
-object in a plane. The thickness is a parameter only where it is asked for.
+object in a plane. The thickness is an optional parameter.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class SlabMaterials:
     grouping: MaterialGrouping = "named"
 
     def parameters(self, thickness: bool = False) -> dict[str, NDArray[np.float32]]:
-        """Parameters x, y and, where asked for, z: of each material [1], or of all surfaces [n]."""
+        """Parameters x, y and, with the thickness, z: of each material [1], or of all surfaces [n]."""
         values = {
             "permittivity": np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)),
             "conductivity": np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)),

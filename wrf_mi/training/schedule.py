@@ -37,7 +37,7 @@ class Schedule:
     first_stage: int = 0
 
     def after(self, best: int) -> tuple[Schedule, int]:
-        """The schedule that goes on from the best state before the validation rows join.
+        """The schedule that continues from the best state before the validation rows join.
 
         Args:
             best: step of that state.

@@ -1,4 +1,4 @@
-"""Methods that fit each receiver by itself from positions and headings."""
+"""Methods that fit each receiver separately from positions and headings."""
 
 from __future__ import annotations
 

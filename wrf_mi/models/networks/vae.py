@@ -8,7 +8,7 @@ output representation using deep conditional generative models" (2015). Chosen h
 - The likelihood is Gaussian. Its pixels are far from independent, so the Kullback-Leibler term is weighted against the
   mean over pixels (Higgins et al. 2017, beta-VAE).
 - Predictions decode z = 0, the prior's mean. The decoder is trained on z from the encoder and, as in Sohn et al.'s
-  hybrid objective, on z from the prior, so that it learns what the position tells.
+  hybrid objective, on z from the prior, so that it learns the effect of the position.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Both maps are over the same cells, distances times directions of a wave model's grid. The network is convolutional
 over the directions, with the distances as channels; without an array there is a single cell of directions, and it is
-fully connected over distances. It learns from simulated channels of few paths for the array and the bands at hand.
+fully connected over distances. It learns from simulated channels of few paths for the given array and bands.
 """
 
 from __future__ import annotations
