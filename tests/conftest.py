@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ init()  # before a test imports Dr.Jit
 
 if TYPE_CHECKING:
     from wrf_mi.core import Record
+    from wrf_mi.parallel import Scheduler
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -73,3 +75,22 @@ def flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def plain_flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same without headings, with heights that differ and anchors that have names."""
     return write_plain_flat(tmp_path_factory.mktemp("data") / "plain")
+
+
+@pytest.fixture(scope="module")
+def two() -> Iterator[Scheduler]:
+    """Two workers on this machine."""
+    from wrf_mi.parallel import open_scheduler
+
+    with open_scheduler("local:2") as workers:
+        yield workers
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Time [s] of `wrf_mi.runs.timing`, which calls advance."""
+    from wrf_mi.runs import timing
+
+    now = [0.0]
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    return now

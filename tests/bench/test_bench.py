@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ from wrf_mi_bench.stress_rows import STAGES, summary_table
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
-from wrf_mi.parallel import Scheduler, open_scheduler
+from wrf_mi.parallel import Scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
@@ -99,12 +98,6 @@ def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: 
     assert json.loads((tmp_path / "out.json").read_text()) == figures
     line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
     assert line == "| mesh: walls | **0.9** | 0.8 |"
-
-
-@pytest.fixture(scope="module")
-def two() -> Iterator[Scheduler]:
-    with open_scheduler("local:2") as workers:
-        yield workers
 
 
 def test_bench_on_workers_writes_figures_and_reports_failures(

@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
 
-from wrf_mi.runs import timing
 from wrf_mi.runs.timing import (
     Interval,
     n_log_n,
 )
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Time that stands still but for what calls add to it."""
-    now = [0.0]
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-    return now
 
 
 def test_growth_beyond_n_log_n_is_reported(clock: list[float]) -> None:

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -23,13 +22,6 @@ from wrf_mi.parallel.worker import WorkerEnvironment, worker_environment
 
 SECONDS = 60
 """For a process of ours to start on a busy machine."""
-
-
-@pytest.fixture(scope="module")
-def two() -> Iterator[Scheduler]:
-    """Two workers on this machine."""
-    with open_scheduler("local:2") as workers:
-        yield workers
 
 
 @pytest.mark.parametrize(("count", "workers", "least", "most"), [(1, 3, 1, 9), (100, 2, 1, 1000), (100, 2, 30, 60)])

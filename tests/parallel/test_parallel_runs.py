@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from wrf_mi import parallel
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.models import ray_tracing
-from wrf_mi.parallel import Scheduler, open_scheduler
+from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.api import predict_to_file, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
@@ -29,12 +28,6 @@ PRODUCTS = 1e-5
 """Share of the largest value by which physics models and operators may differ: a product of matrices adds in an order
 that depends on how many columns it has. Splatted fields and traces are bit-identical."""
 POSITIONS = 12
-
-
-@pytest.fixture(scope="module")
-def two() -> Iterator[Scheduler]:
-    with open_scheduler("local:2") as workers:
-        yield workers
 
 
 @pytest.fixture(scope="module")

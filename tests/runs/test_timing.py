@@ -37,14 +37,6 @@ def array() -> np.ndarray:
     return np.ones(ARRAY_MB * 1_000_000 // 8)
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Time that stands still but for what calls add to it."""
-    now = [0.0]
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-    return now
-
-
 def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
     rng = np.random.default_rng(0)
     few, many = (bootstrap(rng.normal(5, 1, n)) for n in (20, 2000))
