@@ -104,6 +104,7 @@ _OWN: Mapping[str, Check] = {
     "operator": _here("prediction by operator", "operator:main"),
     "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
+    "ingredients": _here("hybrid and its ingredients", "ingredients:main", RFID, FLAT, CONFERENCE, resumes=True),
     "sentinels": _here(
         "figures kept",
         "sentinels:main",

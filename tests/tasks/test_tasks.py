@@ -104,7 +104,7 @@ def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_
     installed: tuple[dict[str, str], Path], tmp_path: Path
 ) -> None:
     environment, data = installed
-    runs = [tmp_path / name for name in ("idw", "kriging")]
+    runs = [tmp_path / name for name in ("idw", "kriging", "hybrid")]
     for status, out, err in commands(environment, *(["train", data, "--model", r.name, "--out", r] for r in runs)):
         assert status == 0, err
         assert "absolute error (ns) on 10 test rows" in out
@@ -129,7 +129,7 @@ def test_unsupported_tasks_are_refused_in_one_line(installed: tuple[dict[str, st
     done = commands(environment, *(["train", data, "--model", model, "--out", tmp_path / model] for model in served))
     for (model, tasks), (status, _, err) in zip(served.items(), done, strict=True):
         assert (status, err.count("\n")) == (2, 1), err
-        assert f"holds delay-spread; {model} serves {tasks}, so choose another model: idw, kriging" in err
+        assert f"holds delay-spread; {model} serves {tasks}, so choose another model: hybrid, idw, kriging" in err
         assert not (tmp_path / model).exists()
 
 

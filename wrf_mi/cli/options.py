@@ -39,7 +39,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
     add("--model", choices=list(MODELS), help="model to fit (default: wrf-gs+); baselines: docs/baselines.md")
-    text = "scene to trace: jointly with wrf-gs, wrf-gs+ or factorised, for physics, or alone for ray-tracing"
+    text = "scene to trace: jointly with wrf-gs, wrf-gs+, factorised, for physics and hybrid, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     add("--receiver", metavar="NAME", help=text)
@@ -50,6 +50,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
+    text = "calibrate predicted standard deviations on training rows held out in space (up to five more fits)"
+    add("--intervals", action="store_true", help=text)
     add("--preset", choices=("default", "paper", "quick"), help="named set of settings")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
 

@@ -40,7 +40,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if metrics.get("n_not_scored"):
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     if "inside_90" in metrics:
-        print(f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals")
+        share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
+        print(f"{share}, CRPS {metrics['crps']:.3g}")
     print(
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
         f"{metrics['ms_per_sample']:.2g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"

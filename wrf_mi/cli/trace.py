@@ -12,7 +12,8 @@ def add_parser(commands: Any) -> None:
     """Add ``trace`` to the commands."""
     text = "predict by ray tracing and score it like a learned field"
     parser = add_command(commands, "trace", trace_command, text)
-    parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[], deterministic=False)
+    parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
+    parser.set_defaults(deterministic=False, intervals=False)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)

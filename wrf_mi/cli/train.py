@@ -97,6 +97,7 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
         "model": model,
         "settings": settings,
         "deterministic": a.deterministic,
+        "intervals": a.intervals,
         "antennas": AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
         "split": "official" if a.split is None else a.split,
         "seed": a.seed or 0,

@@ -18,6 +18,7 @@ _OWN: Mapping[str, Model | str] = {
     "factorised": "wrf_mi.models.gaussian.model:FACTORISED",
     "physics": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
+    "hybrid": "wrf_mi.models.hybrid.model:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:MODEL",
     "kriging": "wrf_mi.models.interpolation.kriging:MODEL",
     "trees": "wrf_mi.models.interpolation.trees:MODEL",

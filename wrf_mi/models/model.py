@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.settings import settings_from
+from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..training.session import FitSession
@@ -235,6 +235,19 @@ class Model:
     def serving(self, task: str, with_scene: bool) -> Model:
         """The entry for data of a task, with or without a scene."""
         return self if self.by_data is None or not self.serves(task) else self.by_data(task, with_scene)
+
+
+def default_settings(entry: Model, settings: Iterable[str], given: Mapping[str, Any]) -> Any:
+    """Settings of a model with ``key=value`` applied after its defaults.
+
+    Args:
+        entry: model, as `Model.serving` gives it.
+        settings: ``key=value``.
+        given: arguments of `wrf_mi.train` that may be settings, too (`Model.given`).
+    """
+    kind: Any = entry.settings
+    stated = {name: value for name, value in given.items() if name in entry.given and value is not None}
+    return with_settings(kind(**stated), [*entry.defaults, *settings])
 
 
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:

@@ -47,11 +47,12 @@ from threadpoolctl import threadpool_limits
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
-from ..core.settings import with_settings
 from ..datasets import make_splits
 from ..datasets.observations import check_observations, place_of
 from ..models import MODELS, Model, Problem, Session, known_model
+from ..models.calibrated import with_intervals
 from ..models.checks import check_record
+from ..models.model import default_settings
 from ..parallel import Scheduler
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
@@ -74,8 +75,7 @@ def _settings_of(model: Model, settings: Settings, given: dict[str, Any]) -> Any
         found: Any = kind(**{field.name: getattr(settings, field.name) for field in fields(settings)})
     else:
         assert isinstance(settings, Iterable)
-        stated = {name: value for name, value in given.items() if name in model.given and value is not None}
-        found = with_settings(kind(**stated), [*model.defaults, *settings])
+        found = default_settings(model, settings, given)
     if "model" in model.given and found.model != model.name:
         raise InputError(f"setting model: {found.model}, where the model is {model.name}; choose it with --model")
     return found
@@ -95,6 +95,7 @@ def plan_run(
     seed: int = 0,
     settings: Settings = (),
     deterministic: bool = False,
+    intervals: bool = False,
     progress: bool = False,
 ) -> tuple[Problem, RunConfig, list[Split]]:
     """Problem, configuration and splits of a run; arguments and errors as those of `train`. Nothing is written."""
@@ -120,11 +121,12 @@ def plan_run(
         check_rows(rows, record, f"split {rows.name}")
         check_observations(record, rows, complete=chosen.complete)
     problem = Problem(record, found, seed, scene_name, material, antennas, not scene_only)
-    if chosen.check is not None:
-        chosen.check(problem, splits)
+    checked = with_intervals(chosen) if intervals else chosen
+    if checked.check is not None:
+        checked.check(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
-    options = (seed, scene_name, material, antennas, deterministic, found)
+    options = (seed, scene_name, material, antennas, deterministic, intervals, found)
     return problem, RunConfig(model, source, record.task, name, n_train, *options), splits
 
 
@@ -157,6 +159,7 @@ def train(
     seed: int = 0,
     settings: Settings = (),
     deterministic: bool = False,
+    intervals: bool = False,
     on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
     scheduler: Scheduler | None = None,
@@ -178,6 +181,8 @@ def train(
         seed: seed of split and fit.
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
+        intervals: calibrate the standard deviations of predictions on training rows that are held out in space; the
+            model is fitted up to five more times.
         on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
         stop: called wherever nothing would be lost; True ends the run, and `resume` continues it.
         scheduler: computes parts of the work of models that have some (ray tracing), with the same result; None: this
@@ -199,6 +204,7 @@ def train(
     traced: dict[str, Any] = {"scene": scene, "material": material, "antennas": antennas, "receiver": receiver}
     rows: dict[str, Any] = {"split": split, "n_train": n_train, "seed": seed, "evaluation": evaluation}
     fit: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
+    fit["intervals"] = intervals
     problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
     if config.deterministic:
         init("llvm", threads=1)

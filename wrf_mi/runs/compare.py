@@ -39,6 +39,7 @@ COLUMNS = {
     "p10": "p10",
     "p90": "p90",
     "inside_90": "inside 90 %",
+    "crps": "CRPS",
     "ms_per_sample": "ms per sample",
     "train_seconds": "training (s)",
     "peak_memory_mb": "peak memory (MB)",

@@ -23,7 +23,7 @@ from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.idw import IdwSettings
 from ..models.model import inputs_of
 from ..tasks import TASKS, UPLINK
-from ..tasks.scores import inside_interval, summary
+from ..tasks.scores import crps, inside_interval, summary
 from ..training.trainer import peak_memory_mb
 from .folder import METRICS, PREDICTIONS, RunConfig
 from .results import Observations, reference_key
@@ -76,9 +76,9 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
-        receivers ``receivers``, with standard deviations ``inside_90``, ``n_train``, ``n_test``, ``n_not_scored``,
-        ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite is not scored: its
-        truth is NaN.
+        receivers ``receivers``, with standard deviations ``inside_90`` and ``crps``, ``n_train``, ``n_test``,
+        ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite
+        is not scored: its truth is NaN.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
@@ -134,7 +134,8 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
             for r, name in enumerate(arrays["receiver_name"])
         }
     if "std" in arrays:
-        metrics["inside_90"] = inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
+        stated = arrays["prediction"], arrays["std"], arrays["truth"]
+        metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
     return metrics
 
 

@@ -31,6 +31,7 @@ from ..core.files import readable, stored_arrays, write_arrays, write_atomically
 from ..core.settings import settings_from
 from ..datasets import load_split, save_split
 from ..models import Model, known_model
+from ..models.calibrated import with_intervals
 from ..models.model import Arrays
 from ..training.trainer import check_rows
 
@@ -58,6 +59,7 @@ class RunConfig:
         material: radio material of a bare mesh, or None.
         antennas: antenna options that override the data set.
         deterministic: fitted on one thread of the CPU, bit-identical from run to run.
+        intervals: standard deviations are calibrated on held-out training rows (`wrf_mi.models.calibrated`).
         settings: all settings of the model.
     """
 
@@ -71,6 +73,7 @@ class RunConfig:
     material: str | None
     antennas: AntennaOptions
     deterministic: bool
+    intervals: bool
     settings: Any
 
     @cached_property
@@ -80,7 +83,8 @@ class RunConfig:
         Raises:
             InputError: no model of that name.
         """
-        return known_model(self.model).serving(self.task, self.scene is not None)
+        entry = known_model(self.model).serving(self.task, self.scene is not None)
+        return with_intervals(entry) if self.intervals else entry
 
 
 def package_versions() -> dict[str, str]:
@@ -121,7 +125,8 @@ def read_config(folder: Path) -> RunConfig:
         check_format(folder)
         names = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material")
         kept = {name: content[name] for name in names}
-        kept |= {"antennas": AntennaOptions(**content["antennas"]), "deterministic": bool(content["deterministic"])}
+        kept |= {"antennas": AntennaOptions(**content["antennas"])}
+        kept |= {name: bool(content.get(name)) for name in ("deterministic", "intervals")}
         config = RunConfig(**kept, settings=None)
         kind: Any = config.entry.settings
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))

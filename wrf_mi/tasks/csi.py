@@ -19,6 +19,7 @@ class Csi(Task):
 
     name = "csi"
     block, label, higher_is_better = "cea_db", "CEA (dB)", True
+    limits = -10.0, 40.0
     axes, more_axes, is_complex = 1, 1, True
     receiver = receiver_with_scene = "csi"
     from_uplink = "copy of the uplink"

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 from skimage.metrics import structural_similarity
 
 from ..core import InputError
@@ -13,6 +14,12 @@ from ..core.angles import FloatArray
 
 EXACT = np.finfo(float).eps ** 2
 """Smallest relative squared error that float64 resolves."""
+WINDOW = 7
+"""Side of the window of structural similarity in pixels, scikit-image's default."""
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Stabilising constants of Wang et al. (2004) for a data range of one."""
+SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)
+"""Sample variance of a window over its variance."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
 
@@ -35,8 +42,8 @@ def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     predicted, expected = np.asarray(prediction, float), np.asarray(truth, float)
     _check(predicted, expected)
     height, width = expected.shape[-2:]
-    if min(height, width) < 7:
-        raise InputError(f"image of {height} x {width} pixels: SSIM needs at least 7 x 7")
+    if min(height, width) < WINDOW:
+        raise InputError(f"image of {height} x {width} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
     pairs = zip(expected.reshape(-1, height, width), predicted.reshape(-1, height, width), strict=True)
     return np.array([structural_similarity(t, p, data_range=1.0) for t, p in pairs]).reshape(expected.shape[:-2])
 
@@ -94,6 +101,28 @@ def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> 
     bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
     known = np.isfinite(error)
     return float((error <= bound * np.asarray(std, float))[known].mean())
+
+
+def crps(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
+    """Mean continuous ranked probability score of the known values, in their unit; the lower the better.
+
+    Args:
+        prediction: mean of a normal distribution, any shape; of a circular one, whose real and imaginary parts are
+            scored in turn, where it is complex.
+        std: its standard deviation, the same shape; for complex values sqrt(E |h - mean|^2).
+        truth: the same shape; NaN where nothing was received.
+
+    Source: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007), equation 21.
+    """
+    mean, expected, spread = np.asarray(prediction), np.asarray(truth), np.asarray(std, float)
+    if np.iscomplexobj(expected):
+        parts = (crps(part(mean), spread / np.sqrt(2), part(expected)) for part in (np.real, np.imag))
+        return sum(parts) / 2
+    known = np.isfinite(expected)
+    error, spread = (expected - mean)[known].astype(float), spread[known]
+    z = error / spread
+    density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
+    return float((spread * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())
 
 
 def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..receivers.instruments import SpectrumInstrument
+from .mixtures import MixtureScores, ssim_mixtures
 from .scores import ssim
 from .task import Task, carrier_hz
 
@@ -36,6 +37,10 @@ class Spectrum(Task):
         from .losses import spectrum_loss
 
         return spectrum_loss(prediction, truth, batch, shape[0], shape[1], ssim_weight)[0]
+
+    def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
+        """Structural similarity on windows that do not overlap (`wrf_mi.tasks.mixtures.ssim_mixtures`)."""
+        return ssim_mixtures(predictions, truth)
 
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Structural similarity on the device, equal to scikit-image's."""

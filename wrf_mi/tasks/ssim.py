@@ -17,17 +17,10 @@ import drjit as dr
 
 from ..backend.device import quads
 from ..core import InputError
-
-WINDOW = 7
-"""Side of the window in pixels, scikit-image's default."""
-C1 = 0.01**2
-C2 = 0.03**2
-"""Stabilising constants of Wang et al. (2004) for a data range of one."""
+from .scores import SSIM_C1, SSIM_C2, SSIM_SAMPLE, WINDOW
 
 BORDER = WINDOW - 1
 PIXELS = WINDOW**2
-SAMPLE = PIXELS / (PIXELS - 1)
-"""Sample variance of a window over its variance."""
 
 
 def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
@@ -60,8 +53,8 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
     moments = [x, y, x * x + y * y, x * y]
     mean_x, mean_y, squares, product = dr.custom(_WindowMeans, moments, batch, height, width)
     means, across = mean_x * mean_x + mean_y * mean_y, mean_x * mean_y
-    similarity = (2 * across + C1) / (means + C1)
-    similarity *= (2 * SAMPLE * (product - across) + C2) / (SAMPLE * (squares - means) + C2)
+    similarity = (2 * across + SSIM_C1) / (means + SSIM_C1)
+    similarity *= (2 * SSIM_SAMPLE * (product - across) + SSIM_C2) / (SSIM_SAMPLE * (squares - means) + SSIM_C2)
     count = (height - BORDER) * (width - BORDER)
     return single(dr.block_sum(similarity, count) / count)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..receivers.instruments import Instrument
+from .mixtures import MixtureScores, mixture_scores
 
 UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
@@ -28,6 +29,7 @@ class Task(ABC):
         label: label of the score, for tables and axes.
         digits: digits of the score after the decimal point.
         higher_is_better: whether the score is an accuracy or an error.
+        limits: scores beyond which models are not compared any more where a mean over rows chooses among them.
         axes: number of axes of one observation, at one receiver and row.
         more_axes: number of optional further axes (antennas) of an observation.
         image: whether an observation is shown as an image; else its level is drawn over positions.
@@ -49,6 +51,7 @@ class Task(ABC):
     label: ClassVar[str]
     digits: ClassVar[int] = 2
     higher_is_better: ClassVar[bool]
+    limits: ClassVar[tuple[float, float]] = (-np.inf, np.inf)
     axes: ClassVar[int]
     more_axes: ClassVar[int] = 0
     image: ClassVar[bool] = False
@@ -123,6 +126,20 @@ class Task(ABC):
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Scores of observations [n, ...] in training: as `of_rows`, by a faster implementation where there is one."""
         return np.asarray(self.of_rows(np.asarray(prediction)[None], np.asarray(truth)[None])[0], float)
+
+    def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
+        """Scores of weighted means of predictions, for the choice of weights: limited, and the higher the better.
+
+        Args:
+            predictions: predictions of one receiver [k, m, ...].
+            truth: observations [m, ...], finite.
+        """
+        sign = 1 if self.higher_is_better else -1
+
+        def limited(mean: NDArray[Any], observed: NDArray[Any]) -> FloatArray:
+            return np.asarray(sign * np.clip(self.of_rows(mean[None], observed[None])[0], *self.limits))
+
+        return mixture_scores(predictions, truth, limited)
 
     def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Score of each receiver and row.

@@ -1,0 +1,202 @@
+"""The hybrid beside each of its ingredients, and intervals of both, over data sets, splits and numbers of rows.
+
+Each cell is a run of the hybrid and one of each ingredient on the same rows. Scores are compared row by row; an
+ingredient is *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import InputError
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.files import write_atomically
+from wrf_mi.models.hybrid.ingredients import INGREDIENTS
+from wrf_mi.runs.api import train
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.runs.folder import METRICS
+from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.timing import bootstrap
+from wrf_mi.scene.make import make_scene
+from wrf_mi.synthetic import load_record
+from wrf_mi.synthetic.laboratory import SCAN
+from wrf_mi.tasks import TASKS
+
+from .bench import CONFERENCE, FLAT, RFID
+from .comparison import data_folder
+from .table_plan import PARTS, available
+from .tables import scene_of
+
+RUNS = Path("runs/bench/ingredients")
+LAB = "laboratory"
+ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
+    (RFID, "official"): (5, 15, 48, None),
+    (RFID, "blocked"): (None,),
+    (LAB, "official"): (5, 15, 48, None),
+    (LAB, "blocked"): (None,),
+    (FLAT, "official"): (5, 15, 64, 400),
+    (FLAT, "blocked"): (400,),
+    (CONFERENCE, "official"): (15, 100, None),
+}
+"""Numbers of training rows by data set and split; None: all."""
+LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
+"""Largest loss against an ingredient that is allowed, in the unit of the score."""
+WORSE_SHARE = 0.02
+"""Largest share of comparisons in which the hybrid may be clearly worse."""
+INSIDE = (0.85, 0.95)
+"""Limits of the share of test values inside the 90 % intervals."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Data set, split and number of training rows; None: all."""
+
+    dataset: str
+    split: str
+    n_train: int | None
+
+    @property
+    def name(self) -> str:
+        """Name for files and progress."""
+        return f"{self.dataset}-{self.split}-{'all' if self.n_train is None else self.n_train}"
+
+    @property
+    def title(self) -> str:
+        """Label in the table."""
+        return f"{self.dataset}, {self.split}, {'all' if self.n_train is None else self.n_train} rows"
+
+
+CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
+
+
+def scene_of_cell(cell: Cell, folder: Path) -> str | None:
+    """Scene of a cell's data set, made where needed; None: none is known."""
+    if cell.dataset == LAB:
+        load_record(LAB)
+        made = folder / "laboratory-room"
+        if not made.exists():
+            make_scene(data_folder(LAB) / SCAN, made)
+        return str(made)
+    part = next(part for part in PARTS if part.dataset == cell.dataset)
+    return None if part.scene == "open" else scene_of(part, folder)[1]
+
+
+def differences(hybrid: Results, ingredient: Results) -> FloatArray:
+    """Scores of the hybrid minus those of an ingredient at the same receivers and rows, the higher the better."""
+    task = TASKS[hybrid.task]
+    pair = [np.clip(run.score[:, np.argsort(run.row)], *task.limits) for run in (hybrid, ingredient)]
+    found = (1 if task.higher_is_better else -1) * (pair[0] - pair[1])
+    return np.asarray(found[np.isfinite(found)], float)
+
+
+def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, Any]]:
+    """Scores, intervals and mean differences of the hybrid and its ingredients."""
+    block = TASKS[hybrid.task].block
+    found = []
+    for name, run in {"hybrid": hybrid, **others}.items():
+        one = {
+            "model": name,
+            "score": run.metrics[block],
+            "block": block,
+            "train_seconds": run.metrics["train_seconds"],
+        }
+        one |= {key: run.metrics.get(key) for key in ("inside_90", "crps", "ms_per_sample")}
+        if name != "hybrid":
+            gain = bootstrap(differences(hybrid, run), np.mean)
+            one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
+        found.append(one)
+    return found
+
+
+def measure(cell: Cell, folder: Path) -> list[dict[str, Any]]:
+    """Runs of a cell in ``folder``, those that are finished excepted, compared."""
+    scene = scene_of_cell(cell, folder.parent)
+    given: dict[str, Any] = {"split": cell.split, "n_train": cell.n_train, "seed": 0}
+
+    def run(name: str, model: str, **more: Any) -> Results:
+        place = folder / name
+        if not (place / METRICS).exists():
+            shutil.rmtree(place, ignore_errors=True)
+            train(cell.dataset, place, model, **given, **more)
+        return read_run(place)
+
+    hybrid = run("hybrid", "hybrid", scene=scene)
+    others = {}
+    for name in hybrid.metrics["held_out"].keys() - {"hybrid"} or {"kriging"}:
+        known = INGREDIENTS[name]
+        more = {"scene": scene if known.scene else None, "settings": known.settings}
+        try:
+            others[name] = run(name, known.model, intervals=True, **more)
+        except InputError:  # too few rows to hold any out
+            others[name] = run(name, known.model, **more)
+    return compared(hybrid, others)
+
+
+def rows_of(cell: Cell, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of the table: the hybrid, then each ingredient with the hybrid's gain over it."""
+    rows = []
+    for one in found:
+        score, inside = one["score"], one["inside_90"]
+        value = f"median {score['median']:.4g}, mean {score['mean']:.4g}"
+        value += "" if inside is None else f", {inside:.0%} inside, CRPS {one['crps']:.3g}"
+        asked = "85 to 95 % inside"
+        if "gain" in one:
+            limit = LIMITS[one["block"]]
+            interval = f"{one['gain_low']:.3g} to {one['gain_high']:.3g}"
+            asked = f"hybrid better by {one['gain']:.3g} ({interval}), at most {limit} worse"
+        rows.append({"what": f"{cell.title}: {one['model']}", "value": value, "asked": asked, **one, "cell": cell.name})
+    return rows
+
+
+def main() -> dict[str, Any]:
+    """Measure all cells whose data are on this machine, unless this code was measured before.
+
+    Returns:
+        ``rows``; ``worse``: number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside``:
+        number of runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; and ``failed``, where a limit is
+        exceeded.
+    """
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    cells = [cell for cell in CELLS if _present(cell)]
+    for count, cell in enumerate(cells, 1):
+        print(f"ingredients: {count} of {len(cells)}: {cell.title}", file=sys.stderr, flush=True)
+        kept = place / f"{cell.name}.json"
+        if not kept.exists():
+            write_atomically(kept, json.dumps(measure(cell, place / cell.name)))
+        rows += rows_of(cell, json.loads(kept.read_text()))
+        for row in rows[-len(json.loads(kept.read_text())) :]:
+            print(f"ingredients: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
+    return {"rows": rows, **_verdict(rows)}
+
+
+def _present(cell: Cell) -> bool:
+    known = next((part for part in PARTS if part.dataset == cell.dataset), None)
+    return known is None or available(known)
+
+
+def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    pairs = [row for row in rows if "gain" in row]
+    worse = [row for row in pairs if row["gain_high"] < 0]
+    beyond = [row for row in pairs if row["gain"] < -LIMITS[row["block"]]]
+    hybrids = [row for row in rows if "gain" not in row and row["inside_90"] is not None]
+    inside = [row for row in hybrids if INSIDE[0] <= row["inside_90"] <= INSIDE[1]]
+    found: dict[str, Any] = {
+        "comparisons": len(pairs),
+        "worse": len(worse),
+        "cells": len(hybrids),
+        "inside": len(inside),
+    }
+    if len(worse) > WORSE_SHARE * len(pairs) or beyond:
+        text = f"clearly worse than an ingredient in {len(worse)} of {len(pairs)} comparisons"
+        found["failed"] = f"{text}, by more than the limit in {len(beyond)}"
+    return found

@@ -1,0 +1,68 @@
+"""Weights by distance, on scores with a known best choice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.types import IntArray
+from wrf_mi.models.hybrid.mixture import FORMS, Mixture, RowScores, choose
+
+ROWS = 200
+RNG = np.random.default_rng(0)
+DISTANCE = RNG.uniform(0, 1, ROWS)
+FOLD = np.arange(ROWS) % 5
+
+
+def errors_of(errors: FloatArray) -> RowScores:
+    """Minus the absolute weighted error of predictions with errors [k, q]."""
+
+    def score(weights: FloatArray, rows: IntArray) -> FloatArray:
+        return -np.abs(np.einsum("qk,kq->q", weights, errors[:, rows]))
+
+    return score
+
+
+def chosen(errors: FloatArray) -> tuple[str, Mixture]:
+    return choose(errors_of(errors), DISTANCE, FOLD, len(errors), lambda share: None)
+
+
+def test_prediction_that_is_best_everywhere_has_all_the_weight():
+    noise = RNG.normal(size=(3, ROWS))
+    form, mixture = chosen(np.stack([noise[0], 0.01 * noise[1], noise[2]]))
+    assert form == "single"
+    assert mixture(np.array([0.0, 0.5, 9.0])) == pytest.approx(np.tile([0.0, 1.0, 0.0], (3, 1)))
+
+
+def test_independent_errors_of_equal_size_are_averaged():
+    form, mixture = chosen(RNG.normal(size=(2, ROWS)))
+    assert form != "single"
+    assert mixture(np.array([0.5]))[0] == pytest.approx([0.5, 0.5], abs=0.2)
+
+
+def test_weights_follow_the_distance():
+    noise = RNG.normal(size=(2, ROWS))
+    near, far = noise[0] * 5 * DISTANCE**2, noise[1]
+    form, mixture = chosen(np.stack([near, far]))
+    assert form == "by distance"
+    assert mixture(np.array([0.0]))[0, 0] > 0.9
+    assert mixture(np.array([1.0, np.inf]))[:, 1] == pytest.approx([1.0, 1.0], abs=0.3)
+    assert mixture(DISTANCE).sum(axis=1) == pytest.approx(np.ones(ROWS))
+
+
+def test_more_freedom_without_evidence_is_refused():
+    rows = np.arange(4)
+    errors = np.array([[1.0, 1.0, 1.0, 1.0], [0.9, 1.3, 0.9, 1.3]])
+    form, mixture = choose(errors_of(errors), np.arange(4.0), rows, 2, lambda share: None)
+    assert form == "single"
+    assert mixture(np.zeros(1))[0] == pytest.approx([1.0, 0.0])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_form_is_below_the_best_single_prediction_on_its_rows(form: str):
+    errors = np.random.default_rng(3).normal(size=(4, ROWS)) * np.array([[1.0], [2.0], [1.5], [0.8]])
+    score, every = errors_of(errors), np.arange(ROWS)
+    mixture = FORMS[form](score, DISTANCE, every, 4)
+    single = FORMS["single"](score, DISTANCE, every, 4)
+    assert score(mixture(DISTANCE), every).mean() >= score(single(DISTANCE), every).mean() - 1e-3

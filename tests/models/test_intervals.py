@@ -1,0 +1,122 @@
+"""Intervals from held-out errors, and held-out rows themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import refused
+
+import wrf_mi
+from wrf_mi.core import Record, Split
+from wrf_mi.datasets import load, make_splits
+from wrf_mi.models.held_out import HeldOut, hold_out_folds
+from wrf_mi.models.intervals import fit_intervals
+from wrf_mi.tasks.scores import crps, inside_interval
+
+COVERED = 0.02
+"""Allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors."""
+
+
+def folds_of(record: Record) -> tuple[Split, list[Split]]:
+    split = make_splits(record, "official")[0]
+    return split, hold_out_folds(record, split)
+
+
+def test_every_training_row_is_held_out_and_no_test_row_is_used(flat_folder: Path):
+    record = load(flat_folder)
+    split, folds = folds_of(record)
+    assert set(np.concatenate([fold.test for fold in folds])) == set(split.all_train)
+    for fold in folds:
+        assert not set(fold.test) & set(fold.all_train)
+        assert set(fold.test) | set(fold.all_train) == set(split.all_train)
+
+
+def test_distances_are_those_to_the_rows_that_remain(flat_folder: Path):
+    record = load(flat_folder)
+    _, folds = folds_of(record)
+    held = HeldOut.of(record, folds)
+    for place in (0, len(held) // 2, len(held) - 1):
+        rows = folds[held.fold[place]].all_train
+        seen = rows[np.isfinite(record.observation[held.receiver[place], rows])]
+        apart = np.linalg.norm(record.tx_pos_m[seen] - record.tx_pos_m[held.row[place]], axis=1)
+        assert held.distance_m[place] == pytest.approx(apart.min())
+
+
+@pytest.mark.parametrize("is_complex", [False, True])
+def test_intervals_cover_new_errors_that_grow_with_size_and_distance(is_complex: bool):
+    rng = np.random.default_rng(0)
+
+    def draw(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        distance, mean = rng.uniform(0, 1, rows), rng.uniform(1, 3, (rows, 10)) + 0j * is_complex
+        noise = rng.normal(size=mean.shape) + (1j * rng.normal(size=mean.shape) if is_complex else 0)
+        return mean, mean + noise * (0.1 + distance[:, None]) * np.abs(mean), distance
+
+    mean, observed, distance = draw(400)
+    intervals = fit_intervals(mean, observed, np.abs(mean), distance)
+    mean, truth, distance = draw(400)
+    found = intervals(mean, np.abs(mean), distance)
+    assert inside_interval(mean, found.stated_std, truth) == pytest.approx(0.9, abs=COVERED)
+    for part in (distance < 0.3, distance > 0.7):
+        assert inside_interval(mean[part], found.stated_std[part], truth[part]) == pytest.approx(0.9, abs=0.06)
+    assert found.stated_std[distance > 0.7].mean() > 2 * found.stated_std[distance < 0.3].mean()
+
+
+def test_intervals_beyond_all_distances_are_as_wide_as_the_widest():
+    rng = np.random.default_rng(1)
+    distance, mean = np.linspace(0, 1, 100), np.zeros((100, 5))
+    intervals = fit_intervals(mean, rng.normal(size=mean.shape), np.ones(mean.shape), distance)
+    far = intervals(np.zeros((1, 5)), np.ones((1, 5)), np.array([np.inf])).stated_std
+    near = intervals(np.zeros((100, 5)), np.ones((100, 5)), distance).stated_std
+    assert np.isfinite(far).all()
+    assert far.max() >= near.max()
+
+
+def test_exact_predictions_have_intervals_that_are_not_empty():
+    mean = np.ones((20, 3))
+    found = fit_intervals(mean, mean, mean, np.arange(20.0))(mean, mean, np.arange(20.0))
+    assert (found.stated_std > 0).all()
+
+
+def test_crps_equals_its_integral():
+    mean, std, truth = 1.0, 2.0, 2.5
+    x = np.linspace(-30, 30, 600_001)
+    from scipy.stats import norm
+
+    integral = np.trapezoid((norm.cdf(x, mean, std) - (x >= truth)) ** 2, x)
+    assert crps([mean], [std], [truth]) == pytest.approx(integral, abs=1e-4)
+    assert crps([mean + 1j * mean], [std * 2**0.5], [truth + 1j * truth]) == pytest.approx(integral, abs=1e-4)
+    assert crps([mean, 0], [std, 1], [truth, np.nan]) == crps([mean], [std], [truth])
+
+
+def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder: Path, tmp_path: Path):
+    plain = wrf_mi.train(flat_folder, tmp_path / "plain", "kriging")
+    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", intervals=True)
+    asked: dict[str, Any] = {"tx_pos_m": [[2.0, 1.0, 1.3]], "tx_heading_rad": [0.5]}
+    found = wrf_mi.open_run(run.folder).predict(**asked)
+    assert found.mean == pytest.approx(plain.predict(**asked).mean)
+    assert plain.predict(**asked).std is None
+    assert (found.stated_std > 0).all()
+    assert "inside_90" not in plain.metrics
+    assert 0.5 < run.metrics["inside_90"] <= 1
+    assert run.metrics["crps"] > 0
+    assert not (run.folder / "held_out").exists()
+
+
+def test_intervals_without_rows_to_hold_out_are_refused(
+    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = ["train", flat_folder, "--model", "kriging", "--n-train", "2", "--intervals", "--out", tmp_path / "run"]
+    refused(arguments, "2 training rows; intervals need three at least", capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_intervals_of_unknown_positions_are_refused(flat_folder: Path, tmp_path: Path):
+    record = load(flat_folder)
+    positions = record.tx_pos_m.copy()
+    positions[0] = np.nan
+    with pytest.raises(wrf_mi.InputError, match="positions are not known"):
+        wrf_mi.train(replace(record, tx_pos_m=positions), tmp_path / "run", "kriging", intervals=True)

@@ -1,0 +1,206 @@
+"""Predictions of training rows by models that are fitted without them."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from ..core import Prediction, Record, Split
+from ..core.angles import FloatArray
+from ..core.files import stored_arrays, write_arrays
+from ..core.types import IntArray
+from ..training.loop import Progress
+from .model import Fitted, Model, Problem, Session, inputs_of
+
+FEW_ROWS = 10
+"""Number of training rows up to which each is held out by itself."""
+MANY_ROWS = 600
+"""Number of training rows from which two folds are enough."""
+FOLDS = 5
+MOST_HELD_OUT = 600
+"""Largest number of held-out observations that weights and intervals are chosen from."""
+
+
+def hold_out_folds(record: Record, split: Split) -> list[Split]:
+    """Splits of the training rows whose test rows are a region and rows in between the others.
+
+    The rows are divided into as many k-means clusters of positions as there are folds, and at random into as many
+    parts. A fold holds out a cluster, whose rows lie as far from the remaining ones as those of a blocked split, and a
+    part, whose rows lie as near as those of a random split. Up to `FEW_ROWS` rows are held out one by one.
+
+    Args:
+        record: data with known positions.
+        split: split whose training and validation rows are divided; the others keep their part. Its seed is that of
+            clusters and parts.
+
+    Returns:
+        Splits; none for fewer than three rows or fewer than two positions.
+    """
+    rows = split.all_train
+    n, positions = len(rows), record.tx_pos_m[rows]
+    places = len(np.unique(positions, axis=0))
+    if n < 3 or places < 2:
+        return []
+    rng = np.random.default_rng([split.seed, 4])
+    if n <= FEW_ROWS:
+        held = [np.arange(n) == row for row in range(n)]
+    else:
+        count = min(FOLDS if n < MANY_ROWS else 2, places)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty cluster holds nothing out
+            _, cluster = kmeans2(positions, count, iter=50, minit="++", missing="warn", rng=rng)
+        part = rng.permutation(np.arange(n) % count)
+        held = [(cluster == fold) | (part == fold) for fold in range(count)]
+    folds = []
+    for number, out in enumerate(held):
+        train, validation = (np.setdiff1d(part, rows[out]) for part in (split.train, split.validation))
+        if out.any() and len(train) + len(validation) >= 2:
+            folds.append(Split(f"fold {number}", split.seed, train, validation, rows[out]))
+    return folds
+
+
+def distance_to_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
+    """Distance [m] of positions [m, 3] to the nearest of some rows that a receiver received; infinite without any."""
+    seen = np.isfinite(record.observation[receiver][rows]).reshape(len(rows), -1).all(axis=1)
+    if not seen.any():
+        return np.full(len(tx_pos_m), np.inf)
+    return np.asarray(cKDTree(record.tx_pos_m[rows[seen]]).query(tx_pos_m)[0])
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out rows of all folds and receivers: q pairs of a receiver and a row that it received.
+
+    Attributes:
+        fold: number of the fold [q].
+        receiver: number of the receiver [q].
+        row: row of the record [q].
+        distance_m: distance to the nearest row that remained in the fold and that the receiver received [q], metres.
+    """
+
+    fold: IntArray
+    receiver: IntArray
+    row: IntArray
+    distance_m: FloatArray
+
+    @classmethod
+    def of(cls, record: Record, folds: Sequence[Split]) -> HeldOut:
+        """Held-out rows of folds."""
+        parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
+        for number, fold in enumerate(folds):
+            for receiver, seen in enumerate(record.observation):
+                rows = fold.test
+                rows = rows[np.isfinite(seen[rows]).reshape(len(rows), -1).all(axis=1)]
+                away = distance_to_rows(record, fold.all_train, record.tx_pos_m[rows], receiver)
+                parts.append((np.full(len(rows), number), np.full(len(rows), receiver), rows, away))
+        return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+    def __len__(self) -> int:
+        """Number of held-out observations."""
+        return len(self.row)
+
+    def chosen(self, keep: NDArray[np.bool_] | IntArray) -> HeldOut:
+        """A part of the held-out observations."""
+        return HeldOut(self.fold[keep], self.receiver[keep], self.row[keep], self.distance_m[keep])
+
+    def thinned(self, seed: int) -> HeldOut:
+        """At most `MOST_HELD_OUT` of the observations, drawn with a seed."""
+        if len(self) <= MOST_HELD_OUT:
+            return self
+        return self.chosen(np.sort(np.random.default_rng([seed, 5]).permutation(len(self))[:MOST_HELD_OUT]))
+
+    def observed(self, record: Record) -> NDArray[np.float32] | NDArray[np.complex64]:
+        """Observations [q, ...]."""
+        return record.observation[self.receiver, self.row]
+
+
+def labelled(session: Session, label: str) -> Session:
+    """A session that reports progress under a label."""
+
+    def on_progress(stage: str, share: float, progress: Progress | None = None, /) -> None:
+        session.on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
+
+    return replace(session, on_progress=on_progress)
+
+
+def fit_model(entry: Model, problem: Problem, split: Split, session: Session) -> tuple[Fitted, Problem]:
+    """A fitted model, and the problem with the settings that its `Model.prepare` chose."""
+    if entry.prepare is not None:
+        problem = replace(problem, settings=entry.prepare(problem, [split], session))
+    return entry.fit(problem, split, session), problem
+
+
+def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int) -> Prediction:
+    """Prediction of rows of the record, stored or made."""
+    return fitted.predict_rows(rows, receiver) or fitted.predict(inputs_of(record, rows), receiver)
+
+
+def held_out_predictions(
+    entry: Model,
+    problem: Problem,
+    folds: Sequence[Split],
+    held: HeldOut,
+    session: Session,
+    name: str,
+) -> Prediction:
+    """Predictions of held-out observations, each by a model that is fitted to the rest of its fold.
+
+    Finished folds are kept in the session's folder until all are; a stopped fit goes on with them.
+
+    Args:
+        entry: model.
+        problem: data, scene and settings.
+        folds: folds of `hold_out_folds`.
+        held: their held-out observations, or some of them.
+        session: folder for files, progress callback and stop condition.
+        name: name of the model for the progress callback.
+
+    Returns:
+        Mean and, where the model states it, standard deviation, [q, ...].
+
+    Raises:
+        InputError: a fold that the model cannot be fitted to.
+    """
+    record, means, deviations = problem.record, [], []
+    for number, fold in enumerate(folds):
+        folder = session.folder / f"fold{number}"
+        kept = folder / "held_out.npz"
+        wanted = held.chosen(held.fold == number)
+        if not len(wanted):
+            continue
+        if not kept.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+
+            def on_progress(
+                stage: str,
+                share: float,
+                progress: object = None,
+                label: str = f"{name}, fold {number + 1} of {len(folds)}",
+            ) -> None:
+                session.on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
+
+            inner = replace(session, folder=folder, on_progress=on_progress)
+            fitted, _ = fit_model(entry, problem, fold, inner)
+            found = [
+                predicted_rows(fitted, record, wanted.row[wanted.receiver == receiver], receiver)
+                for receiver in range(len(record.receivers))
+                if (wanted.receiver == receiver).any()
+            ]
+            arrays = {"mean": np.concatenate([one.mean for one in found])}
+            if found[0].std is not None:
+                arrays["std"] = np.concatenate([one.stated_std for one in found])
+            write_arrays(kept, arrays)
+        arrays = stored_arrays(kept)
+        means.append(arrays["mean"])
+        deviations.append(arrays.get("std"))
+    for number in range(len(folds)):
+        shutil.rmtree(session.folder / f"fold{number}", ignore_errors=True)
+    known = [one for one in deviations if one is not None]
+    return Prediction(np.concatenate(means), np.concatenate(known) if len(known) == len(means) else None)

@@ -1,0 +1,109 @@
+"""Models that a hybrid mixes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ...core import InputError, Split
+from .. import MODELS
+from ..checks import check_record
+from ..model import Model, Problem, default_settings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Ingredient:
+    """A model of the registry with or without the scene.
+
+    Attributes:
+        model: name of the model.
+        scene: whether it is given the scene; then it needs one.
+        settings: ``key=value`` that differ from its defaults.
+        default: whether it is mixed where `HybridSettings.ingredients` names none.
+    """
+
+    model: str
+    scene: bool = False
+    settings: tuple[str, ...] = ()
+    default: bool = True
+
+
+INGREDIENTS = {
+    "idw": Ingredient("idw"),
+    "kriging": Ingredient("kriging"),
+    "trees": Ingredient("trees"),
+    "mri": Ingredient("mri"),
+    "physics-no-mesh": Ingredient("physics"),
+    "ray-tracing": Ingredient("ray-tracing", scene=True),
+    "calibrated": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials",), default=False),
+    "physics": Ingredient("physics", scene=True),
+    "learned": Ingredient("wrf-gs+", default=False),
+    "joint": Ingredient("wrf-gs+", scene=True, default=False),
+}
+"""Ingredients by name; any other name is that of a model without the scene."""
+
+
+def problems(problem: Problem, names: Sequence[str] | None) -> dict[str, tuple[Model, Problem]]:
+    """Entry and problem of each ingredient that serves the data.
+
+    Args:
+        problem: problem of the hybrid.
+        names: names of ingredients; None: all defaults that serve the data.
+
+    Raises:
+        InputError: an unknown name, an ingredient that does not serve the data, or none that does.
+    """
+    found: dict[str, tuple[Model, Problem]] = {}
+    for name in names or [name for name, ingredient in INGREDIENTS.items() if ingredient.default]:
+        if name not in INGREDIENTS and name not in MODELS:
+            known = ", ".join([*INGREDIENTS, *(model for model in MODELS if model not in INGREDIENTS)])
+            raise InputError(f"setting ingredients: {name!r} is unknown; choose from {known}")
+        try:
+            found[name] = _problem(problem, INGREDIENTS.get(name, Ingredient(name)))
+        except InputError:
+            if names:
+                raise
+    if not found:
+        raise InputError(f"{problem.record.name}: no ingredient of the hybrid serves these data; choose another model")
+    return found
+
+
+def _problem(problem: Problem, ingredient: Ingredient) -> tuple[Model, Problem]:
+    record, entry = problem.record, MODELS[ingredient.model]
+    check_record(entry, record)
+    if ingredient.scene and problem.scene is None:
+        raise InputError(f"ingredient {ingredient.model}: needs a scene; give --scene SCENE")
+    chosen = entry.serving(record.task, ingredient.scene)
+    if chosen.uplink == "required":
+        raise InputError(f"ingredient {ingredient.model}: predicts from the uplink, the hybrid from positions")
+    given = {"model": ingredient.model, "seed": problem.seed}
+    settings = default_settings(chosen, ingredient.settings, given)
+    scene = problem.scene if ingredient.scene else None
+    material = problem.material if ingredient.scene else None
+    return chosen, replace(problem, dataset=record, settings=settings, scene=scene, material=material)
+
+
+def serving(found: dict[str, tuple[Model, Problem]], split: Split, required: bool) -> dict[str, tuple[Model, Problem]]:
+    """Ingredients whose checks pass; others are left out with a line in the log, or refused where they are required.
+
+    Raises:
+        InputError: of a required ingredient, or of the last one where none passes.
+    """
+    kept, refusal = {}, None
+    for name, (entry, problem) in found.items():
+        try:
+            if entry.check is not None:
+                entry.check(problem, [split])
+        except InputError as error:
+            if required:
+                raise
+            logger.info("hybrid without %s: %s", name, error)
+            refusal = error
+        else:
+            kept[name] = entry, problem
+    if not kept and refusal is not None:
+        raise refusal
+    return kept

@@ -1,0 +1,135 @@
+"""Weights of several predictions by the distance to the nearest training row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+
+KNOTS, KNOT_ROWS = 4, 20
+"""Largest number of distances at which weights are chosen, and least number of held-out observations for each."""
+FIRST, STEPS = 3, 12
+"""Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
+
+RowScores = Callable[[FloatArray, IntArray], FloatArray]
+"""From weights [n, k] of some held-out observations and their numbers [n] to scores [n], the higher the better."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Weights that are piecewise linear in the distance.
+
+    Attributes:
+        distance_m: distances [b], metres, ascending.
+        weights: weights [b, k] at these distances, of sum 1.
+    """
+
+    distance_m: FloatArray
+    weights: FloatArray
+
+    def __call__(self, distance_m: FloatArray) -> FloatArray:
+        """Weights [m, k] at distances [m]; those at the last knot beyond it."""
+        return np.stack([np.interp(distance_m, self.distance_m, column) for column in self.weights.T], axis=1)
+
+
+def constant(weights: FloatArray) -> Mixture:
+    """The same weights [k] at all distances."""
+    return Mixture(np.zeros(1), weights[None])
+
+
+def best_single(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+    """The prediction with the best mean score."""
+    means = [_mean(score, one, rows, np.ones(len(rows))) for one in np.eye(count)]
+    return constant(np.eye(count)[int(np.argmax(means))])
+
+
+def mixed(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+    """One mixture for all distances, by forward selection with replacement.
+
+    The selection starts from the best single prediction and goes on while the mean score increases.
+
+    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
+    """
+    return constant(_selected(score, rows, np.ones(len(rows)), count))
+
+
+def by_distance(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+    """A mixture as `mixed` at each of some distances.
+
+    An observation counts at the two knots next to its distance, the more the nearer.
+    """
+    distance_m = distance_m[rows]
+    knots = _knots(distance_m)
+    shares = np.stack([np.interp(distance_m, knots, column) for column in np.eye(len(knots))])
+    weights = [_selected(score, rows[share > 0], share[share > 0], count) for share in shares]
+    return Mixture(knots, np.stack(weights))
+
+
+FORMS = {"single": best_single, "mixed": mixed, "by distance": by_distance}
+"""Forms of the weights, in the order of their freedom."""
+
+
+def choose(
+    score: RowScores,
+    distance_m: FloatArray,
+    fold: IntArray,
+    count: int,
+    on_fold: Callable[[float], None],
+) -> tuple[str, Mixture]:
+    """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
+
+    Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
+    its mean score is better by more than the standard error of the difference.
+
+    Args:
+        score: scores of all held-out observations by their weights.
+        distance_m: their distances [q], metres.
+        fold: their folds [q].
+        count: number k of predictions.
+        on_fold: called with the share of the folds that is done.
+    """
+    folds, every = np.unique(fold), np.arange(len(fold))
+    found = {name: np.full(len(fold), np.nan) for name in FORMS}
+    for done, number in enumerate(folds):
+        out = fold == number
+        for name, form in FORMS.items():
+            chosen = form(score, distance_m, every[~out] if len(folds) > 1 else every, count)
+            found[name][out] = score(chosen(distance_m[out]), every[out])
+        on_fold((done + 1) / len(folds))
+    best = next(iter(FORMS))
+    for name in FORMS:
+        gain = found[name] - found[best]
+        if len(gain) > 1 and gain.mean() > gain.std(ddof=1) / len(gain) ** 0.5:
+            best = name
+    return best, FORMS[best](score, distance_m, every, count)
+
+
+def _selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
+    """Weights [k] of the forward selection on some observations, which count by their shares."""
+    every = np.eye(count)
+    values = [_mean(score, one, rows, share) for one in every]
+    weights: FloatArray = every[int(np.argmax(values))]
+    best = max(values)
+    for step in range(FIRST, FIRST + STEPS):
+        changed = (weights * step + every) / (step + 1)
+        values = [_mean(score, one, rows, share) for one in changed]
+        if max(values) <= best:
+            break
+        best, weights = max(values), changed[int(np.argmax(values))]
+    return weights
+
+
+def _knots(distance_m: FloatArray) -> FloatArray:
+    finite = distance_m[np.isfinite(distance_m)]
+    count = int(np.clip(len(finite) // KNOT_ROWS, 1, KNOTS))
+    knots: FloatArray = np.unique(np.quantile(finite, (np.arange(count) + 0.5) / count)) if len(finite) else np.zeros(1)
+    return knots
+
+
+def _mean(score: RowScores, weights: FloatArray, rows: IntArray, share: FloatArray) -> float:
+    scores = score(np.broadcast_to(weights, (len(rows), len(weights))), rows)
+    return float(np.average(scores, weights=share))
