@@ -83,8 +83,7 @@ def fit_intervals(mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, 
     step = max(1, mean.size // MOST_VALUES)
     sizes, error = (np.ravel(values)[::step] for values in (size, np.abs(mean - observed)))
     distance = np.broadcast_to(_columns(distance_m, mean.ndim), mean.shape).ravel()[::step]
-    # Values of one observation are not independent, so the number of observations widens the level.
-    level = min(LEVEL * (1 + 1 / len(mean)), 1.0)
+    level = min(LEVEL * (1 + 1 / error.size), 1.0)
     floor = SMALLEST * max(float(np.median(error)), float(np.finfo(np.float32).tiny))
     knots, std = _by_group(sizes, error, SIZES if len(mean) >= SIZES else 1, level)
     std = np.maximum(std / inside, floor)

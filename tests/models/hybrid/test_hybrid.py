@@ -63,7 +63,7 @@ def test_ingredients_that_do_not_serve_the_data_are_left_out_or_refused(
     from wrf_mi.models.hybrid.ingredients import problems
     from wrf_mi.models.hybrid.model import HybridSettings
 
-    assert list(problems(Problem(one_gateway, HybridSettings()), None)) == ["idw", "kriging", "physics-no-mesh"]
+    assert list(problems(Problem(one_gateway, HybridSettings()), None)) == ["kriging", "physics-no-mesh", "idw"]
     out = ["--out", str(tmp_path / "run")]
     refused(["train", folder, "--model", "hybrid", "--set", "ingredients=mri", *out], "mri serves rssi", capsys)
     refused(["train", folder, "--model", "hybrid", "--set", "ingredients=physics", *out], "needs a scene", capsys)

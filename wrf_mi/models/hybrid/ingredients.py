@@ -32,18 +32,19 @@ class Ingredient:
 
 
 INGREDIENTS = {
-    "idw": Ingredient("idw"),
     "kriging": Ingredient("kriging"),
-    "trees": Ingredient("trees"),
-    "mri": Ingredient("mri"),
+    "physics": Ingredient("physics", scene=True),
     "physics-no-mesh": Ingredient("physics"),
     "ray-tracing": Ingredient("ray-tracing", scene=True),
+    "trees": Ingredient("trees"),
+    "mri": Ingredient("mri"),
+    "idw": Ingredient("idw"),
     "calibrated": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials",), default=False),
-    "physics": Ingredient("physics", scene=True),
     "learned": Ingredient("wrf-gs+", default=False),
     "joint": Ingredient("wrf-gs+", scene=True, default=False),
 }
-"""Ingredients by name; any other name is that of a model without the scene."""
+"""Ingredients by name, the first of which is used where held-out rows do not tell them apart; any other name is that of
+a model without the scene."""
 
 
 def problems(problem: Problem, names: Sequence[str] | None) -> dict[str, tuple[Model, Problem]]:

@@ -42,9 +42,11 @@ def constant(weights: FloatArray) -> Mixture:
 
 
 def best_single(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
-    """The prediction with the best mean score."""
-    means = [_mean(score, one, rows, np.ones(len(rows))) for one in np.eye(count)]
-    return constant(np.eye(count)[int(np.argmax(means))])
+    """The first prediction, or the one with the best mean score, if that is better by more than its standard error."""
+    every = np.eye(count)
+    scores = np.stack([score(np.broadcast_to(one, (len(rows), count)), rows) for one in every])
+    best = int(np.argmax(scores.mean(axis=1)))
+    return constant(every[best if _gains(scores[best] - scores[0]) else 0])
 
 
 def mixed(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
@@ -102,10 +104,14 @@ def choose(
         on_fold((done + 1) / len(folds))
     best = next(iter(FORMS))
     for name in FORMS:
-        gain = found[name] - found[best]
-        if len(gain) > 1 and gain.mean() > gain.std(ddof=1) / len(gain) ** 0.5:
+        if _gains(found[name] - found[best]):
             best = name
     return best, FORMS[best](score, distance_m, every, count)
+
+
+def _gains(gain: FloatArray) -> bool:
+    """Whether the mean gain [n] exceeds its standard error."""
+    return len(gain) > 1 and bool(gain.mean() > gain.std(ddof=1) / len(gain) ** 0.5)
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:

@@ -55,8 +55,6 @@ logger = logging.getLogger(__name__)
 FOLDER = "ingredients"
 NEGLIGIBLE = 1e-3
 """Weight below which an ingredient is not evaluated: its share of the prediction."""
-FEW_ROWS_PREFERRED = ("kriging", "idw")
-"""Ingredients of which the first is used alone where training rows are too few to hold any out."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +178,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
                 del found[name]
     form, mixture, intervals, scores = _weights(record, predictions, held, session)
     if held is None:
-        preferred = next((name for name in FEW_ROWS_PREFERRED if name in found), next(iter(found)))
-        mixture = constant(np.array([float(name == preferred) for name in found]))
+        mixture = constant(np.eye(len(found))[0])
     names = [name for name, most in zip(found, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
     places = [list(found).index(name) for name in names]
     fitted = {}
