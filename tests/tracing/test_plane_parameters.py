@@ -281,3 +281,16 @@ def test_corrected_scene_has_moved_planes_and_stays_closed(scene: Any, tmp_path:
     assert corners(scene) == corners(again) == 12
     with pytest.raises(ValueError, match="planes"):
         write_corrected_scene(tmp_path / "other", scene, {SHIFT: np.zeros(count + 1)})
+
+
+def test_plain_sionna_rt_opens_a_corrected_scene_below_the_range_of_its_materials(scene: Any, tmp_path: Path) -> None:
+    from sionna import rt
+
+    write_corrected_scene(tmp_path / "corrected", scene, {})
+    plain = rt.load_scene(str(tmp_path / "corrected" / "scene.xml"), merge_shapes=False)
+    plain.frequency = FREQUENCY_HZ  # Sionna RT knows concrete from 1 GHz
+    for name, thing in plain.objects.items():
+        stated = scene.objects[name].radio_material
+        for quantity in ("relative_permittivity", "conductivity", "thickness"):
+            values = (float(np.ravel(getattr(one, quantity))[0]) for one in (thing.radio_material, stated))
+            assert next(values) == pytest.approx(next(values), rel=1e-4), (name, quantity)

@@ -18,6 +18,7 @@ from ..scene.folder import write_scene
 from ..scene.materials import THICKNESS_M, Materials
 from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
 from .material_parameters import SURFACE, MaterialGrouping, SlabMaterials, name_of, read_materials, slabs_of_faces
+from .materials import in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
@@ -105,8 +106,8 @@ def write_corrected_scene(
 ) -> Path:
     """Write a scene with moved planes and changed materials as a scene folder.
 
-    Objects whose surfaces differ in material become several. Materials that have not changed keep their names; others
-    have constants, which hold at the carrier that the scene is set to.
+    Objects whose surfaces differ in material become several. Materials that have not changed keep their names, unless
+    Sionna RT does not know them at the carrier that the scene is set to; others have constants, which hold there.
 
     Args:
         folder: the new folder.
@@ -131,6 +132,7 @@ def write_corrected_scene(
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
     stated, fitted = material_constants(slabs, {}), material_constants(slabs, parameters)
     changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
+    carrier_hz = float(scene.frequency[0])
     parts, entries, constants, thickness = [], {}, {}, {}
     for index, name in enumerate(surfaces.names):
         faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])
@@ -144,16 +146,18 @@ def write_corrected_scene(
             if changed[slab] or material not in THICKNESS_M:
                 material = f"fitted_{(part if grouping == 'surface' else material).replace('-', '_')}"
                 constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
+            elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):
+                material = f"{itu}_{carrier_hz / 1e6:.0f}mhz"
+                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
             else:
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
     facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants)
-    carrier = f"{float(scene.frequency[0]) / 1e9:.6g} GHz"
     return write_scene(
         folder,
         parts,
         frame="that of the scene it was made from",
-        source=f"a scene corrected by measurements at {carrier}, where the constants of its materials hold",
+        source=f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold",
         materials=facts,
         description="A scene corrected by measurements",
         replace=replace,

@@ -73,9 +73,9 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
         itu_type = getattr(material, "itu_type", None)
         if itu_type is None:
             continue
-        ranges_ghz = ITU_MATERIALS_PROPERTIES[itu_type]
-        if any(low <= frequency_hz / 1e9 <= high for low, high in ranges_ghz):
+        if in_itu_range(itu_type, frequency_hz):
             continue
+        ranges_ghz = ITU_MATERIALS_PROPERTIES[itu_type]
         if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
             where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in sorted(ranges_ghz))
             text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
@@ -93,6 +93,13 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
     scene.frequency = frequency_hz
 
 
+def in_itu_range(name: str, frequency_hz: float) -> bool:
+    """Whether ITU-R P.2040 has a material, e.g. ``"concrete"``, at a frequency, so that Sionna RT knows it."""
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    return any(low <= frequency_hz / 1e9 <= high for low, high in ITU_MATERIALS_PROPERTIES[name])
+
+
 def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:
     """Relative permittivity, conductivity (S/m) and default thickness (m) of materials of ITU-R P.2040 by name.
 
@@ -101,8 +108,8 @@ def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES, itu_material
 
     found = {}
-    for name, ranges_ghz in ITU_MATERIALS_PROPERTIES.items():
-        if any(low <= frequency_hz / 1e9 <= high for low, high in ranges_ghz):
+    for name in ITU_MATERIALS_PROPERTIES:
+        if in_itu_range(name, frequency_hz):
             permittivity, conductivity = (float(np.ravel(value)[0]) for value in itu_material(name, frequency_hz))
         elif name in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
             permittivity, conductivity = BELOW_1_GHZ[name]
