@@ -85,7 +85,7 @@ def test_command_trains_as_the_function_does(
     assert status == 0, err
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["SSIM", "physics", "IDW"]
-    assert lines[3].endswith("of the test values lie inside the predicted 90 % intervals")
+    assert "of the test values lie inside the predicted 90 % intervals, CRPS " in lines[3]
     assert lines[-1] == f"results: {out}"
     assert "one: element signals of spectra" in err.splitlines()
     np.testing.assert_allclose(stored(out)["prediction"], stored(run)["prediction"], atol=ROUNDING)
