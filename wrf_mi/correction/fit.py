@@ -16,12 +16,15 @@ from .frame import rigid_motions
 from .least_squares import Prior, Solution, solve
 from .misfit import Misfit
 from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
+from .path_sum import PathSum, near
 from .search import Choice, choose, joint_choices, material_choices, shift_choices
 
 LEAST_PATHS = 10
 """Fewest paths of a surface or plane that is changed."""
-ROUNDS = 4
+ROUNDS = 3
 """Largest number of rounds: planes that are off hide the right material, and conversely."""
+ROUND_STEPS = 3
+"""Largest number of least-squares steps between choices."""
 REFINING_STEPS = 3
 """Largest number of least-squares steps of one plane while shifts are compared."""
 
@@ -116,7 +119,7 @@ class Fit:
                 if choice.what in taken and len(chosen):
                     mean[chosen] = vector[chosen]
                     self.taken[stage, choice.what] = taken[choice.what].partition(",")[0]
-            found = self.solve(stage, vector, mean)
+            found = self.solve(stage, vector, mean, ROUND_STEPS)
             vector = found.vector
         self.means[stage] = mean
         return found
@@ -136,7 +139,7 @@ class Fit:
             expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
         return expected
 
-    def _refined(self, start: FloatArray, places: IntArray) -> FloatArray:
+    def _refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         misfit, vector, mean = self.misfit, start.copy(), start.copy()
         planes = misfit.plane_entries
@@ -146,12 +149,11 @@ class Fit:
             vector[places] = part
             return vector
 
-        prior, nothing = self.prior(mean, places), lambda place: None
         found = solve(
-            lambda part: misfit.residual(whole(part)),
-            lambda part: misfit.jacobian(whole(part), places, nothing),
+            lambda part: trials.residual(whole(part)),
+            lambda part: trials.jacobian(whole(part), places),
             start[places],
-            prior,
+            self.prior(mean, places),
             REFINING_STEPS,
         )
         return whole(found.vector)
@@ -159,12 +161,12 @@ class Fit:
     def _progress(self, what: str) -> Callable[[int, int], None]:
         return lambda done, of: self.on_stage(what, done / max(of, 1))
 
-    def solve(self, stage: str, start: FloatArray, mean: FloatArray) -> Solution:
-        """Least squares of a stage's entries; the whole vector."""
+    def solve(self, stage: str, start: FloatArray, mean: FloatArray, most_steps: int | None = None) -> Solution:
+        """Least squares of a stage's entries, in at most ``most_steps`` steps; the whole vector."""
         free, misfit = self.free(stage), self.misfit
         prior = self.prior(mean, free)
         what = f"least squares of {len(free)} parameters"
-        steps = self.options.steps
+        steps = self.options.steps if most_steps is None else min(most_steps, self.options.steps)
 
         def whole(part: FloatArray) -> FloatArray:
             vector = start.copy()
@@ -177,7 +179,7 @@ class Fit:
             def column(place: int) -> None:
                 self.on_stage(what, min((done + place / max(len(free), 1)) / (steps + 1), 1.0))
 
-            return misfit.jacobian(whole(part), free, column)
+            return near(misfit, whole(part)).jacobian(whole(part), free, column)
 
         def on_step(step: int, cost: float) -> None:
             nonlocal done

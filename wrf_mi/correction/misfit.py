@@ -52,6 +52,7 @@ class Misfit:
         start: stated values of the vector [p].
         parts: slice of each parameter in the vector, by name.
         observed: observations [n_rx * rows, values] in the residuals' unit, NaN where nothing was received.
+        unit: unit of each row's residuals [n_rx * rows].
     """
 
     def __init__(
@@ -90,9 +91,10 @@ class Misfit:
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
         self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)
-        self.observed, self._unit = self._observations()
+        self.observed, self.unit = self._observations()
         self._reports = [self._recorded(r, tangent=False) for r in range(len(self.sides))]
         self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
+        self._gains = [_recorded_gain(side) for side in self.sides]
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
         """Observations and their units [n_rx * rows], in which residuals are."""
@@ -148,9 +150,19 @@ class Misfit:
         """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
         params = self._device(vector)
         found = [np.asarray(report(params).numpy(), float).reshape(len(self.rows), -1) for report in self._reports]
-        return np.concatenate(found) / self._unit[:, None] - self.observed
+        return np.concatenate(found) / self.unit[:, None] - self.observed
 
-    def jacobian(self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None]) -> NDArray[np.float32]:
+    def gains(self, vector: FloatArray) -> NDArray[np.complex128]:
+        """Gains of the paths of a vector, receiver by receiver, without exp(-j k length)."""
+        params, found = self._device(vector), list[NDArray[np.complex128]]()
+        for side, gain in zip(self.sides, self._gains, strict=True):
+            real, imaginary = gain(params)
+            found.append((np.asarray(real) + 1j * np.asarray(imaginary))[side.exists])
+        return np.concatenate(found)
+
+    def jacobian(
+        self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
+    ) -> NDArray[np.float32]:
         """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
         count, params = len(self.rows), self._device(vector)
@@ -160,7 +172,7 @@ class Misfit:
                 slope = tangent(params, direction).numpy()
                 slopes[r * count : (r + 1) * count, :, place] = slope.reshape(count, -1)
             on_column(place)
-        slopes /= self._unit[:, None, None]
+        slopes /= self.unit[:, None, None]
         slopes[~np.isfinite(self.observed).all(axis=1)] = 0
         return slopes
 
@@ -197,6 +209,18 @@ class Misfit:
                 np.add.at(planes, np.asarray(level.plane)[reflects], 1)
                 np.add.at(slabs, np.asarray(level.material)[reflects | passes], 1)
         return planes, slabs
+
+
+def _recorded_gain(side: TracedField) -> Recorded:
+    """Function of parameters: real and imaginary parts of the gains of all paths."""
+
+    def gain(params: Mapping[str, Any]) -> Any:
+        with dr.suspend_grad():
+            found = side(params).gain
+            dr.eval(found)
+        return found
+
+    return Recorded(gain, lambda: side.arrays)
 
 
 def _arrays(side: TracedField, model: ReceiverModel) -> Sequence[Any]:

@@ -21,6 +21,7 @@ from ..tracing.materials import itu_constants
 from ..tracing.plane_parameters import SHIFT, TILT
 from .least_squares import Noise
 from .misfit import Misfit
+from .path_sum import PathSum, near
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
@@ -105,8 +106,8 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_o
             np.concatenate([material.places, shift.places]),
             {
                 f"{kind}, {there}": np.concatenate([values, moved])
-                for kind, values in material.values.items()
                 for there, moved in shift.values.items()
+                for kind, values in material.values.items()
             },
             np.concatenate([material.deviation, shift.deviation]),
         )
@@ -121,7 +122,7 @@ def choose(
     vector: FloatArray,
     choices: Sequence[Choice],
     expect: Callable[[FloatArray, IntArray], FloatArray],
-    refine: Callable[[FloatArray, IntArray], FloatArray],
+    refine: Callable[[Misfit | PathSum, FloatArray, IntArray], FloatArray],
     on_choice: Callable[[int, int], None],
 ) -> tuple[FloatArray, dict[str, str]]:
     """Coordinate descent over choices, in sweeps until none changes.
@@ -131,34 +132,39 @@ def choose(
         vector: start [p].
         choices: choices in the order in which they are tried.
         expect: ``expect(vector, places)``: entries ``places`` by all others, in place of alternatives' NaN.
-        refine: ``refine(vector, places)``: the vector after some least-squares steps of the entries ``places``.
+        refine: ``refine(trials, vector, places)``: the vector after some least-squares steps of the entries ``places``
+            on the residuals of ``trials``.
         on_choice: called with the number of choices tried and their number.
 
     Returns:
         The vector, and the alternative taken by each choice that changed.
     """
     vector, taken, first = np.array(vector, float), dict[str, str](), itemgetter(0)
-    residual = misfit.residual(vector)
     for sweep in range(SWEEPS):
-        noise, changed = Noise.of(residual), False
+        trials = near(misfit, vector)
+        residual, changed = trials.residual(vector), False
+        noise = Noise.of(residual)
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
             tried, expected = [], expect(vector, choice.places)
             for name, values in choice.values.items():
                 there = vector.copy()
                 there[choice.places] = np.where(np.isnan(values), expected, values)
-                tried.append((noise.cost(misfit.residual(there)) + choice.cost(there), name, there))
+                tried.append((noise.cost(trials.residual(there)) + choice.cost(there), name, there))
             if choice.joint:
                 # A plane that is tilted, too, fits at the right shift only once its tilts do.
                 by_shift = {
                     name.rpartition(",")[2]: (cost, name, there) for cost, name, there in sorted(tried, key=first)[::-1]
                 }
+                places = choice.places if trials is misfit else choice.places[np.isfinite(choice.deviation)]
                 for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
-                    better = refine(there, choice.places)
-                    tried.append((noise.cost(misfit.residual(better)) + choice.cost(better), name, better))
+                    better = refine(trials, there, places)
+                    tried.append((noise.cost(trials.residual(better)) + choice.cost(better), name, better))
             least, name, there = min(tried, key=first)
             if least < noise.cost(residual) + choice.cost(vector) - GAIN:
-                taken[choice.what], vector, residual, changed = name, there, misfit.residual(there), True
+                taken[choice.what], vector, residual, changed = name, there, trials.residual(there), True
+                if isinstance(trials, PathSum):
+                    trials.accept(there)
         if not changed:
             break
     return vector, taken
