@@ -127,15 +127,46 @@ def traced_room(
 
 def transmitters(scene: Any, room: TracedRoom) -> FloatArray:
     """Positions [train + test, 3] in metres, uniform over the free volume of a ``sionna.rt.Scene``, to 0.1 mm."""
-    surfaces, rng = scene_surfaces(scene), np.random.default_rng([room.seed, 0])
+    low, high = np.array([0, 0, room.low_m]), np.array([LENGTH, WIDTH, room.high_m])
+    rng = np.random.default_rng([room.seed, 0])
+    apart = room.seed, RECEIVER.position_m, room.from_array_m
+    return free_positions(scene, low, high, room.train + room.test, room.clear_m, rng, *apart)
+
+
+def free_positions(
+    scene: Any,
+    low_m: FloatArray,
+    high_m: FloatArray,
+    count: int,
+    clear_m: float,
+    rng: np.random.Generator,
+    seed: int,
+    station_m: FloatArray | None = None,
+    from_station_m: float = 0.0,
+) -> FloatArray:
+    """Positions [count, 3] in metres, uniform over the free part of a box, to 0.1 mm.
+
+    Args:
+        scene: a ``sionna.rt.Scene``.
+        low_m: lower corner of the box [3], metres.
+        high_m: upper corner of the box [3], metres.
+        count: number of positions.
+        clear_m: least distance from surfaces, metres.
+        rng: generator of the positions.
+        seed: seed of the points by which distances from surfaces are judged.
+        station_m: position [3] to keep away from, metres; None: none.
+        from_station_m: least distance from it, metres.
+    """
+    surfaces = scene_surfaces(scene)
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
     # A point every 2 cm or so: much less than the clearance.
-    tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=room.seed)[0])
-    count, found = room.train + room.test, np.zeros((0, 3))
+    tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=seed)[0])
+    found = np.zeros((0, 3))
     while len(found) < count:
-        drawn = np.round(rng.uniform([0, 0, room.low_m], [LENGTH, WIDTH, room.high_m], (count, 3)), 4)
-        free = tree.query(drawn)[0] > room.clear_m
-        free &= np.linalg.norm(drawn - RECEIVER.position_m, axis=1) > room.from_array_m
+        drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
+        free = tree.query(drawn)[0] > clear_m
+        if station_m is not None:
+            free &= np.linalg.norm(drawn - station_m, axis=1) > from_station_m
         free &= solid_around(surfaces, drawn) < 0
         found = np.concatenate([found, drawn[free]])
     return found[:count]

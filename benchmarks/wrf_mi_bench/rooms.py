@@ -1,0 +1,146 @@
+"""Channels of twelve random rooms, predicted from scans as they are, from corrected ones, and without a scene.
+
+A room's accuracy is the mean over test rows of the channel estimation accuracy (CEA), limited to 0 to 40 dB: below, a
+prediction is worse than none, and above, errors do not matter to a receiver. Rooms are those of the seeds 0 to 11;
+nothing was tuned on them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+from wrf_mi_scenes.random_rooms import random_room
+
+import wrf_mi
+from wrf_mi.core import Record
+from wrf_mi.core.files import write_atomically
+from wrf_mi.correction import correct_scene, write_page
+from wrf_mi.datasets import make_splits
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.synthetic.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
+from wrf_mi.tasks import instrument_of, task_of
+from wrf_mi.tracing import TraceResult
+from wrf_mi.tracing.tracer import RayTracer
+
+from .comparison import line
+from .scene import match
+
+SEEDS = range(12)
+RUNS = Path("runs/bench/rooms")
+LIMITS_DB = 0.0, 40.0
+SCAN, CORRECTED = "trace, scan", "trace, corrected"
+MODELS: Mapping[str, tuple[str, str]] = {
+    "kriging": ("kriging", ""),
+    "physics, no scene": ("physics", ""),
+    "physics, scan": ("physics", "scan"),
+    "physics, corrected": ("physics", "corrected"),
+}
+"""Model, and the scene that it is given or "", by the column of the table."""
+COLUMNS = (SCAN, CORRECTED, *MODELS)
+ASKED_DB = 3.0
+"""Least median gain of the corrected scene."""
+
+
+def clipped_cea_db(prediction: NDArray[Any], truth: NDArray[Any], record: Record) -> float:
+    """Mean over rows of the CEA of channels [n, subcarriers], limited to `LIMITS_DB`."""
+    return float(np.clip(task_of(record).score(prediction, truth), *LIMITS_DB).mean())
+
+
+def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
+    """How far the paths of a scan's scene are from those of the true one, between the same ends.
+
+    Paths are the same where directions at both ends and lengths agree (`wrf_mi_bench.scene.match`); the scan's are
+    right where the length is, too, within a quarter of the wavelength, as other phases add up to another channel.
+
+    Returns:
+        ``missing``, the share of the true paths that the scan lacks; ``wrong``, the share of the scan's paths that are
+        not there or not right; and the root mean square ``phase_error_rad`` of reflected paths that are the same.
+    """
+    ours, theirs = match(truth.paths, scan.paths)
+    longer = np.abs(truth.paths.length_m[ours] - scan.paths.length_m[theirs])
+    wavelength = speed_of_light / CARRIER_HZ
+    phase = 2 * np.pi / wavelength * longer[truth.paths.bounces[ours] > 0]
+    return {
+        "missing": 1 - len(ours) / max(len(truth.paths), 1),
+        "wrong": 1 - np.count_nonzero(longer < wavelength / 4) / max(len(scan.paths), 1),
+        "phase_error_rad": float(np.sqrt(np.square(phase).mean())),
+    }
+
+
+def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str, Any]:
+    """Accuracy of every prediction in the room of a seed; all files go into a folder."""
+    room = random_room(seed)
+    record, true, scan = random_room_record(seed, folder, survey)
+    split = make_splits(record, "official")[0]
+    corrected = folder / "corrected"
+    page = write_page(correct_scene(scan, record, split), corrected, replace=True)
+    rows, instrument = split.test, instrument_of(record)
+    truth = record.scored[0, rows]
+    traced, scores = {}, {}
+    for name, opened in (("true", true), (SCAN, scan), (CORRECTED, corrected)):
+        tracer = RayTracer(opened, instrument, OPTIONS)
+        traced[name] = tracer.trace(record.tx_pos_m[rows])
+        scores[name] = clipped_cea_db(tracer.observe(traced[name])[0], truth, record)
+    scenes = {"": None, "scan": scan, "corrected": corrected}
+    for column, (model, given) in MODELS.items():
+        run = wrf_mi.train(record, folder / "runs" / column.replace(", ", "-"), model, scene=scenes[given])
+        found = wrf_mi.open_run(run.folder, record).predict(record.tx_pos_m[rows]).mean
+        scores[column] = clipped_cea_db(np.asarray(found), truth, record)
+    size = " x ".join(f"{side:.1f}" for side in room.size_m)
+    what = f"{seed}: {size} m, {len(room.parts) - 6} pieces, {room.mount}{', perfect' if room.perfect else ''}"
+    kept = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
+    facts = {"surfaces": len(page["materials"]), "planes": len(page["planes"])}
+    return {
+        **line(what, f"{scores[SCAN]:.1f} to {scores[CORRECTED]:.1f} dB", "-"),
+        "cea_db": scores,
+        "scan": disagreement(traced["true"], traced[SCAN]),
+        "correction": kept | facts,
+    }
+
+
+def main() -> dict[str, Any]:
+    """Measure all rooms; a room that this code has measured before is not measured again.
+
+    Returns:
+        ``rows``: of each room, and of the median over rooms, ``cea_db`` by column, and for each room how wrong its
+        ``scan`` is and sizes and duration of its ``correction``.
+    """
+    place, rows = RUNS / fit_key(source_files()), list[dict[str, Any]]()
+    for seed in SEEDS:
+        file = place / f"{seed}.json"
+        if not file.exists():
+            shutil.rmtree(place / str(seed), ignore_errors=True)
+            row = measure_room(seed, place / str(seed))
+            write_atomically(file, json.dumps(row, indent=1))
+            shutil.rmtree(place / str(seed))
+        rows.append(json.loads(file.read_text()))
+    gains = [row["cea_db"][CORRECTED] - row["cea_db"][SCAN] for row in rows]
+    medians = {column: float(np.median([row["cea_db"][column] for row in rows])) for column in COLUMNS}
+    text = f"{np.median(gains):.1f} dB ({min(gains):.1f} to {max(gains):.1f} dB)"
+    median = line("median gain of the corrected scene (range over rooms)", text, f"{ASKED_DB:.0f} dB, aim 15 dB")
+    return {"rows": [*rows, {**median, "cea_db": medians}]}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table of the accuracy in each room, its scan's errors and the duration of the correction."""
+    head = [*COLUMNS, "paths missing", "wrong", "phase error", "correction"]
+    lines = [f"| room | {' | '.join(head)} |", "| --- |" + " ---: |" * len(head)]
+    for row in rows:
+        cells = [f"{row['cea_db'][column]:.1f}" for column in COLUMNS]
+        name = f"**median**; {row['what']}: {row['value']}"
+        if "scan" in row:
+            name = row["what"]
+            cells += [f"{100 * row['scan'][share]:.0f} %" for share in ("missing", "wrong")]
+            cells.append(f"{row['scan']['phase_error_rad']:.1f} rad")
+            cells.append(f"{row['correction']['seconds']:.0f} s")
+        else:
+            cells += [""] * 4
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -1,0 +1,84 @@
+"""Random rooms: what a seed fixes, and what rooms and their scans promise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from wrf_mi_bench.rooms import disagreement
+from wrf_mi_scenes.mitsuba_xml import PERFECT
+from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
+
+from wrf_mi.scene.folder import read_scene_folder
+from wrf_mi.synthetic.random_room import OPTIONS, Survey, random_room_record
+from wrf_mi.tasks import instrument_of
+from wrf_mi.tracing.tracer import RayTracer
+
+ROOMS = [random_room(seed) for seed in range(200, 240)]
+SMALL = Survey(train=20, test=20, rays=40_000)
+
+
+def test_rooms_keep_their_bounds() -> None:
+    for room in ROOMS:
+        low, high = (
+            getattr(np, what)([m.bounds[k] for _, m in room.parts.values()], axis=0)
+            for k, what in enumerate(("min", "max"))
+        )
+        np.testing.assert_allclose(low, 0, atol=1e-12)
+        np.testing.assert_allclose(high, room.size_m)
+        assert ((np.array(room.size_m[:2]) >= LEAST_M) & (np.array(room.size_m[:2]) <= MOST_M)).all()
+        assert HEIGHTS_M[0] <= room.size_m[2] <= HEIGHTS_M[1]
+        assert FEWEST <= len(room.parts) - 6 <= MOST
+
+
+def test_furniture_and_access_point_stand_apart() -> None:
+    for room in ROOMS:
+        boxes = [mesh.bounds for name, (_, mesh) in room.parts.items() if name.startswith("piece")]
+        for index, one in enumerate(boxes):
+            assert (np.maximum(one[0] - room.station_m, room.station_m - one[1]).max()) >= CLEAR_M - 1e-4
+            for other in boxes[:index]:
+                assert np.maximum(one[0] - other[1], other[0] - one[1])[:2].max() > 0
+        walls = np.concatenate([room.station_m, np.subtract(room.size_m, room.station_m)])
+        assert walls.min() == pytest.approx(MOUNTED_M, abs=1e-4) if room.mount != "free" else walls.min() > MOUNTED_M
+
+
+def test_rooms_differ_in_mount_and_materials() -> None:
+    assert {room.mount for room in ROOMS} == set(MOUNTS)
+    perfect = [{material for material, _ in room.parts.values()} == {PERFECT} for room in ROOMS]
+    assert perfect == [room.perfect for room in ROOMS]
+    assert 0 < sum(perfect) < len(ROOMS) / 2
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple:
+    folder = tmp_path_factory.mktemp("room")
+    return folder, *random_room_record(103, folder, SMALL)
+
+
+def test_a_seed_fixes_channels_and_scan(made: tuple, tmp_path: Path) -> None:
+    _, record, _, scan = made
+    again, _, other = random_room_record(103, tmp_path, SMALL)
+    np.testing.assert_array_equal(record.observation, again.observation)
+    np.testing.assert_array_equal(record.tx_pos_m, again.tx_pos_m)
+    one, two = (sorted((path / "meshes").iterdir()) for path in (scan, other))
+    assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two]
+
+
+def test_noise_has_the_stated_power(made: tuple) -> None:
+    _, record, *_ = made
+    noise = np.square(np.abs(record.observation - record.truth)).mean(axis=2)
+    signal = np.square(np.abs(record.truth)).mean(axis=2)
+    assert 10 * np.log10((signal / noise).mean()) == pytest.approx(SMALL.snr_db, abs=1.5)
+
+
+def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made: tuple) -> None:
+    """And the scan states no material of the room: those of the rules."""
+    _, record, true, scan = made
+    traced = [RayTracer(scene, instrument_of(record), OPTIONS).trace(record.tx_pos_m) for scene in (true, scan)]
+    found = disagreement(*traced)
+    assert found["wrong"] >= 1 / 3
+    assert found["phase_error_rad"] >= 1
+    assert not read_scene_folder(scan).materials.constants
+    same = disagreement(traced[0], traced[0])
+    assert same == {"missing": 0, "wrong": 0, "phase_error_rad": 0}

@@ -1,0 +1,121 @@
+"""Channels of a random room (`wrf_mi_scenes.random_rooms`), and a scene made from its own misregistered scan.
+
+One antenna at an access point, eight subcarriers over 80 MHz at 2.44 GHz, noise. Paths: line of sight, reflections and
+transmissions, three at most. The scan is simulated from some positions in the room; it is displaced and turned against
+the frame of the devices as a whole, and each of its positions a little more, as registration leaves it. The scene is
+made of the scan by the pipeline of the command ``mesh``, with the materials of the default rules.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from wrf_mi_scenes.mitsuba_xml import write_scene
+from wrf_mi_scenes.random_rooms import random_room
+
+from ..core import Receiver, Record
+from ..core.angles import FloatArray
+from ..core.antenna import UPRIGHT
+from ..core.files import write_arrays
+from ..receivers.instruments import ChannelInstrument
+from ..scene.make import make_scene
+from ..scene.scan import simulate_scan
+from ..tracing.options import TraceOptions
+from ..tracing.scenes import open_scene
+from ..tracing.tracer import RayTracer
+from .floor_channels import with_noise
+from .furnished_room import free_positions
+
+CARRIER_HZ = 2.44e9
+SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
+OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 18, seed=1)
+"""Paths of the true channels."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Parameters of a random room's measurements.
+
+    Attributes:
+        train, test: numbers of training and test rows.
+        low_m, high_m: bounds of the transmitters' height, metres.
+        clear_m, from_station_m: least distances from surfaces and from the access point, metres.
+        snr_db: signal-to-noise ratio of each row.
+        poses, rays: number of the LiDAR's positions, and of rays at each.
+        frame_m, frame_rad: standard deviations of the scan's displacement along each axis and rotation about it.
+        pose_m, pose_rad: the same of each position of the LiDAR against the whole scan.
+    """
+
+    train: int = 300
+    test: int = 100
+    low_m: float = 0.5
+    high_m: float = 2.0
+    clear_m: float = 0.1
+    from_station_m: float = 0.5
+    snr_db: float = 30.0
+    poses: int = 4
+    rays: int = 60_000
+    frame_m: float = 0.03
+    frame_rad: float = 0.005
+    pose_m: float = 0.01
+    pose_rad: float = 0.001
+
+
+DEFAULT = Survey()
+SCANNER_CLEAR_M = 0.35
+"""Least distance of the LiDAR from surfaces, metres."""
+
+
+def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) -> tuple[Record, Path, Path]:
+    """Measure the room of a seed: its channels, and a scene made from a scan of it.
+
+    The official split is the first ``train`` rows and the rest; positions are drawn independently.
+
+    Args:
+        seed: seed of the room and of all that is drawn in it.
+        folder: folder for both scenes and the scan.
+        survey: parameters.
+
+    Returns:
+        The record, with ``task="csi"`` and `Record.truth`; the scene file of the true room, for comparison only; and
+        the scene folder made from the scan, the input of models.
+    """
+    folder, room = Path(folder), random_room(seed)
+    true = write_scene(folder / "truth", room.parts, f"Random room {seed}", "wrf_mi_scenes.random_rooms")
+    scene = open_scene(true.parent, CARRIER_HZ)
+    station = np.array(room.station_m)
+    count, rng = survey.train + survey.test, np.random.default_rng([seed, 1])
+    bounds = np.array([0.0, 0.0, survey.low_m]), np.array([*room.size_m[:2], survey.high_m])
+    positions = free_positions(scene, *bounds, count, survey.clear_m, rng, seed, station, survey.from_station_m)
+    record = Record(
+        f"random-room-{seed}",
+        "csi",
+        positions,
+        (Receiver("access-point", station, np.array(UPRIGHT)),),
+        np.zeros((1, count, len(SUBCARRIERS_HZ)), np.complex64),
+        official=(np.arange(survey.train), np.arange(survey.train, count)),
+        frequencies_hz=SUBCARRIERS_HZ,
+    )
+    channel = RayTracer(true.parent, ChannelInstrument(record.receivers, SUBCARRIERS_HZ), OPTIONS)(positions)[0]
+    noisy = with_noise(channel[:, None], survey.snr_db, np.random.default_rng([seed, 2]))[:, 0]
+    poses = free_positions(scene, *bounds, survey.poses, SCANNER_CLEAR_M, rng, seed)
+    scan = write_arrays(folder / "scan.npz", {"points": _scan(true, poses, seed, survey).astype(np.float32)})
+    measured = make_scene(scan, folder / "measured", replace=True).folder
+    observed = noisy.astype(np.complex64)[None]
+    return replace(record, observation=observed, truth=channel.astype(np.complex64)[None]), true.parent, measured
+
+
+def _scan(xml: Path, poses_m: FloatArray, seed: int, survey: Survey) -> FloatArray:
+    """Points [n, 3] in a frame that is off by the errors of the survey, metres."""
+    rng, parts = np.random.default_rng([seed, 3]), []
+    common = rng.normal(0, survey.frame_m, 3), Rotation.from_rotvec(rng.normal(0, survey.frame_rad, 3))
+    middle = poses_m.mean(axis=0)
+    for number, pose in enumerate(poses_m):
+        points = simulate_scan(xml, pose[None], rays_per_pose=survey.rays, seed=seed * len(poses_m) + number)
+        own = Rotation.from_rotvec(rng.normal(0, survey.pose_rad, 3))
+        points = own.apply(points - pose) + pose + rng.normal(0, survey.pose_m, 3)
+        parts.append(common[1].apply(points - middle) + middle + common[0])
+    return np.concatenate(parts)
