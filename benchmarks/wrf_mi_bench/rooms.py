@@ -69,7 +69,7 @@ def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
     phase = 2 * np.pi / wavelength * longer[truth.paths.bounces[ours] > 0]
     return {
         "missing": 1 - len(ours) / max(len(truth.paths), 1),
-        "wrong": 1 - np.count_nonzero(longer < wavelength / 4) / max(len(scan.paths), 1),
+        "wrong": 1 - int((longer < wavelength / 4).sum()) / max(len(scan.paths), 1),
         "phase_error_rad": float(np.sqrt(np.square(phase).mean())),
     }
 

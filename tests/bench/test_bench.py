@@ -29,7 +29,7 @@ from wrf_mi.parallel import Scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-NEEDS_NO_DATA = ("traced-and-splatted", "scaling", "operator", "stress", "pareto", "sentinels")
+NEEDS_NO_DATA = ("traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "sentinels")
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     "pareto": "speed.md",
@@ -38,6 +38,7 @@ ON_PAGE = {
     "budgets": "speed.md",
     "training": "speed.md",
     "stress": "numerics.md",
+    "rooms": "correction.md",
     "sentinels": "results.md",
 }
 """Pages that show a check's table; all others are in `docs/results.md`."""

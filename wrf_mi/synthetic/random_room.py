@@ -45,8 +45,8 @@ class Survey:
         clear_m, from_station_m: least distances from surfaces and from the access point, metres.
         snr_db: signal-to-noise ratio of each row.
         poses, rays: number of the LiDAR's positions, and of rays at each.
-        frame_m, frame_rad: standard deviations of the scan's displacement along each axis and rotation about it.
-        pose_m, pose_rad: the same of each position of the LiDAR against the whole scan.
+        frame_m, frame_rad: length of the scan's displacement and angle of its rotation, in random directions.
+        pose_m, pose_rad: standard deviations, along and about each axis, of the errors of each position of the LiDAR.
     """
 
     train: int = 300
@@ -58,8 +58,8 @@ class Survey:
     snr_db: float = 30.0
     poses: int = 4
     rays: int = 60_000
-    frame_m: float = 0.03
-    frame_rad: float = 0.005
+    frame_m: float = 0.055
+    frame_rad: float = 0.009
     pose_m: float = 0.01
     pose_rad: float = 0.001
 
@@ -111,7 +111,8 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
 def _scan(xml: Path, poses_m: FloatArray, seed: int, survey: Survey) -> FloatArray:
     """Points [n, 3] in a frame that is off by the errors of the survey, metres."""
     rng, parts = np.random.default_rng([seed, 3]), []
-    common = rng.normal(0, survey.frame_m, 3), Rotation.from_rotvec(rng.normal(0, survey.frame_rad, 3))
+    along, about = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    common = survey.frame_m * along, Rotation.from_rotvec(survey.frame_rad * about)
     middle = poses_m.mean(axis=0)
     for number, pose in enumerate(poses_m):
         points = simulate_scan(xml, pose[None], rays_per_pose=survey.rays, seed=seed * len(poses_m) + number)
