@@ -23,9 +23,10 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError
+from wrf_mi.core.digest import content_digest
 from wrf_mi.core.files import atomic_folder, one_line, write_atomically
 from wrf_mi.parallel import Scheduler
-from wrf_mi.runs.fit_key import content_digest, dataset_files, fit_key, scene_files
+from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files
 from wrf_mi.runs.folder import CONFIG, METRICS, package_versions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene

@@ -22,13 +22,14 @@ from pathlib import Path
 from typing import Any
 
 from ..core import AntennaOptions, InputError
+from ..core.digest import content_digest
 from ..core.files import one_line, write_atomically
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
-from .fit_key import content_digest, dataset_files, scene_files
+from .fit_key import dataset_files, scene_files
 from .folder import CONFIG, METRICS, package_versions
 from .results import write_csv
 

@@ -28,9 +28,9 @@ from ...core import InputError, Record
 from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
-from ...receivers import rssi_dbm
-from ...tracing import TraceOptions, trace_paths
+from ...tracing import TraceOptions
 from ...tracing.devices import solid_around
+from ...tracing.kept_powers import traced_powers
 from ...tracing.solve import Prepared
 
 NEAREST_M = 0.05
@@ -291,9 +291,7 @@ def trace_map(
     if not outside.any():
         raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
     traced = np.full((len(record.receivers), len(points)), np.nan)
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
-    found = trace_paths(scene, points[outside], record.receivers, options, **how)
-    traced[:, outside] = rssi_dbm(found.paths)
+    traced[:, outside] = traced_powers(scene, prepared, points[outside], record.receivers, options, record.tx_antenna)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers, which lie further apart than the neighbourhood and may be on different floors.

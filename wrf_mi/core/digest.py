@@ -1,0 +1,70 @@
+"""Digests of values and files: equal content has equal digests, other content another."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+
+
+def content_digest(*values: Any) -> str:
+    """SHA-256 (hex) of values.
+
+    Args:
+        values: arrays, data classes (fields that count in comparisons), mappings, tuples and lists of these, and plain
+            values. A path stands for the names and contents of the files there.
+
+    Raises:
+        InputError: a path that does not exist.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _add(digest, value)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    """Kind and size precede content, so that different values give different bytes."""
+    if isinstance(value, Path):
+        if not value.exists():
+            raise InputError(f"{value}: no such file or folder; restore it")
+        files = [value] if value.is_file() else files_below(value)
+        digest.update(f"files {len(files)}\n".encode())
+        for file in files:
+            with file.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest.update(f"{file.relative_to(value).as_posix()!r} {content}\n".encode())
+    elif isinstance(value, np.ndarray):
+        digest.update(f"array {value.dtype.str} {value.shape}\n".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__}\n".encode())
+        _add(digest, {field.name: getattr(value, field.name) for field in fields(value) if field.compare})
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping {len(value)}\n".encode())
+        for key in sorted(value):
+            _add(digest, key)
+            _add(digest, value[key])
+    elif isinstance(value, (tuple, list)):
+        digest.update(f"sequence {len(value)}\n".encode())
+        for item in value:
+            _add(digest, item)
+    elif value is None or isinstance(value, (str, int, float, np.generic)):
+        digest.update(f"{value!r}\n".encode())
+    else:
+        raise TypeError(
+            f"content_digest: {type(value).__name__} has no digest; give arrays, data classes or plain values"
+        )
+
+
+def files_below(folder: Path) -> list[Path]:
+    """All files below a folder; links are followed."""
+    below = (Path(parent) / name for parent, _, names in os.walk(folder, followlinks=True) for name in names)
+    return sorted(path for path in below if path.is_file())
