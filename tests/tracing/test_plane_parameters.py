@@ -27,7 +27,7 @@ import mitsuba as mi
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.material_parameters import MaterialGrouping
+from wrf_mi.tracing.material_parameters import MaterialGrouping, read_materials
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
 from wrf_mi.tracing.surfaces import scene_surfaces
 from wrf_mi.tracing.walls import walls_of
@@ -294,3 +294,13 @@ def test_plain_sionna_rt_opens_a_corrected_scene_below_the_range_of_its_material
         for quantity in ("relative_permittivity", "conductivity", "thickness"):
             values = (float(np.ravel(getattr(one, quantity))[0]) for one in (thing.radio_material, stated))
             assert next(values) == pytest.approx(next(values), rel=1e-4), (name, quantity)
+
+
+def test_corrected_scene_has_the_fitted_constants_of_named_materials(scene: Any, tmp_path: Path) -> None:
+    """Training has one number for each quantity of a material, in an array of one."""
+    slabs = read_materials(scene)
+    name = next(iter(scene.objects.values())).radio_material.name
+    stated = slabs.permittivity[slabs.names.index(name)]
+    raised = {f"material.{name}.permittivity": np.log([stated + 1.0])}  # permittivity 1 + exp(x)
+    again = open_scene(write_corrected_scene(tmp_path / "corrected", scene, raised), FREQUENCY_HZ)
+    assert np.isclose(read_materials(again).permittivity, stated + 2.0, rtol=1e-5).any()

@@ -89,7 +89,7 @@ def material_constants(slabs: SlabMaterials, parameters: Mapping[str, NDArray[An
     for column, (quantity, least) in enumerate(QUANTITIES.items()):
         for index, name in enumerate([SURFACE] if slabs.grouping == "surface" else slabs.names):
             if (found := parameters.get(name_of(name, quantity))) is not None:
-                rows = slice(None) if name == SURFACE else index
+                rows = slice(None) if name == SURFACE else slice(index, index + 1)
                 values[rows, column] = least + np.exp(np.ravel(np.asarray(found, float)))
     return values
 
