@@ -103,11 +103,11 @@ def test_run_folder_states_scene_and_trained_parameters(rooms: dict[str, Path], 
     stated = yaml.safe_load((run / "config.yaml").read_text())
     assert stated["scene"] == str(rooms["known"])
     params = open_run(run).field.params
-    moved = {name for name in params if name.startswith(("material", "receiver"))}
-    assert {"receiver.gateway1.gain", "material.itu_concrete.permittivity", "material.itu_brick.conductivity"} <= moved
+    moved = {name for name in params if name.startswith(("material", "receiver", "surface"))}
+    assert {"receiver.gateway1.gain", "material.surface.permittivity", "surface.factor"} <= moved
     # A pose is held unless a rate is given for it, and costs nothing.
     assert not any("position" in name or "turn" in name for name in moved)
-    for name in ("receiver.gateway1.gain", "material.itu_concrete.permittivity"):
+    for name in ("receiver.gateway1.gain", "material.surface.permittivity", "surface.factor"):
         assert params[name].any()
 
 

@@ -191,7 +191,7 @@ def test_calibration_is_kept_and_scores_again(
             scene=room,
             settings=["calibration=gain", "holdout_steps_fraction=2"],
         )
-    with pytest.raises(InputError, match="calibration everything: choose of gain, materials, planes, patterns, pose"):
+    with pytest.raises(InputError, match="everything: choose of gain, materials, planes, patterns, pose, surface"):
         train(flat_folder, tmp_path / "other", "ray-tracing", scene=room, settings=["calibration=everything"])
 
 

@@ -82,7 +82,7 @@ def test_held_out_groups_are_clusters_of_positions() -> None:
 @pytest.mark.parametrize("higher_is_better", [True, False])
 def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better: bool) -> None:
     """The truth is a correction that falls off within half a metre: weights of that reach have no error."""
-    held = [at(0.05, 0.2, 0.5, 1.0)]
+    held = [at(*np.linspace(0.05, 1.0, 20))]
     reach = Reach(ORIGIN, 0.0)
     lengths = reach.lengths(held)
     truth = replace(reach, length_m=lengths[3]).weight(held[0], 0)
@@ -90,13 +90,25 @@ def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better: bool) -
     def score(receiver: int, weight: Sequence[float]) -> np.ndarray:
         return np.abs(weight - truth) * (-1 if higher_is_better else 1)
 
-    assert choose_reach(reach, lengths, held, score, higher_is_better) == (lengths[3], 0.0)
+    found, scores = choose_reach(reach, lengths, held, score, higher_is_better)
+    assert found == lengths[3]
+    assert not scores.any()
+
+
+def test_reach_whose_gain_is_within_its_standard_error_is_not_chosen() -> None:
+    """Gaussians that add noise of mean zero, and a gain of half its standard error."""
+    held = [at(*np.linspace(0.05, 1.0, 40))]
+    noise = np.random.default_rng(0).normal(0, 1, 40)
+    noise += 0.5 * noise.std() / np.sqrt(40) - noise.mean()
+    reach = Reach(ORIGIN, np.inf)
+    assert choose_reach(reach, [0.0, np.inf], held, lambda r, weight: noise * weight, True)[0] == 0
+    assert choose_reach(reach, [0.0, np.inf], held, lambda r, weight: (noise + 1) * weight, True)[0] == np.inf
 
 
 def test_without_held_out_rows_the_reach_is_kept() -> None:
-    found, score = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w, True)
+    found, scores = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w, True)
     assert found == 2.0
-    assert np.isnan(score)
+    assert not len(scores)
 
 
 def channels(channel: np.ndarray, position: np.ndarray) -> Record:

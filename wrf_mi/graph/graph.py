@@ -6,8 +6,8 @@
 
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
-``receiver.*`` and ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`). Without a scene Sionna RT is
-not imported.
+``receiver.*``, ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`) and ``surface.*``
+(`wrf_mi.tracing.surface_gaussians`). Without a scene Sionna RT is not imported.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component
 from ..gaussians.tiles import Plane
-from ..tracing.options import TraceOptions
+from ..tracing.options import FACTOR, TraceOptions
 from ..tracing.polarization import check_polarization
 from ..tracing.pose import receiver_pose
 from ..tracing.solve import Prepared
+from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
 from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form, ReceiverModel
@@ -85,6 +86,9 @@ class Graph:
         tx_antenna: antenna of the transmitters.
         evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
 
+    Attributes:
+        surface: Gaussians on the scene's surfaces, which change its paths; None: none (`cover`).
+
     Raises:
         InputError: a receiver model or a scene without the array or carrier it needs, or nothing to evaluate.
     """
@@ -112,6 +116,7 @@ class Graph:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.form, self.tx_antenna = form, tx_antenna
+        self.surface: SurfaceGaussians | None = None
         self.evaluation = evaluation_of(evaluation, scene, traced)
         self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, receiver) for receiver in receivers)
 
@@ -153,7 +158,33 @@ class Graph:
         trace = TraceOptions(transmission=t.transmission, max_depth=t.depth, max_reflections=t.reflections, rays=t.rays)
         antenna, receiver = self.tx_antenna, self.receivers[number]
         options = TracedOptions(trace, t.pattern_degree, 1.0, antenna, t.materials, t.moves_planes, t.faint)
-        return TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
+        side = TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
+        if self.surface:
+            side.attach(self.surface)
+        return side
+
+    def cover(
+        self, sides: Sequence[TracedField | None], given: Mapping[str, NDArray[Any]] | None = None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Put Gaussians on the surfaces that paths of traced sides meet, if the settings train them.
+
+        Args:
+            sides: traced sides of the training transmitters; later ones get the same Gaussians.
+            given: parameters of a fit with such Gaussians, which replace new ones.
+
+        Returns:
+            Starting values of their parameters, none without such Gaussians.
+        """
+        spacing_m, present = self.traced.surface_spacing, [side for side in sides if side is not None]
+        if given is not None:
+            self.surface = SurfaceGaussians.of(given, spacing_m)
+        elif self.traced.surface > 0 and present:
+            self.surface = SurfaceGaussians.covering(Interactions.joined([s.interactions for s in present]), spacing_m)
+        if not self.surface:
+            return {}
+        for side in present:
+            side.attach(self.surface)
+        return self.surface.parameters()
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
         """Starting values of the trained parameters beside the field's, by name, from the traced sides of all
@@ -207,6 +238,7 @@ class Graph:
         side: TracedField | None,
         learned: bool = True,
         chunked: bool = False,
+        surface: bool = True,
     ) -> Report:
         """Reports of a receiver as a function of parameters, for transmitters of a traced side.
 
@@ -215,11 +247,14 @@ class Graph:
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
             chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
+            surface: with the Gaussians on surfaces, where the graph has some.
         """
         model, receiver = self.models[number], self.receivers[number]
         moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
+            if not surface:
+                params = {name: values for name, values in params.items() if name != FACTOR}
             paths = None if side is None else side(params, batch.slots)
             if self.field is None or not learned:
                 return model(paths, None)

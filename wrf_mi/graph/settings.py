@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..core.settings import ShareBelow1
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
+from ..core.settings import Positive, ShareBelow1
+from ..tracing.options import DISC, MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 
 EvaluationName = Literal["splatted", "traced"]
 """Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
-TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.")
+TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.", "surface.")
 """Prefixes of the traced side's parameters (`wrf_mi.tracing.traced_field.TracedField.parameters`)."""
 
 
@@ -42,6 +42,9 @@ class TracedConfig:
         turn: rate of the receivers' orientations, rad.
         shift: rate of the planes' shifts along their normals, metres.
         tilt: rate of the planes' tilts, rad.
+        surface: rate of the factors of Gaussians on the surfaces (of their logarithms, and of their phases in rad); 0:
+            no such Gaussians.
+        surface_spacing: distance of neighbouring Gaussians on a surface, metres.
     """
 
     depth: Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")] = 3
@@ -59,11 +62,15 @@ class TracedConfig:
     turn: float = 0.0
     shift: float = 0.0
     tilt: float = 0.0
+    surface: float = 0.02
+    surface_spacing: Positive = 0.5
 
     def rate(self, name: str) -> float:
         """Learning rate of a parameter of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
+        if name == DISC:
+            return 0.0
         first, last = name.partition(".")[0], name.rpartition(".")[2]
-        rate: float = getattr(self, first if first in ("material", "pattern") else last)
+        rate: float = getattr(self, first if first in ("material", "pattern", "surface") else last)
         return rate
 
     @property

@@ -60,8 +60,8 @@ class TracingSettings(LoopOptions, TraceOptions):
 
     Attributes:
         calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
-            receiver), ``materials``, ``planes``, ``patterns`` (of the antennas) and ``pose`` (of the receivers); null:
-            none.
+            receiver), ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and
+            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.surface_gaussians`); null: none.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters
             (`wrf_mi.tracing.convergence`); null: none are chosen.
@@ -184,7 +184,8 @@ def _graph_problem(problem: Problem) -> Problem:
 
 
 def _changes_scene(problem: Problem) -> bool:
-    return bool({"planes", "materials"} & set((problem.settings.calibration or "").split(",")))
+    parts = set((problem.settings.calibration or "").split(","))
+    return bool({"planes", "materials"} & parts) and "surface" not in parts  # a scene's folder holds no Gaussians
 
 
 def fit(problem: Problem, split: Split, session: Session) -> Fitted:

@@ -11,6 +11,9 @@ MAX_DEPTH = 12
 MAX_RAYS = 1 << 24
 MAX_DEGREE = 8
 """Largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`."""
+FACTOR, DISC = "surface.factor", "surface.disc"
+"""Parameters of Gaussians on surfaces (`wrf_mi.tracing.surface_gaussians`): trained [2, g], logarithmic amplitudes and
+phases in rad, and constant [6, g], centres in metres and unit normals."""
 
 
 @dataclass(frozen=True)

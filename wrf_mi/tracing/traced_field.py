@@ -35,10 +35,12 @@ from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .material_parameters import MaterialGrouping, slabs_of_faces
+from .options import FACTOR
 from .pattern_parameters import pattern_coefficients, pattern_factor
 from .plane_parameters import PlaneTables
 from .pose import component, moved_m, pose_parameters, receiver_pose
 from .solve import Prepared
+from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 from .surfaces import Surfaces, scene_surfaces
 
 Float64: Any = dr.float64_array_t(mi.Float)
@@ -154,6 +156,8 @@ class TracedField:
             raise InputError(f"{text}; trace these")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
         self._prepared = prepared
+        self._gaussians: SurfaceGaussians | None = None
+        self._weights: PathWeights | None = None
         self.frequency_hz = float(scene.frequency[0])
         self.searches = 0
         self.surfaces: Surfaces = scene_surfaces(scene)
@@ -177,7 +181,7 @@ class TracedField:
     @property
     def arrays(self) -> list[Any]:
         """Device arrays that a call reads beside its arguments, the inputs of a recording."""
-        return [self.chains, self._constants, self._planes]
+        return [self.chains, self._constants, self._planes, self._weights]
 
     @property
     def gain_name(self) -> str:
@@ -226,12 +230,13 @@ class TracedField:
             parameters: Dr.Jit tensors by the names of `parameters`; missing ones keep their initial values.
             rows: transmitters of the batch, an unsigned integer array; None: all.
         """
-        chains, batch = self.chains, len(self)
+        chains, batch, chosen = self.chains, len(self), None
         if rows is not None:
             batch = dr.width(rows)
             slot = dr.arange(mi.UInt32, batch * self._each)
             row = dr.gather(mi.UInt32, rows, slot // self._each)
-            chains = chains.select(row * self._each + slot % self._each)
+            chosen = row * self._each + slot % self._each
+            chains = chains.select(chosen)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
         tables = (*self.slabs.tables(parameters, self._constants[:3]), self._constants[3])
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
@@ -247,11 +252,24 @@ class TracedField:
         for name, direction in ((self.pattern_name, paths.arrival), (TX_PATTERN, paths.departure)):
             if name in parameters:
                 gain = times(gain, pattern_factor(parameters[name], direction))
+        if self._weights is not None and FACTOR in parameters:
+            gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
         return TracedPaths(gain, paths.length_m, paths.arrival, batch, self._each)
 
     def pose(self, parameters: Mapping[str, Any], float_type: Any = mi.Float) -> Pose:
         """Corrected pose of the receiver, for Gaussians."""
         return receiver_pose(self.receiver, parameters, float_type)
+
+    @property
+    def interactions(self) -> Interactions:
+        """Points at which paths meet surfaces, as found with the planes as stated."""
+        return self._met
+
+    def attach(self, gaussians: SurfaceGaussians) -> None:
+        """Let Gaussians on the surfaces change paths, by the parameter `wrf_mi.tracing.options.FACTOR`."""
+        self._gaussians = gaussians
+        count = len(self) * self._each
+        self._weights = PathWeights.of(gaussians, self._met, self._path_of_met, count)
 
     def search(self, here_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
@@ -307,6 +325,12 @@ class TracedField:
                 )
             )
         self._each, self.searched_at_m = each, np.array(here_m, float)
+        met = types != 0
+        normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
+        self._met = Interactions(traced.paths.vertices_m[met], normal)
+        self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
+        if self._gaussians is not None:
+            self.attach(self._gaussians)
         self.chains = Chains(
             [repeated(c) for c in self.tx_pos_m.T],
             (repeated(np.cos(self.heading_rad)), repeated(np.sin(self.heading_rad))),

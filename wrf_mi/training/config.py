@@ -259,24 +259,27 @@ PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every
 """Settings of paths alone: few parameters converge soon."""
 PATHS_OF_IMAGES = ("batch=8",)
 """Further settings where observations are images of thousands of numbers."""
-HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0")
+HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0", "traced.surface=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "gain": ("traced.gain=0.05",),
     "materials": ("traced.material=0.05",),
     "planes": ("traced.shift=1e-3", "traced.tilt=5e-4"),
     "patterns": ("traced.pattern=0.03", "traced.pattern_degree=3"),
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
+    "surface": ("traced.surface=0.02",),
 }
 """Trainable parts of the traced side by name; rates as ``--set`` takes them."""
-JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05")
+JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05", "traced.materials=surface")
 """Settings of Gaussians beside the paths of a scene for one antenna: the few parameters of paths converge soon."""
 JOINT_IMAGES = (
     "batch=8",
-    "steps=1500",
+    "steps=2000",
     "initial.signal=0.02",
     "density.every=0",
-    "validate_every=50",
-    "patience=6",
+    "validate_every=100",
+    "patience=3",
+    "traced.alone=0.15",
+    "traced.materials=surface",
 )
 """Settings where observations are images: paths explain most of one, and Gaussians add little at first."""
 

@@ -106,6 +106,7 @@ class TrainingLoop(ABC):
             loss, trouble = self.take_step(trouble)
             losses += loss
             dr.eval(losses)
+            state = self.state
             state.step, since, taken = state.step + 1, since + 1, taken + 1
             if trouble.step[0]:  # one number, but reading it waits for the step
                 self._require_finite(trouble)
@@ -113,10 +114,10 @@ class TrainingLoop(ABC):
             last = state.step == config.steps
             if state.step in schedule.density:
                 self.adapt()
-            second_stage = state.step >= schedule.first_stage
-            choosing = config.patience > 0 and second_stage and state.step <= schedule.joined and not state.chosen
-            scored = (state.step % config.validate_every == 0 and second_stage) or last
-            scored = scored or (choosing and state.step in (schedule.first_stage, schedule.joined))
+            judged = state.step >= min(schedule.stages, default=0)
+            choosing = config.patience > 0 and judged and state.step <= schedule.joined and not state.chosen
+            scored = (state.step % config.validate_every == 0 and judged) or last
+            scored = scored or (choosing and state.step in (*schedule.stages, schedule.joined))
             if state.step % config.log_every == 0 or scored:
                 self._require_finite(trouble)
                 score = self.validate() if scored else None

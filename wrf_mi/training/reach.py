@@ -96,33 +96,38 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     return replace(split, train=rows[~held], validation=np.sort(np.concatenate([split.validation, rows[held]])))
 
 
+def improves(score: FloatArray, before: FloatArray, higher_is_better: bool) -> bool:
+    """Whether the mean gain of paired scores [rows] exceeds its standard error; NaN where nothing was received."""
+    gain = (score - before) * (1 if higher_is_better else -1)
+    gain = gain[np.isfinite(gain)]
+    return len(gain) > 1 and float(gain.mean()) > float(gain.std(ddof=1)) / np.sqrt(len(gain))
+
+
 def choose_reach(
     reach: Reach,
     lengths: Sequence[float],
     tx_pos_m: Sequence[FloatArray],
     score: Callable[[int, NDArray[np.float32]], FloatArray],
     higher_is_better: bool,
-) -> tuple[float, float]:
-    """The reach with the best score on held-out transmitters.
+) -> tuple[float, FloatArray]:
+    """The reach by scores of held-out transmitters.
 
     Args:
         reach: reach with the training transmitters.
-        lengths: candidates, metres.
+        lengths: candidates in ascending order, metres.
         tx_pos_m: held-out transmitters that each receiver observed, [m, 3] in metres.
         score: ``score(receiver, weight)``: scores of a receiver's held-out transmitters with weights [m].
         higher_is_better: direction of the score.
 
     Returns:
-        The first reach with the best mean, metres, and its median score. Without held-out transmitters, the given reach
-        and NaN.
+        The last reach that improves on the one kept before it (`improves`), metres, and its scores, all receivers
+        pooled. Without held-out transmitters, the given reach and no scores.
     """
     held = [r for r, tx in enumerate(tx_pos_m) if len(tx)]
-    best: tuple[float, float, float] = (-np.inf, reach.length_m, np.nan)
+    kept, best = reach.length_m, np.zeros(0)
     for length in lengths if held else []:
         tried = replace(reach, length_m=length)
         scores = np.concatenate([np.ravel(score(r, tried.weight(tx_pos_m[r], r))) for r in held])
-        # Means have less variance than medians, which tables state.
-        mean = float(np.nanmean(scores)) * (1 if higher_is_better else -1)
-        if mean > best[0]:
-            best = mean, length, float(np.nanmedian(scores))
-    return best[1], best[2]
+        if not len(best) or improves(scores, best, higher_is_better):
+            kept, best = length, scores
+    return kept, best

@@ -25,7 +25,8 @@ class Schedule:
         decay: decay of the running mean of the parameters at each step, [steps].
         density: steps after which a round of density control follows.
         joined: first step that may train on the validation rows; ``steps`` if never.
-        first_stage: steps of a first stage without a choice of state, in which the paths of a scene are trained alone.
+        stages: first steps of the stages after the first, in ascending order; learning rates fall anew in each, and no
+            state of the first stage is chosen before its end.
     """
 
     rows: IntArray
@@ -34,7 +35,11 @@ class Schedule:
     decay: NDArray[np.float64]
     density: frozenset[int]
     joined: int
-    first_stage: int = 0
+    stages: tuple[int, ...] = ()
+
+    def stage(self, step: int) -> int:
+        """Number of the stage of a step, from 0."""
+        return sum(step >= start for start in self.stages)
 
     def after(self, best: int) -> tuple[Schedule, int]:
         """The schedule that continues from the best state before the validation rows join.
@@ -60,7 +65,7 @@ def plan(
     everything: Sequence[IntArray],
     rng: np.random.Generator,
     density: frozenset[int] = frozenset(),
-    first_stage: int = 0,
+    stages: tuple[int, ...] = (),
 ) -> Schedule:
     """The schedule of a fit, a function of settings, rows and seed only: a resumed run gets the same.
 
@@ -73,7 +78,7 @@ def plan(
         everything: rows of each receiver with the validation rows.
         rng: generator of the order of rows.
         density: steps after which a round of density control follows.
-        first_stage: steps of a first stage: learning rates fall in it, and then anew.
+        stages: first steps of the stages after the first.
 
     Raises:
         InputError: a receiver without rows that train.
@@ -89,12 +94,12 @@ def plan(
     return Schedule(
         rows=np.concatenate([rows for rows, _ in plans]),
         receiver=np.concatenate([receiver for _, receiver in plans]),
-        factor=np.concatenate([_falling(part, o) for part in (first_stage, steps - first_stage)]),
+        factor=np.concatenate([_falling(int(part), o) for part in np.diff([0, *stages, steps])]),
         # A young mean forgets faster, or it would be mostly the starting values.
         decay=np.minimum(o.ema_decay, (t + 1) / (t + 10)),
         density=density,
         joined=joined,
-        first_stage=first_stage,
+        stages=stages,
     )
 
 
@@ -106,12 +111,12 @@ def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
     return np.asarray(cosine * np.minimum(1.0, (t + 1) / max(1, optimiser.warm_up)))
 
 
-def density_rounds(config: DensityConfig, steps: int, first_stage: int = 0) -> frozenset[int]:
-    """Steps after which a round of density control follows; in the first stage there are no Gaussians."""
-    left = steps - first_stage
+def density_rounds(config: DensityConfig, steps: int, before: int = 0) -> frozenset[int]:
+    """Steps after which a round of density control follows; before the last stage there are no Gaussians."""
+    left = steps - before
     first, last = int(config.start * left), int(config.stop * left)
     rounds = range(config.every, left, config.every) if config.every else ()
-    return frozenset(first_stage + s for s in rounds if first <= s <= last)
+    return frozenset(before + s for s in rounds if first <= s <= last)
 
 
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:

@@ -15,7 +15,7 @@ from ..backend.device import to_float, to_tensor
 from ..gaussians.density import DensityChange
 
 Arrays = dict[str, NDArray[Any]]
-KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m")
+KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m", "surface", "baseline")
 """Attributes that a checkpoint stores under their names."""
 
 
@@ -34,6 +34,8 @@ class FitState:
         view_gradient_steps: steps in that sum.
         reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
         searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
+        surface: whether Gaussians on surfaces are trained.
+        baseline: scores of the held-out rows by paths alone, [rows]; empty where there are none.
         chosen: step from which the fit went on (`LoopConfig.patience`); 0: none was chosen.
         best: arrays of the state with the best validation score, or None.
         best_score: its score, the higher the better; kept once the fit went on from it.
@@ -46,6 +48,7 @@ class FitState:
         self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = self.chosen = 0
         self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
+        self.surface, self.baseline = False, np.zeros(0)
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0
         self._reset_view_gradient()
@@ -120,6 +123,13 @@ class FitState:
             return self
         return FitState.from_arrays(self.best | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
 
+    def next_stage(self) -> FitState:
+        """The best state so far as the start of another stage, at the present step, without moments."""
+        state = self.go_back()
+        state.step, state.best, state.waited = self.step, self.best, 0
+        state.forget_moments()
+        return state
+
     def arrays(self) -> Arrays:
         """All arrays, for a checkpoint."""
         kept = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
@@ -146,7 +156,8 @@ class FitState:
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
         state.view_gradient_steps, state.reach_m = int(arrays["view_gradient_steps"]), float(arrays["reach_m"])
         state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
-        state.searched_m = np.array(arrays["searched_m"])
+        state.searched_m, state.baseline = np.array(arrays["searched_m"]), np.array(arrays["baseline"])
+        state.surface = bool(arrays["surface"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

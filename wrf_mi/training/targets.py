@@ -144,10 +144,18 @@ def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool =
     train = [targets.received(r, split.train) for r in range(len(targets.truth))]
     # A receiver without training rows learns from its validation rows.
     train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
-    first = round(config.traced.alone * config.steps) if joint else 0
-    if joint and config.patience and 0 < config.holdout_steps_fraction <= config.traced.alone:
+    stages = _stages(config) if joint else ()
+    if stages and config.patience and 0 < config.holdout_steps_fraction * config.steps <= stages[-1]:
         end = config.holdout_steps_fraction
-        text = f"{config.traced.alone} of the steps are not less than holdout_steps_fraction, {end}"
+        share = f"{config.traced.alone} of the steps" + (", twice," if len(stages) > 1 else "")
+        text = f"{share} are not less than holdout_steps_fraction, {end}"
         raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
     rng = np.random.default_rng([config.seed, 1])
-    return plan(config, train, everything, rng, density_rounds(config.density, config.steps, first), first)
+    density = density_rounds(config.density, config.steps, stages[-1] if stages else 0)
+    return plan(config, train, everything, rng, density, stages)
+
+
+def _stages(config: TrainConfig) -> tuple[int, ...]:
+    """First steps of the stages beside paths: Gaussians on surfaces, if there are any, and those of the field."""
+    count = 2 if config.traced.surface > 0 else 1
+    return tuple(round(k * config.traced.alone * config.steps) for k in range(1, count + 1) if config.traced.alone)

@@ -32,7 +32,7 @@ from .fields import make_field
 from .initial import initial_gaussians
 from .loop import TrainingLoop
 from .predictor import Predictor
-from .reach import Reach, choose_reach, hold_out_groups
+from .reach import Reach, choose_reach, hold_out_groups, improves
 from .state import FitState
 from .step import Loss, TrainingData, device_pose, evaluated, make_step
 from .targets import form_of, plan_rows, targets_of
@@ -121,7 +121,7 @@ class Trainer(TrainingLoop):
         # Gaussians that correct paths are chosen also on rows far from the training rows.
         self._chooses_reach = self.graph.corrects and config.patience > 0 and config.holdout_steps_fraction > 0
         self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
-        unjudged = self._chooses_reach and self._choosing is split
+        self._unjudged = self._chooses_reach and self._choosing is split
         joint = self.graph.field is not None and scene is not None
         self.schedule = plan_rows(config, self.targets, self._choosing, joint)
         if config.deterministic:
@@ -143,10 +143,14 @@ class Trainer(TrainingLoop):
         if state is None:
             self.graph.check_polarization(record.tx_pos_m[known])
             state = FitState(self._start(initial))
-            if unjudged:
+            state.surface = bool(self.graph.surface) and not self.schedule.stages
+            if self._unjudged:
                 logger.warning("%d training rows do not suffice to choose a reach: no Gaussians", len(split.train))
                 state.reach_m = 0.0
+        else:
+            self.graph.cover(self._sides, state.params())
         self.state = state
+        self._held_scores = np.zeros(0)
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self._restore_paths()
@@ -187,7 +191,7 @@ class Trainer(TrainingLoop):
             seen = replace(self.record, receivers=self.graph.receivers)
             start = initial or initial_gaussians(self.config.initial, seen, self.split.train, rng, self.graph.sphere)
             values = self.graph.field.init(start, rng)
-        values |= self.graph.parameters(self._sides)
+        values |= self.graph.parameters(self._sides) | self.graph.cover(self._sides)
         for r, side in enumerate(self._sides):
             if side is not None and side.gain_name in values:
                 values |= self.graph.match_gain(r, side, {}, self.targets.truth[r, self._known])
@@ -213,13 +217,13 @@ class Trainer(TrainingLoop):
         if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
             state.searched_m[receiver] = side.searched_at_m
         learned = side is None or (
-            state.step >= self.schedule.first_stage and not (state.chosen and state.reach_m == 0)
+            self._stage == len(self.schedule.stages) and not (state.chosen and state.reach_m == 0)
         )
         arrays = self.graph.arrays(receiver, side)
-        key = None if side is None and not arrays else (receiver, side and side.searches, learned)
+        key = None if side is None and not arrays else (receiver, side and side.searches, learned, state.surface)
         if key not in self._steps:
             self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
-            report = self.graph.report(receiver, side, learned)
+            report = self.graph.report(receiver, side, learned, surface=state.surface)
             read = None if key is None else partial(self.graph.arrays, receiver, side)
             if read is not None:
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
@@ -229,6 +233,19 @@ class Trainer(TrainingLoop):
             rest = self._loss, self._shape, read, self.graph.evaluation
             self._steps[key] = make_step(report, self._rates(), *rest)
         return self._steps[key]
+
+    @property
+    def _stage(self) -> int:
+        """Stage of the schedule to which the next step belongs, or the chosen state."""
+        return self.schedule.stage(self.state.chosen - 1 if self.state.chosen else self.state.step)
+
+    def _begin_stage(self) -> None:
+        """Go on from the best state so far; Gaussians on surfaces are trained from the second stage on."""
+        self.state = self.state.next_stage()
+        if self._stage == 1 and self.graph.surface and not self._unjudged:
+            self.state.surface = True
+        self._restore_paths()
+        self.record_functions()
 
     def _rates(self) -> dict[str, float]:
         o, traced = self.config.optimiser, self.graph.traced
@@ -259,10 +276,10 @@ class Trainer(TrainingLoop):
         known = [self.record.tx_pos_m[self.targets.received(r, rows)] for r in range(len(self.record.receivers))]
         return Reach(tuple(known), self.state.reach_m)
 
-    def _corrected_score(self) -> float:
-        """Median score of Gaussians that correct paths; the best reach is used until one is chosen."""
-        predict, record, reach = self.predictor(), self.record, self.reach()
-        chosen = self._choosing if self._chooses_reach and not self.state.chosen else self.split
+    def _corrected_scores(self) -> NDArray[np.float64]:
+        """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
+        predict, record, reach, state = self.predictor(), self.record, self.reach(), self.state
+        chosen = self._choosing if self._chooses_reach and not state.chosen else self.split
         rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
         assert reach is not None
 
@@ -272,14 +289,21 @@ class Trainer(TrainingLoop):
             return self.task.training_score(found, record.observation[r, rows[r]])
 
         held = [record.tx_pos_m[chosen_rows] for chosen_rows in rows]
-        lengths = reach.lengths(held) if chosen is not self.split else [reach.length_m]
-        self.state.reach_m, median = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
-        return median
+        lengths = [reach.length_m]
+        if chosen is not self.split:
+            # Before the last stage the field has not been trained.
+            trained = self.schedule.stage(state.step - 1) == len(self.schedule.stages)
+            lengths = reach.lengths(held) if trained else [0.0]
+        state.reach_m, found = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
+        if chosen is not self.split and self.schedule.stages and state.step == self.schedule.stages[0]:
+            state.baseline = found
+        return found
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
         if self.graph.corrects:
-            return self._corrected_score()
+            self._held_scores = self._corrected_scores()
+            return float(np.nanmedian(self._held_scores)) if len(self._held_scores) else float("nan")
         rows, record = self.split.validation, self.record
         if not len(rows):
             return float("nan")
@@ -291,7 +315,19 @@ class Trainer(TrainingLoop):
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
     def choose(self, score: float) -> bool:
-        """Early stopping (`TrainingLoop`)."""
+        """Early stopping (`TrainingLoop`).
+
+        Beside paths, means decide, which have less variance than medians. A state of a later stage has to improve on
+        paths alone (`improves`), and only the last stage ends early.
+        """
+        if self.graph.corrects and len(self._held_scores):
+            score = float(np.nanmean(self._held_scores))
+            first = self.schedule.stages and self.state.step == self.schedule.stages[0]
+            baseline = self.state.baseline
+            if len(baseline) and not first and not improves(self._held_scores, baseline, self.higher_is_better):
+                score = -np.inf if self.higher_is_better else np.inf
+        if self.schedule.stage(self.state.step) < len(self.schedule.stages):
+            self.state.waited = -1
         chosen = super().choose(score)
         if chosen:
             self._restore_paths()
@@ -301,10 +337,11 @@ class Trainer(TrainingLoop):
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""
-        state, schedule, t = self.state, self.schedule, self.state.step
+        schedule, t = self.schedule, self.state.step
         receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
-        if 0 < t == schedule.first_stage:
-            state.forget_moments()
+        if t in schedule.stages and not self.state.chosen:
+            self._begin_stage()
+        state = self.state
         state.mean, trouble, report = self._step_of(receiver)(
             state.adam,
             state.mean,

@@ -70,6 +70,7 @@ class FittedField(Fitted):
         assert self.receivers is not None
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
+        graph.cover((), self.params)
         common = self.field, self.params, self.receivers, *form.size
         reach = _reach(self._arrays)
         return Predictor(*common, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)

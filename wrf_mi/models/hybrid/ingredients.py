@@ -36,10 +36,12 @@ INGREDIENTS = {
     "physics": Ingredient("physics", scene=True),
     "physics-no-mesh": Ingredient("physics"),
     "ray-tracing": Ingredient("ray-tracing", scene=True),
+    "surface": Ingredient(
+        "ray-tracing", scene=True, settings=("calibration=gain,materials,surface", "transmission=true")
+    ),
     "trees": Ingredient("trees"),
     "mri": Ingredient("mri"),
     "idw": Ingredient("idw"),
-    "calibrated": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials",), default=False),
     "learned": Ingredient("wrf-gs+", default=False),
     "joint": Ingredient("wrf-gs+", scene=True, default=False),
 }

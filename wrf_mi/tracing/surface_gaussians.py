@@ -1,0 +1,172 @@
+"""Gaussians on the surfaces of a scene, whose signal is the traced field there times a learned complex factor.
+
+Where a traced path meets surfaces at points q_i, its gain is multiplied by
+
+    exp( sum_i sum_g w_g(q_i) (a_g + j b_g) ),   w_g(q) = exp(-|q - p_g|^2 / (2 s^2))
+
+over the `NEAREST` Gaussians of the same plane: g at p_g changes what a wave leaves the surface
+with, in logarithmic amplitude a_g and phase b_g, as a window in a wall, a cabinet in front of it or a bump of some
+millimetres do. Zeros leave the paths as traced. Unlike Gaussians whose signals follow the transmitter's position, these
+hold for all transmitters whose paths meet the same places: metres away from the training transmitters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..backend.device import on_device
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .field_calculator import Complex
+from .options import DISC, FACTOR
+
+NEAREST = 6
+"""Gaussians that change one interaction."""
+SIZE = 0.75
+"""Standard deviation of a Gaussian in the plane, as a share of the spacing."""
+EXTENT = 4.0
+"""Distance in standard deviations beyond which a Gaussian does not count: its weight is below 4e-4."""
+LEAST_POINTS = 4
+"""Fewest interactions of training paths in a cell of the lattice that gets a Gaussian."""
+SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99
+"""Largest distance along the normal, and smallest cosine between normals, of a plane that scans find twice."""
+
+Float64: Any = dr.float64_array_t(mi.Float)
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """Interactions of paths with surfaces.
+
+    Attributes:
+        position_m: points [m, 3], world frame, metres.
+        normal: unit normals of the planes, either sign, [m, 3].
+    """
+
+    position_m: FloatArray
+    normal: FloatArray
+
+    @classmethod
+    def joined(cls, parts: list[Interactions]) -> Interactions:
+        """Interactions of several receivers."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("position_m", "normal")))
+
+
+@dataclass(frozen=True)
+class SurfaceGaussians:
+    """Flat Gaussians on surfaces.
+
+    Attributes:
+        discs: centres in metres and unit normals (`DISC`), [6, g].
+        size_m: standard deviation s in the plane, metres.
+    """
+
+    discs: FloatArray
+    size_m: float
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return self.discs.shape[1]
+
+    @classmethod
+    def covering(cls, met: Interactions, spacing_m: float) -> SurfaceGaussians:
+        """Gaussians where interactions lie: at their mean in each cell of a lattice of ``spacing_m`` in each plane."""
+        offset = (met.position_m * met.normal).sum(axis=1)
+        cell = np.round((met.position_m - offset[:, None] * met.normal) / spacing_m)
+        rows = np.column_stack([cell, np.round(offset / SAME_PLANE_M), np.round(met.normal / (1 - SAME_PLANE_COS))])
+        _, group, count = np.unique(rows.astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+        values = np.column_stack([met.position_m, met.normal]).T
+        sums = np.stack([np.bincount(group.reshape(-1), row, len(count)) for row in values])
+        discs = (sums / count)[:, count >= LEAST_POINTS]
+        discs[3:] /= np.linalg.norm(discs[3:], axis=0)
+        # As a run stores them: a resumed fit has the same weights.
+        return cls(discs.astype(np.float32).astype(float), SIZE * spacing_m)
+
+    def near(self, met: Interactions) -> tuple[IntArray, FloatArray]:
+        """Numbers of the nearest Gaussians of each interaction [m, NEAREST], and their weights w_g, 0 for none."""
+        index = np.zeros((len(met.position_m), NEAREST), np.int64)
+        weight = np.zeros(index.shape)
+        if not len(met.position_m) or not len(self):
+            return index, weight
+        # Twice as many neighbours as needed, as those of other planes do not count.
+        count = min(2 * NEAREST, len(self))
+        ranks = np.arange(1, count + 1)
+        distance, found = cKDTree(self.discs[:3].T).query(
+            met.position_m, ranks, distance_upper_bound=EXTENT * self.size_m
+        )
+        real = found < len(self)
+        found = np.where(real, found, 0)
+        normal = self.discs[3:].T[found]
+        away = np.abs(((met.position_m[:, None] - self.discs[:3].T[found]) * normal).sum(axis=-1))
+        turned = np.abs((met.normal[:, None] * normal).sum(axis=-1))
+        same = real & (away < SAME_PLANE_M) & (turned > SAME_PLANE_COS)
+        every = np.where(same, np.exp(-0.5 * np.square(np.where(real, distance, 0) / self.size_m)), 0)
+        order = np.argsort(-every, axis=1, kind="stable")[:, :NEAREST]
+        index[:, : order.shape[1]] = np.take_along_axis(found, order, axis=1)
+        weight[:, : order.shape[1]] = np.take_along_axis(every, order, axis=1)
+        return index, weight
+
+    def parameters(self) -> dict[str, NDArray[np.float32]]:
+        """Parameters of Gaussians that change nothing: `FACTOR` and `DISC`."""
+        return {FACTOR: np.zeros((2, len(self)), np.float32), DISC: self.discs.astype(np.float32)}
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, NDArray[Any]], spacing_m: float) -> SurfaceGaussians | None:
+        """The Gaussians of parameters; None where these have none."""
+        return cls(np.asarray(parameters[DISC], float), SIZE * spacing_m) if DISC in parameters else None
+
+
+@dataclass
+class PathWeights:
+    """Weights of surface Gaussians for q paths, on the device.
+
+    Attributes:
+        index: numbers of Gaussians, `each` for a path in turn, [q * each].
+        weight: their weights w_g, [q * each].
+        each: largest number of Gaussians of a path.
+    """
+
+    index: Any
+    weight: Any
+    each: int
+
+    @classmethod
+    def of(cls, gaussians: SurfaceGaussians, met: Interactions, path: IntArray, count: int) -> PathWeights:
+        """Weights of ``count`` paths, of which ``path`` [m] have the interactions, in ascending order."""
+        index, weight = gaussians.near(met)
+        place = np.arange(len(path)) - np.searchsorted(path, path)
+        depth = int(place.max(initial=0)) + 1
+        indices, weights = np.zeros((count, depth, NEAREST), np.int64), np.zeros((count, depth, NEAREST))
+        indices[path, place], weights[path, place] = index, weight
+        return cls(on_device(indices, mi.UInt32), on_device(weights, Float64), depth * NEAREST)
+
+    def factor(self, factors: Any, paths: Any | None = None) -> Complex:
+        """Complex factor of each path's gain, or of the numbers ``paths``. Differentiable in ``factors``.
+
+        Args:
+            factors: tensor `FACTOR`, [2, g].
+            paths: numbers of paths, an unsigned integer array; None: all.
+        """
+        index, weight = self.index, self.weight
+        if paths is not None:
+            slot = dr.arange(mi.UInt32, dr.width(paths) * self.each)
+            entry = dr.gather(mi.UInt32, paths, slot // self.each) * self.each + slot % self.each
+            index, weight = dr.gather(mi.UInt32, index, entry), dr.gather(Float64, weight, entry)
+        flat, count = factors.array, factors.shape[1]
+        amplitude, phase = (
+            dr.block_reduce(
+                dr.ReduceOp.Add, weight * Float64(dr.gather(type(flat), flat, index + part * count)), self.each
+            )
+            for part in (0, 1)
+        )
+        sine, cosine = dr.sincos(phase)
+        amplitude = dr.exp(amplitude)
+        return amplitude * cosine, amplitude * sine
