@@ -31,6 +31,7 @@ class Ingredient:
     default: bool = True
 
 
+SURFACE = "calibration=gain,materials,surface", "transmission=true"
 INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
