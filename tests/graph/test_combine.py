@@ -141,6 +141,10 @@ def test_power_receiver(how: Any) -> None:
     np.testing.assert_allclose(model(made, None).numpy(), 10 * np.log10(np.abs(h[0]) ** 2), atol=1e-4)
     silent = dr.zeros(Float64, 2 * count), dr.zeros(Float64, 2 * count)
     np.testing.assert_allclose(model(None, silent).numpy(), -200.0, atol=1e-9)
+    noisy = PowerReceiver(45, 60, (FREQUENCY_HZ,), how=how, floor=0.1)
+    np.testing.assert_allclose(noisy(None, silent).numpy(), -10.0, atol=1e-9)
+    both = 10 ** (model(made, field).numpy() / 10) + 0.1
+    np.testing.assert_allclose(noisy(made, field).numpy(), 10 * np.log10(both), atol=DOUBLE)
 
 
 def test_power_over_channels_and_without_interference() -> None:

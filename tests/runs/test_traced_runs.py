@@ -22,6 +22,7 @@ from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import evaluate_run, predict_to_file, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
+from wrf_mi.runs.run import open_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, solve
@@ -356,3 +357,14 @@ def test_tracer_predicts_free_space_loss(flat_folder: Path, room: Path) -> None:
     record = load(flat_folder)
     tracer = RayTracer(room, instrument_of(record), DIRECT)
     np.testing.assert_allclose(tracer(record.tx_pos_m[:4]), friis_dbm(record)[:, :4], atol=FLOAT32_DB)
+
+
+def test_calibrated_strength_without_a_path_is_that_of_the_weakest_training_row(
+    flat_folder: Path, calibrated: Path
+) -> None:
+    """Below the floor, which nothing passes here."""
+    record = load(flat_folder)
+    assert record.official is not None
+    below = record.tx_pos_m[:2] - np.array([0, 0, 9.0])
+    report = open_run(calibrated).predict(below, 0, np.zeros(2)).mean
+    np.testing.assert_allclose(report, np.nanmin(record.observation[:, record.official[0]]), atol=FLOAT32_DB)

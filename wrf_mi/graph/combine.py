@@ -263,10 +263,12 @@ class PowerReceiver(CsiReceiver):
         interference: traced paths interfere with each other; False: their powers add, as in an average over positions
             within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
             side its root enters as a positive real number.
+        floor: power that is received beside both sides, as the instrument's noise.
     """
 
     how: How = "coherent"
     interference: bool = True
+    floor: float = LEAST_POWER
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -283,7 +285,7 @@ class PowerReceiver(CsiReceiver):
             mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
             here = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
-        return 10 * dr.log2(received + LEAST_POWER) / math.log2(10)
+        return 10 * dr.log2(received + self.floor) / math.log2(10)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by mean powers in dB."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.registry import Registry
-from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from .combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
 """Group of entry points of receiver models."""
@@ -65,6 +65,7 @@ class Form:
         basis: complex [components, outputs] that learned channels are sums of; None: no channels.
         features: number of features that describe a transmitter in place of its position; 0: its position.
         headings: whether the transmitters' antenna turns with their (known) headings.
+        floor_db: power in dB that is received where no path arrives; NaN: none.
     """
 
     receiver: str
@@ -74,6 +75,7 @@ class Form:
     basis: NDArray[np.complex128] | None = field(default=None, repr=False)
     features: int = 0
     headings: bool = False
+    floor_db: float = float("nan")
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for a file."""
@@ -95,6 +97,7 @@ class Form:
             basis if basis.size else None,
             int(arrays["form/features"]),
             bool(arrays["form/headings"]),
+            float(arrays["form/floor_db"]),
         )
 
     @property
@@ -146,7 +149,8 @@ def _array(form: Form, receiver: Receiver) -> ArrayReceiver:
 def _power(form: Form, receiver: Receiver) -> PowerReceiver:
     known = form.frequencies_hz is not None
     # As the instrument of the task: powers of paths are added.
-    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), interference=False)
+    floor = LEAST_POWER if np.isnan(form.floor_db) else 10 ** (form.floor_db / 10)
+    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), interference=False, floor=floor)
 
 
 def _csi(form: Form, receiver: Receiver) -> CsiReceiver:

@@ -116,7 +116,9 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
     headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
     if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
-    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features, headings)
+    # The tracer finds no path through many walls; what was measured there is the weakest of all.
+    floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
+    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features, headings, floor_db)
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
