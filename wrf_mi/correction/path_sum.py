@@ -17,6 +17,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..tasks import task_of
 from ..tracing.image_method import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
@@ -67,7 +68,7 @@ class PathSum:
         """Whether a misfit is of channels of single antennas, with materials and planes as its only parameters."""
         known = all(name in (SHIFT, TILT) or name.startswith(PREFIX) for name in misfit.parts)
         record = misfit.record
-        return known and SHIFT in misfit.parts and record.task == "csi" and record.observation.ndim == 3
+        return known and SHIFT in misfit.parts and task_of(record).is_complex and record.observation.ndim == 3
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains those of one changed surface at a time."""

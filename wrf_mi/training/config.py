@@ -15,6 +15,7 @@ from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_s
 from ..gaussians.encoding import unambiguous_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
+from ..tasks import TASKS
 from .loop_config import AdamConfig, LoopConfig
 
 AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
@@ -271,6 +272,8 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
 """Trainable parts of the traced side by name; rates as ``--set`` takes them."""
 JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05", "traced.materials=surface")
 """Settings of Gaussians beside the paths of a scene for one antenna: the few parameters of paths converge soon."""
+JOINT_STRENGTHS = (*JOINT_ONE_ANTENNA, "traced.depth=6", "traced.reflections=2", "traced.pattern_degree=3")
+"""Settings for signal strengths: paths through walls of two surfaces each, and shadowing by the carrier's body."""
 JOINT_IMAGES = (
     "batch=8",
     "steps=2000",
@@ -282,6 +285,9 @@ JOINT_IMAGES = (
     "traced.materials=surface",
 )
 """Settings where observations are images: paths explain most of one, and Gaussians add little at first."""
+ALONE: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENNA}
+JOINT: Mapping[str, tuple[str, ...]] = {"rssi": JOINT_STRENGTHS, "csi": JOINT_ONE_ANTENNA}
+"""Settings by task, without and with a scene."""
 
 
 def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
@@ -290,12 +296,12 @@ def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
     """
     if image:
         return JOINT_IMAGES if with_scene else ()
-    return () if task not in ("rssi", "csi") else JOINT_ONE_ANTENNA if with_scene else ONE_ANTENNA
+    return (JOINT if with_scene else ALONE).get(task, ())
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:
     """Default settings for a task, without or with the paths of a scene."""
-    return with_settings(TrainConfig(), task_settings(task, task == "spectrum", with_scene))
+    return with_settings(TrainConfig(), task_settings(task, TASKS[task].image, with_scene))
 
 
 def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:

@@ -15,6 +15,7 @@ from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.receivers import receiver_index
 from ...core.types import IntArray
+from ...tasks import task_of
 from ...tracing.polarization import check_polarization
 from ...tracing.solve import Prepared
 from ...training.session import OnProgress
@@ -135,7 +136,7 @@ def physics_model(
     def check(problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse antennas in solids; warn of antennas near surfaces, crossed polarisations and ignored antennas."""
         record, scene = problem.record, problem.opened_scene
-        if task == "csi" and record.observation.ndim != 3:
+        if task_of(record).is_complex and record.observation.ndim != 3:
             text = f"channels of {record.observation.shape[2]} antennas; the physics model serves receivers with one"
             raise InputError(f"{record.name}: {text}")
         if scene is None:
