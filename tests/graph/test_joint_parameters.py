@@ -141,6 +141,7 @@ def test_permittivity_is_recovered_in_joint_training(tmp_path: Path) -> None:
     whole, known = rooms(tmp_path)
     record = record_of("csi", whole, (receiver(),), transmitters(28))
     own = (*ONE_REFLECTION, *QUICK, "batch=20", "traced.material=0.05", "initial.gaussians=40", "steps=150")
+    own = (*own, "traced.materials=named", "traced.surface=0")
     config = with_settings(default_config("csi"), [*own, "network.width=32", "network.layers=2"])
     trainer = Trainer(record, all_of(record, 20), config, scene=known)
     trainer.run()

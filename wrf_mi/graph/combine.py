@@ -38,6 +38,10 @@ How = Literal["coherent", "power"]
 
 LEAST_POWER = 1e-20
 """Constant added to a power before its logarithm: the lowest report is -200 dB."""
+SILENCE = 4 * LEAST_POWER
+"""Power up to which nothing arrives: above the constants that are added to powers."""
+FLOOR_DB = 1e-3
+"""Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = SQUARED_MAGNITUDE_EPS) -> Any:
@@ -263,7 +267,7 @@ class PowerReceiver(CsiReceiver):
         interference: traced paths interfere with each other; False: their powers add, as in an average over positions
             within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
             side its root enters as a positive real number.
-        floor: power that is received beside both sides, as the instrument's noise.
+        floor: power that is reported where neither side arrives.
     """
 
     how: How = "coherent"
@@ -285,8 +289,12 @@ class PowerReceiver(CsiReceiver):
             mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
             here = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
-        return 10 * dr.log2(received + self.floor) / math.log2(10)
+        received = dr.select(received > SILENCE, received + LEAST_POWER, self.floor)
+        return 10 * dr.log2(received) / math.log2(10)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by mean powers in dB."""
-        return float((np.nanmean(observed) - np.mean(report)) * math.log(10) / 20)
+        arrives = np.abs(report - 10 * math.log10(self.floor)) > FLOOR_DB
+        if not arrives.any():
+            return 0.0
+        return float((np.nanmean(observed[arrives]) - np.mean(report[arrives])) * math.log(10) / 20)
