@@ -11,6 +11,8 @@ import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.tracing.options import FACTOR
+from wrf_mi.tracing.surface_gaussians import SurfaceGaussians
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
 # isort: split
@@ -31,6 +33,8 @@ TOLERANCE = 1e-6
 deviation of such derivatives. Central differences in float64."""
 ROUNDING = 2e-15
 """Rounding of the terms of the loss, relative to the sum of their magnitudes; differences divide it by the step."""
+SPACING_M = 1.0
+"""Distance of Gaussians on surfaces: cells of at least four interactions."""
 STEP = 1e-6
 """So small that no pixel crosses a footprint's cut-off, where the field jumps."""
 HEIGHT, WIDTH, BATCH = 12, 40, 2
@@ -48,7 +52,7 @@ MODELS: dict[str, Any] = {
 KINDS = (
     *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
     *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),
-    *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal"),
+    *("field.position", "field.log_scale", "field.rotation", "field.opacity", "field.signal", FACTOR),
 )
 """Kinds of parameters; the field has networks, too."""
 
@@ -65,6 +69,10 @@ def both(
     how = TracedOptions(options, pattern_degree=2, gain=300.0, materials=request.param, planes=True)
     traced = TracedField(scene, transmitters(BATCH), own, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
+    gaussians = SurfaceGaussians.covering(traced.interactions, SPACING_M)
+    assert len(gaussians) > 3
+    traced.attach(gaussians)
+    values[FACTOR] = rng.normal(0, 0.2, (2, len(gaussians)))
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it.
     encoding = Encoding(position_octaves=1, position_scale_m=1e12, tx_octaves=2)
     field = WrfGsPlus(encoding=encoding, layers=3, width=16, skip=2)
