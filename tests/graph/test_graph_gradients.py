@@ -33,8 +33,8 @@ TOLERANCE = 1e-6
 deviation of such derivatives. Central differences in float64."""
 ROUNDING = 2e-15
 """Rounding of the terms of the loss, relative to the sum of their magnitudes; differences divide it by the step."""
-SPACING_M = 1.0
-"""Distance of Gaussians on surfaces: cells of at least four interactions."""
+SIZE_M = 0.3
+"""Standard deviation of Gaussians on surfaces."""
 STEP = 1e-6
 """So small that no pixel crosses a footprint's cut-off, where the field jumps."""
 HEIGHT, WIDTH, BATCH = 12, 40, 2
@@ -69,8 +69,8 @@ def both(
     how = TracedOptions(options, pattern_degree=2, gain=300.0, materials=request.param, planes=True)
     traced = TracedField(scene, transmitters(BATCH), own, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
-    gaussians = SurfaceGaussians.covering(traced.interactions, SPACING_M)
-    assert len(gaussians) > 3
+    met = traced.interactions
+    gaussians = SurfaceGaussians(np.column_stack([met.position_m, met.normal])[::5].T, SIZE_M)
     traced.attach(gaussians)
     values[FACTOR] = rng.normal(0, 0.2, (2, len(gaussians)))
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it.
