@@ -30,6 +30,8 @@ ROWS_OF_GROUP = 4
 """Least average number of rows of a cluster."""
 HELD_OUT = 0.25
 """Approximate share of the training rows that are held out in clusters."""
+MOST_HELD_OUT = 0.5
+"""Largest share in a single cluster."""
 LENGTHS = 7
 """Number of reaches tried beside 0: each twice the one before, the last four times the largest distance held out."""
 
@@ -89,9 +91,9 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     held = np.zeros(len(rows), bool)
     for group in rng.permutation(count):
         more = held | (labels == group)
-        if not held.any() or more.mean() <= HELD_OUT:
+        if more.mean() <= (HELD_OUT if held.any() else MOST_HELD_OUT):
             held = more
-    if held.all():
+    if not held.any():
         return split
     return replace(split, train=rows[~held], validation=np.sort(np.concatenate([split.validation, rows[held]])))
 
