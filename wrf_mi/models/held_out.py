@@ -177,16 +177,7 @@ def held_out_predictions(
             continue
         if not kept.exists():
             folder.mkdir(parents=True, exist_ok=True)
-
-            def on_progress(
-                stage: str,
-                share: float,
-                progress: object = None,
-                label: str = f"{name}, fold {number + 1} of {len(folds)}",
-            ) -> None:
-                session.on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
-
-            inner = replace(session, folder=folder, on_progress=on_progress)
+            inner = labelled(replace(session, folder=folder), f"{name}, fold {number + 1} of {len(folds)}")
             fitted, _ = fit_model(entry, problem, fold, inner)
             found = [
                 predicted_rows(fitted, record, wanted.row[wanted.receiver == receiver], receiver)
