@@ -12,27 +12,30 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drjit.opt import Adam
 
 from wrf_mi.backend import init
-from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.device import on_device, to_float, to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core import InputError
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
-from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
+from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
-from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.step import device_pose, grey
+from wrf_mi.training.config import TrainConfig, calibration_config
+from wrf_mi.training.step import TrainingData, device_pose, grey
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
@@ -45,6 +48,11 @@ WORSE = 2.0
 REPEATS, MOST_S = 15, 5.0
 """Rounds of a pair, and seconds after which no further round begins."""
 OPTIONS = TraceOptions(rays=1 << 14)
+ONLY_STEPS = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
+"""Settings of a fit of nothing but steps."""
+
+STEPS = 25
+"""Steps of a call, where the end of a run of one step would count."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +86,7 @@ def _stock(gaussians: Any, receiver: Any) -> StockRenderer:
 
 
 def _training() -> tuple[Call, Call]:
-    never = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
-    config, split = with_settings(TrainConfig(), ["steps=100000", *never]), make_splits(record(20), "random")[0]
+    config, split = with_settings(TrainConfig(), ["steps=100000", *ONLY_STEPS]), make_splits(record(20), "random")[0]
     frozen, fresh = (Trainer(record(20), split, config) for _ in range(2))
 
     def ours() -> None:
@@ -135,6 +142,45 @@ def _physics() -> tuple[Call, Call]:
     return physics(1), lambda: traced(tx_pos_m)
 
 
+def _paths_alone() -> tuple[Call, Call]:
+    """Ours trains the paths of spectra by the graph, theirs by Adam on paths, receiver and loss as such: without
+    Gaussians a step should cost at most 1.05 times as much.
+    """
+    receivers, carrier = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),), np.array([FREQUENCY_HZ])
+    known, split = record(20, receivers=receivers, frequencies_hz=carrier), make_splits(record(20), "random")[0]
+    config = with_settings(calibration_config(["gain", "materials"], images=True), ["steps=100000", *ONLY_STEPS])
+    trainer = Trainer(known, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
+    graph, targets, batch = trainer.graph, trainer.targets, trainer.schedule.rows[0]
+    side = graph.trace(known.tx_pos_m, 0)
+    assert side is not None
+    adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
+    names, model, size = list(adam), graph.models[0], targets.truth.shape[2:]
+    loss_of = partial(trainer.task.loss, ssim_weight=config.loss.ssim_weight)
+
+    def step(adam: Any, data: TrainingData, rows: Any, receiver: Any) -> Any:
+        truth = data.select(rows, receiver, HEIGHT * WIDTH)[1]
+        found = loss_of(model(side({name: adam[name] for name in names}, rows), None), truth, len(batch), *size)
+        dr.backward(found)
+        adam.step(eval=False)
+        dr.eval(adam, found)
+        return dr.detach(found)
+
+    recorded = Recorded(step, lambda: graph.arrays(0, side))
+    data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(1 / targets.unit))
+    rows, receiver = on_device(batch, mi.UInt32), dr.opaque(mi.UInt32, 0)
+
+    def ours() -> None:
+        last = trainer.state.step + STEPS
+        trainer.run(stop=lambda: trainer.state.step == last)
+
+    def theirs() -> None:
+        for _ in range(STEPS):
+            dr.eval(recorded(adam, data, rows, receiver))
+            dr.sync_thread()
+
+    return ours, theirs
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Context with Dr.Jit's kernels on one thread."""
@@ -151,6 +197,7 @@ PAIRS: list[Pair] = [
     Pair("integrator", "our Mitsuba integrator over `volprim_rf_basic`, geometry new", _integrator),
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
+    Pair("paths-alone", "a step of the graph without Gaussians over one of the traced paths as such", _paths_alone),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
     Pair("physics", "a physics model's prediction over the ray tracer's, one transmitter", _physics),

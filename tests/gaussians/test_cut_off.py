@@ -1,4 +1,6 @@
-"""Footprints end at three standard deviations: lists of tiles are short, and the error has a bound."""
+"""Gaussians are left out beyond three standard deviations and where they are faint: lists of tiles are short, and the
+error has a bound.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_fields import BATCH, COUNT, POSE, RECEIVER, SIZE, Float64, fields
+from scipy.special import logit
 
 from wrf_mi.core.angles import pixel_directions
 from wrf_mi.gaussians import oracle
+from wrf_mi.gaussians.density import adapt
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.footprint_constants import CUTOFF
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
+from wrf_mi.training.config import DensityConfig
 
 pytestmark = pytest.mark.all_threads
 
@@ -47,9 +52,30 @@ def test_cut_off_stays_within_its_bound(seed: int) -> None:
     assert 0 < error <= bound
 
 
-def _oracle(gaussians: Any) -> np.ndarray:
-    own = slice(0, COUNT)
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32))
+def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed: int) -> None:
+    """The bound is that of the cut-off with the whole weight of each pruned Gaussian, at most its opacity."""
+    gaussians, least = fields(seed, False), DensityConfig().least_opacity
+    opacity = 10.0 ** np.random.default_rng(seed).uniform(-4, 0, COUNT)
+    parameters = {
+        "position": np.stack([p.numpy()[:COUNT] for p in gaussians.position]),
+        "log_scale": np.log([s.numpy()[:COUNT] for s in gaussians.scale]),
+        "rotation": np.stack([q.numpy()[:COUNT] for q in gaussians.rotation]),
+        "opacity": logit(opacity[None]),
+    }
+    one = np.ones(COUNT)
+    change = adapt(parameters, one, one, np.random.default_rng(0), 0.0, COUNT, np.pi, least)
+    pruned = np.setdiff1d(np.arange(COUNT), change.source)
+    assert change.pruned == len(pruned) == (opacity < least).sum()
+    strength = np.hypot(*(s.numpy()[:COUNT] for s in gaussians.signal))
+    bound = (opacity[pruned] * (strength[pruned] + strength.max())).sum()
+    images = [_oracle(gaussians, opacity, kept) for kept in (np.arange(COUNT), change.source)]
+    error = np.abs(images[0] - images[1]).max()
+    assert 0 < error <= bound
 
+
+def _oracle(gaussians: Any, opacity: Any = None, own: Any = slice(0, COUNT)) -> np.ndarray:
     def stack(parts: list[Any]) -> np.ndarray:
         return np.stack([p.numpy()[own] for p in parts], axis=1)
 
@@ -60,5 +86,5 @@ def _oracle(gaussians: Any) -> np.ndarray:
         stack(gaussians.signal) @ np.array([1, 1j]),
         RECEIVER,
         pixel_directions(*SIZE),
-        opacity=gaussians.opacity.numpy()[own],
+        opacity=(gaussians.opacity.numpy() if opacity is None else opacity)[own],
     )

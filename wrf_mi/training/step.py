@@ -140,9 +140,12 @@ def make_step(
         params = rated_params(adam, rates, factor)
         condition, truth = data.select(rows, receiver, values)
         batch = dr.width(rows)
-        prediction = report(params, Batch(condition, slots, receiver, pose, plane))
         scale = data.factor(rows, receiver, values)
-        loss = loss_of(prediction * scale, truth * scale, batch, *shape)
+        truth = truth * scale
+        # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather again.
+        dr.schedule(truth, scale)
+        prediction = report(params, Batch(condition, slots, receiver, pose, plane))
+        loss = loss_of(prediction * scale, truth, batch, *shape)
         mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
         view_gradient_norm = mi.Float(0)
         if CENTRES in params:
