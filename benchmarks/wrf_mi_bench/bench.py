@@ -105,6 +105,7 @@ _OWN: Mapping[str, Check] = {
     "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
     "ingredients": _here("hybrid and its ingredients", "ingredients:main", RFID, FLAT, CONFERENCE, resumes=True),
+    "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "sentinels": _here(
         "figures kept",

@@ -6,11 +6,11 @@ ingredient is *clearly better* where the 95 % bootstrap interval of the mean dif
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ import numpy as np
 
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.files import write_atomically
 from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 from wrf_mi.runs.api import train
 from wrf_mi.runs.fit_key import fit_key, source_files
@@ -27,11 +26,12 @@ from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.timing import bootstrap
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
+from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.synthetic.laboratory import SCAN
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, RFID
-from .comparison import data_folder
+from .comparison import data_folder, kept
 from .table_plan import PARTS
 from .tables import scene_of
 
@@ -53,6 +53,9 @@ WORSE_SHARE = 0.02
 """Largest share of comparisons in which the hybrid may be clearly worse."""
 INSIDE = (0.85, 0.95)
 """Limits of the share of test values inside the 90 % intervals."""
+
+WITH_INTERVALS = ("kriging", "physics")
+"""Ingredients that are also fitted to folds for intervals of their own."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,12 @@ CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in cou
 
 def scene_of_cell(cell: Cell, folder: Path) -> str | None:
     """Scene of a cell's data set, made where needed; None: none is known."""
-    if cell.dataset == LAB:
-        load_record(LAB)
-        made = folder / "laboratory-room"
+    if cell.dataset in (LAB, ROOM):
+        load_record(cell.dataset)  # made where needed
+        scan = data_folder(cell.dataset) / SCAN
+        made = folder / f"{cell.dataset}-{fit_key(scan)}"
         if not made.exists():
-            make_scene(data_folder(LAB) / SCAN, made)
+            make_scene(scan, made)
         return str(made)
     part = next(part for part in PARTS if part.dataset == cell.dataset)
     return None if part.scene == "open" else scene_of(part, folder)[1]
@@ -134,7 +138,7 @@ def measure(cell: Cell, folder: Path) -> list[dict[str, Any]]:
         known = INGREDIENTS[name]
         more = {"scene": scene if known.scene else None, "settings": known.settings}
         try:
-            others[name] = run(name, known.model, intervals=True, **more)
+            others[name] = run(name, known.model, intervals=name in WITH_INTERVALS, **more)
         except InputError:  # too few rows to hold any out
             others[name] = run(name, known.model, **more)
     return compared(hybrid, others)
@@ -171,11 +175,9 @@ def main() -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for count, cell in enumerate(CELLS, 1):
         print(f"ingredients: {count} of {len(CELLS)}: {cell.title}", file=sys.stderr, flush=True)
-        kept = place / f"{cell.name}.json"
-        if not kept.exists():
-            write_atomically(kept, json.dumps(measure(cell, place / cell.name)))
-        rows += rows_of(cell, json.loads(kept.read_text()))
-        for row in rows[-len(json.loads(kept.read_text())) :]:
+        found = rows_of(cell, kept(place / f"{cell.name}.json", partial(measure, cell, place / cell.name)))
+        rows += found
+        for row in found:
             print(f"ingredients: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
     return {"rows": rows, **_verdict(rows)}
 

@@ -7,9 +7,9 @@ nothing was tuned on them.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from wrf_mi_scenes.random_rooms import random_room
 
 import wrf_mi
 from wrf_mi.core import Record
-from wrf_mi.core.files import write_atomically
 from wrf_mi.correction import correct_scene, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.fit_key import fit_key, source_files
@@ -29,7 +28,7 @@ from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.tracer import RayTracer
 
-from .comparison import line
+from .comparison import kept, line
 from .scene import match
 
 SEEDS = range(12)
@@ -95,13 +94,13 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
         scores[column] = clipped_cea_db(np.asarray(found), truth, record)
     size = " x ".join(f"{side:.1f}" for side in room.size_m)
     what = f"{seed}: {size} m, {len(room.parts) - 6} pieces, {room.mount}{', perfect' if room.perfect else ''}"
-    kept = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
+    chosen = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
     facts = {"surfaces": len(page["materials"]), "planes": len(page["planes"])}
     return {
         **line(what, f"{scores[SCAN]:.1f} to {scores[CORRECTED]:.1f} dB", "-"),
         "cea_db": scores,
         "scan": disagreement(traced["true"], traced[SCAN]),
-        "correction": kept | facts,
+        "correction": chosen | facts,
     }
 
 
@@ -114,13 +113,10 @@ def main() -> dict[str, Any]:
     """
     place, rows = RUNS / fit_key(source_files()), list[dict[str, Any]]()
     for seed in SEEDS:
-        file = place / f"{seed}.json"
-        if not file.exists():
-            shutil.rmtree(place / str(seed), ignore_errors=True)
-            row = measure_room(seed, place / str(seed))
-            write_atomically(file, json.dumps(row, indent=1))
-            shutil.rmtree(place / str(seed))
-        rows.append(json.loads(file.read_text()))
+        folder = place / str(seed)
+        shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
+        rows.append(kept(place / f"{seed}.json", partial(measure_room, seed, folder)))
+        shutil.rmtree(folder, ignore_errors=True)
     gains = [row["cea_db"][CORRECTED] - row["cea_db"][SCAN] for row in rows]
     medians = {column: float(np.median([row["cea_db"][column] for row in rows])) for column in COLUMNS}
     text = f"{np.median(gains):.1f} dB ({min(gains):.1f} to {max(gains):.1f} dB)"

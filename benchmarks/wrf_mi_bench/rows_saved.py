@@ -1,0 +1,126 @@
+"""Score of WRF-GS+ against the number of training rows: random start, start from a mesh, and jointly with its paths.
+
+The *rows saved* are the share of the rows of a random start that joint training needs for the same score.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from wrf_mi.runs.api import train
+from wrf_mi.runs.figures import save
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.synthetic.furnished_room import NAME as ROOM
+from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.task import Task
+
+from .bench import FLAT
+from .comparison import Row, kept, line
+from .ingredients import LAB, Cell, scene_of_cell
+from .table_plan import SEEDS
+
+RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")
+"""Kept results, and the picture, which is written only in a checkout of the project."""
+ROWS: Mapping[str, Sequence[int]] = {
+    LAB: (20, 40, 80, 160),
+    ROOM: (50, 100, 200, 400),
+    FLAT: (50, 100, 200, 400),
+}
+STEPS = 3000
+RANDOM, MESH, JOINT, IDW = "random start", "start from the mesh", "joint with its paths", "IDW"
+
+
+def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:
+    """Median scores of all three by name, and of inverse-distance weighting; ``task``."""
+    scene, found = scene_of_cell(cell, folder.parent), dict[str, Any]()
+    for name, given, start in ((RANDOM, None, []), (MESH, None, [f"initial.mesh={scene}"]), (JOINT, scene, [])):
+        place = folder / name.replace(" ", "-")
+        shutil.rmtree(place, ignore_errors=True)
+        settings = [f"steps={steps}", *start]
+        run = train(cell.dataset, place, scene=given, n_train=cell.n_train, seed=seed, settings=settings)
+        task, reference = TASKS[run.metrics["task"]], run.metrics["reference"]
+        idw = reference[task.reference]["median"]
+        found |= {name: run.metrics[task.block]["median"], IDW: idw, "task": task.name}
+    shutil.rmtree(folder)
+    return found
+
+
+def rows_needed(rows: Sequence[int], score: Sequence[float], goal: float, higher_is_better: bool) -> float | None:
+    """Number of rows at which a curve reaches a score, linear in the logarithm of the rows; the first number where it
+    is reached at once, None: never.
+    """
+    sign = 1 if higher_is_better else -1
+    best = np.maximum.accumulate(sign * np.asarray(score, float))
+    if best[-1] < sign * goal:
+        return None
+    reached = int(np.argmax(best >= sign * goal))
+    if reached == 0:
+        return float(rows[0])
+    share = (sign * goal - best[reached - 1]) / (best[reached] - best[reached - 1])
+    low, high = np.log(rows[reached - 1]), np.log(rows[reached])
+    return float(np.exp(low + share * (high - low)))
+
+
+def curves(found: Sequence[Mapping[str, Any]], dataset: str, name: str) -> np.ndarray:
+    """Scores [sizes, seeds] of a data set by a name of `measure`."""
+    return np.array(
+        [[one[name] for one in found if (one["dataset"], one["rows"]) == (dataset, n)] for n in ROWS[dataset]]
+    )
+
+
+def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Rows of the table: scores of each data set and size, and the rows that joint training needs."""
+    lines = []
+    for dataset, rows in ROWS.items():
+        task = task_of(found, dataset)
+        means = {name: curves(found, dataset, name).mean(axis=1) for name in (RANDOM, MESH, JOINT)}
+        for number, n in enumerate(rows):
+            shown = ", ".join(f"{name} {means[name][number]:.{task.digits}f}" for name in means)
+            needed = rows_needed(rows, means[JOINT], means[RANDOM][number], task.higher_is_better)
+            text = "more than measured" if needed is None else f"{needed:.0f} ({needed / n:.0%})"
+            lines.append(line(f"{dataset}, {n} rows", f"{shown}; joint needs {text}", "half of the rows"))
+    return lines
+
+
+def task_of(found: Sequence[Mapping[str, Any]], dataset: str) -> Task:
+    """Task of a data set."""
+    return TASKS[next(one["task"] for one in found if one["dataset"] == dataset)]
+
+
+def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
+    """Scores over the number of rows, a panel for each data set: mean and range over seeds."""
+    figure = Figure(figsize=(3.4 * len(ROWS), 3.4), layout="constrained", facecolor="white")
+    panels = figure.subplots(1, len(ROWS), squeeze=False)[0]
+    for axes, (dataset, rows) in zip(panels, ROWS.items(), strict=True):
+        for name in (RANDOM, MESH, JOINT):
+            scores = curves(found, dataset, name)
+            (drawn,) = axes.plot(rows, scores.mean(axis=1), marker="o", label=name)
+            axes.fill_between(rows, scores.min(axis=1), scores.max(axis=1), alpha=0.2, color=drawn.get_color())
+        axes.plot(rows, curves(found, dataset, IDW).mean(axis=1), "k--", label=IDW)
+        label = task_of(found, dataset).label
+        axes.set(xscale="log", xticks=rows, xticklabels=rows, xlabel="training rows", ylabel=label, title=dataset)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8)
+    return figure
+
+
+def main() -> dict[str, Any]:
+    """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture."""
+    place, found = RUNS / fit_key(source_files()), list[dict[str, Any]]()
+    for seed in SEEDS:
+        for dataset, rows in ROWS.items():
+            for n in rows:
+                cell, name = Cell(dataset, "official", n), f"{dataset}-{n}-{seed}"
+                one = kept(place / f"{name}.json", partial(measure, cell, seed, place / name))
+                found.append({"dataset": dataset, "rows": n, "seed": seed, **one})
+    if PICTURE.parent.is_dir():
+        save(picture(found), PICTURE)
+    return {"rows": saved(found), "scores": found}

@@ -1,0 +1,40 @@
+"""Benchmark of training rows saved: rows that a curve needs, one cell measured, table and picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wrf_mi_bench import rows_saved
+from wrf_mi_bench.ingredients import LAB, Cell
+from wrf_mi_bench.rows_saved import IDW, JOINT, MESH, RANDOM, ROWS, measure, picture, rows_needed, saved
+
+
+@pytest.mark.parametrize(
+    ("score", "goal", "rows"), [((1, 2, 3), 2.5, 20 * 2**0.5), ((1, 2, 3), 0.5, 10), ((1, 2, 3), 4, None)]
+)
+def test_rows_needed_are_where_the_curve_reaches_the_score(score: Any, goal: float, rows: float | None) -> None:
+    """And the same of a score that is the better the lower."""
+    assert rows_needed((10, 20, 40), score, goal, True) == (None if rows is None else pytest.approx(rows))
+    lower = [-s for s in score]
+    assert rows_needed((10, 20, 40), lower, -goal, False) == (None if rows is None else pytest.approx(rows))
+
+
+def test_a_cell_is_measured_with_all_three_starts(tmp_path: Path) -> None:
+    found = measure(Cell(LAB, "official", 5), 0, tmp_path / "cell", steps=2)
+    assert {RANDOM, MESH, JOINT, IDW, "task"} == set(found)
+    assert len({found[RANDOM], found[MESH], found[JOINT]}) == 3
+    assert not (tmp_path / "cell").exists()
+
+
+def test_table_states_the_share_of_the_rows_and_the_picture_has_a_panel_a_data_set() -> None:
+    found = [
+        {"dataset": name, "rows": n, "seed": 0, "task": "spectrum", RANDOM: k, MESH: k, JOINT: k + 1, IDW: 0.1}
+        for name, rows in ROWS.items()
+        for k, n in enumerate(rows)
+    ]
+    lines = saved(found)
+    assert "joint needs 80 (50%)" in next(one for one in lines if one["what"] == f"{LAB}, 160 rows")["value"]
+    assert len(picture(found).axes) == len(ROWS)
+    assert len(lines) == sum(map(len, rows_saved.ROWS.values()))
