@@ -34,7 +34,7 @@ from ..tasks import instrument_of, task_of
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
 from ..tracing.solve import Prepared
-from ..training.reach import hold_out_groups
+from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
 from .options import DEFAULTS, CorrectionOptions, OnStage
@@ -170,9 +170,7 @@ def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
     """
     kept = ""
     for stage, score in scores.items():
-        gain = (score - scores[kept]) * (1 if higher_is_better else -1)
-        gain = gain[np.isfinite(gain)]
-        if len(gain) > 1 and gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+        if improves(score, scores[kept], higher_is_better):
             kept = stage
     return kept
 
