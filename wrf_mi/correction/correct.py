@@ -1,14 +1,7 @@
-"""Correction of a scene by measurements.
+"""Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-Paths are found once with the stated scene. Then, each on the training rows alone:
-
-1. *choice*: every surface tries common materials, every plane shifts (`wrf_mi.correction.search`);
-2. *least squares*: materials, planes and antennas, with priors (`wrf_mi.correction.least_squares`).
-
-Both are done in rounds, first without a quarter of the training rows, held out in clusters. On these rows the stated
-scene, changed materials alone, and materials with planes are compared; more freedom is kept where it gains more than
-the standard error of the gain, and is fitted again to all training rows. A scene that measurements cannot improve is
-returned as it was.
+Paths are found once with the stated scene; choice (`wrf_mi.correction.search`) and least squares
+(`wrf_mi.correction.least_squares`) are done in rounds on training rows, and what is kept is decided on others of them.
 """
 
 from __future__ import annotations
