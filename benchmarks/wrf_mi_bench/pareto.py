@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from wrf_mi.core import InputError
-from wrf_mi.runs.figures import save
+from wrf_mi.core.files import write_figure
 from wrf_mi.tasks import TASKS
 
 from .comparison import Row, line
@@ -98,5 +98,5 @@ def main() -> dict[str, Sequence[Any]]:
     """Fronts of all parts in both costs, and their picture."""
     found = read_points()
     if PICTURE.parent.is_dir():
-        save(pareto_figure(found), PICTURE)
+        write_figure(PICTURE, pareto_figure(found))
     return {"rows": fronts(found)}

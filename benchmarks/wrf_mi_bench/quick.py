@@ -272,16 +272,3 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
     if backend != (name := init().name):
         raise InputError(f"{file}: ratios of the backend {backend}; store those of {name} in another folder with --out")
     return ratios
-
-
-def ratio_table(ratios: Mapping[str, Mapping[str, float]], pairs: Sequence[Pair] = PAIRS) -> str:
-    """Markdown table of stored ratios."""
-    titles = {pair.name: pair.title for pair in pairs}
-    lines = ["| ratio | measured (95 % interval) | medians |", "| --- | --- | --- |"]
-    for name, one in ratios.items():
-        value = Interval(one["value"], one["low"], one["high"])
-        lines.append(
-            f"| {titles[name]} | **{value.value:.2g}** ({value.low:.2g} to {value.high:.2g}) "
-            f"| {one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms |"
-        )
-    return "\n".join(lines)

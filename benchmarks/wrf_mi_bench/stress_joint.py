@@ -77,10 +77,6 @@ TWO_BOUNCES = TraceOptions(max_depth=2, rays=1 << 13)
 Parts = dict[str, tuple[str, Mesh]]
 
 
-def _room() -> Parts:
-    return {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
-
-
 @dataclass(frozen=True)
 class Case:
     """An ill-conditioned geometry.
@@ -147,7 +143,8 @@ class _Joint:
 
     def __init__(self, case: Case, work: Path) -> None:
         self._case, rng = case, np.random.default_rng(7)
-        scene = open_scene(write_scene(work, _room() | case.parts, "Stress"), HZ, THICKNESS_M)
+        room = {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
+        scene = open_scene(write_scene(work, room | case.parts, "Stress"), HZ, THICKNESS_M)
         options = TracedOptions(case.options, 2, gain=100.0, materials="surface", planes=True)
         self._traced = TracedField(scene, case.tx_pos_m, case.receiver, options)
         self._oracle = TracedOracle(self._traced)

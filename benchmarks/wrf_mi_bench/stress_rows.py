@@ -158,16 +158,3 @@ def stages(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, int, float, flo
         worst, bound = zip(*map(worst_of, members), strict=True) if members else ((float("nan"),), (float("nan"),))
         found.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
     return found
-
-
-def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Markdown table of the worst error of each stage and its bound, and of the outcome of the fits."""
-    lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
-    lines += [
-        f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |" for title, cases, worst, bound in stages(rows)
-    ]
-    for row in rows:
-        if row["what"].startswith(FITS):
-            what, _, count = row["what"].rpartition(", ")
-            lines.append(f"| {what} | {count.removesuffix(' cases')} | **{row['value']}** | {row['asked']} |")
-    return "\n".join(lines)

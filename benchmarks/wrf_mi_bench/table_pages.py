@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from wrf_mi.core import InputError
-from wrf_mi.core.files import one_line, write_atomically
-from wrf_mi.runs.figures import save, score_cdf
+from wrf_mi.core.files import one_line, write_atomically, write_figure
+from wrf_mi.runs.figures import score_cdf
 from wrf_mi.tasks import TASKS
 
 from .table_plan import PARTS, SHARES, Part, plan
@@ -47,7 +47,7 @@ def write_tables(place: Path, quick: bool = False) -> None:
         figure = score_cdf(
             {part.entries[method].label: one["quantiles"] for method, one in whole.items()}, {}, TASKS[part.task].label
         )
-        save(figure, place / picture)
+        write_figure(place / picture, figure)
         text.append(f"![Distribution of the scores of each method]({picture})")
     write_atomically(place / "README.md", "\n\n".join(text) + "\n")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from wrf_mi_bench.bench import (
 )
 from wrf_mi_bench.check import main
 from wrf_mi_bench.pareto import fronts, read_points
-from wrf_mi_bench.stress_rows import STAGES, summary_table
+from wrf_mi_bench.stress_rows import FITS, STAGES, stages
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -140,12 +141,25 @@ def test_documents_show_the_fronts_of_the_stored_tables() -> None:
     assert f"<!-- pareto -->\n{shown}\n<!-- /pareto -->" in (CHECKOUT / "docs" / "speed.md").read_text()
 
 
+def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Markdown table of the worst error of each stage and its bound, and of the outcome of the fits."""
+    lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
+    lines += [
+        f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |" for title, cases, worst, bound in stages(rows)
+    ]
+    for row in rows:
+        if row["what"].startswith(FITS):
+            what, _, count = row["what"].rpartition(", ")
+            lines.append(f"| {what} | {count.removesuffix(' cases')} | **{row['value']}** | {row['asked']} |")
+    return "\n".join(lines)
+
+
 def test_documents_show_the_worst_of_each_stage() -> None:
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
     shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
     assert shown.strip() == summary_table(rows)
-    stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
-    assert set(stages) >= {words for words, _ in STAGES}
+    shown_stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
+    assert set(shown_stages) >= {words for words, _ in STAGES}
     worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
     assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
 

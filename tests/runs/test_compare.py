@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from wrf_mi.core import InputError
+from wrf_mi.core.files import write_figure
 from wrf_mi.runs import figures
 from wrf_mi.runs.compare import COLUMNS, compare
 from wrf_mi.runs.results import read_run
@@ -261,7 +262,7 @@ def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
     axes = figure.add_axes((0, 0, 1, 1), projection="polar")
     figures.polar_spectrum(axes, spectrum)
     axes.set_axis_off()
-    with Image.open(figures.save(figure, tmp_path / "polar.png", dpi=100)) as picture:
+    with Image.open(write_figure(tmp_path / "polar.png", figure, dpi=100)) as picture:
         green = np.asarray(picture.convert("RGB")).astype(int)
     yellow = (green[..., 0] > 200) & (green[..., 1] > 200) & (green[..., 2] < 120)
     row, column = np.argwhere(yellow).mean(axis=0)

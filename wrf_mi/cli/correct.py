@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .options import DATASET, Arguments, add_command, add_n_train
 from .output import print_json
+
+if TYPE_CHECKING:
+    from ..correction.options import OnStage
 
 
 def add_parser(commands: Any) -> None:
@@ -48,8 +53,8 @@ def correct_command(a: Arguments) -> int:
     splits = make_splits(record, a.split, a.seed, a.n_train)
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
-    with _Stages() as stages:
-        found = correct_scene(a.scene, record, splits[0], options, a.material, stages.show)
+    with _stages() as show:
+        found = correct_scene(a.scene, record, splits[0], options, a.material, show)
         facts = write_page(found, a.out, a.replace)
     if a.json:
         print_json({"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}})
@@ -62,33 +67,21 @@ def correct_command(a: Arguments) -> int:
     return 0
 
 
-class _Stages:
+@contextmanager
+def _stages() -> Iterator[OnStage]:
     """What is done and how much of it, on standard error: a bar on a terminal, else a line for each stage."""
+    from rich.console import Console
+    from rich.progress import Progress
 
-    def __enter__(self) -> _Stages:
-        from rich.console import Console
-        from rich.progress import Progress
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=1.0, visible=False)
 
-        console = Console(stderr=True)
-        self._bar = Progress(console=console, transient=True) if console.is_terminal else None
-        self._what = ""
-        if self._bar is not None:
-            self._bar.start()
-        return self
+        def show(what: str, share: float) -> None:
+            if what != bar.tasks[0].description:
+                bar.reset(task, description=what, visible=True)
+                if bar.disable:
+                    print(f"correct: {what}", file=sys.stderr, flush=True)
+            bar.update(task, completed=share)
 
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def show(self, what: str, share: float) -> None:
-        """Show a stage and the share of it that is done."""
-        if what != self._what:
-            self._what = what
-            if self._bar is None:
-                print(f"correct: {what}", file=sys.stderr, flush=True)
-            else:
-                for task in self._bar.task_ids:
-                    self._bar.remove_task(task)
-                self._task = self._bar.add_task(what, total=1.0)
-        if self._bar is not None:
-            self._bar.update(self._task, completed=share)
+        yield show

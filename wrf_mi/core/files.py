@@ -159,6 +159,13 @@ def write_atomically(path: Path, content: bytes | str) -> Path:
     return path
 
 
+def write_figure(path: Path, figure: Any, dpi: int = 110) -> Path:
+    """Write a Matplotlib figure as PNG atomically."""
+    with atomic_file(path) as part:
+        figure.savefig(part, format="png", dpi=dpi, metadata={"Software": None})
+    return path
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> Path:
     """Write an ``.npz`` file of plain arrays atomically."""
     with atomic_file(path) as part, part.open("wb") as stream:

@@ -41,13 +41,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield f"{prefix}{key}", value
 
 
-@cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(hint)
-
-
-def _range(limits: Any) -> tuple[TypeAdapter[Any], str]:
-    return TypeAdapter(Annotated[float, limits, Field(allow_inf_nan=False)]), limits.description
+_adapter = cache(TypeAdapter)
 
 
 @cache
@@ -56,7 +50,9 @@ def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
     hints = [typing.get_type_hints(base, include_extras=True) for base in reversed(kind.__mro__)]
     items = (item for found in hints for item in found.items())
     stated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
-    return {field.name: _range(stated.get(field.name, NOT_NEGATIVE)) for field in dataclasses.fields(kind)}
+    limits = {field.name: stated.get(field.name, NOT_NEGATIVE) for field in dataclasses.fields(kind)}
+    finite = Field(allow_inf_nan=False)
+    return {name: (TypeAdapter(Annotated[float, each, finite]), each.description) for name, each in limits.items()}
 
 
 def check(settings: Any, prefix: str = "") -> None:

@@ -1,14 +1,7 @@
-"""Correction of a scene by measurements.
+"""Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-Paths are found once with the stated scene. Then, each on the training rows alone:
-
-1. *choice*: every surface tries common materials, every plane shifts (`wrf_mi.correction.search`);
-2. *least squares*: materials, planes and antennas, with priors (`wrf_mi.correction.least_squares`).
-
-Both are done in rounds, first without a quarter of the training rows, held out in clusters. On these rows the stated
-scene, changed materials alone, and materials with planes are compared; more freedom is kept where it gains more than
-the standard error of the gain, and is fitted again to all training rows. A scene that measurements cannot improve is
-returned as it was.
+Paths are found once with the stated scene; choice (`wrf_mi.correction.search`) and least squares
+(`wrf_mi.correction.least_squares`) are done in rounds on training rows, and what is kept is decided on others of them.
 """
 
 from __future__ import annotations
@@ -34,7 +27,7 @@ from ..tasks import instrument_of, task_of
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
 from ..tracing.solve import Prepared
-from ..training.reach import hold_out_groups
+from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
 from .options import DEFAULTS, CorrectionOptions, OnStage
@@ -170,9 +163,7 @@ def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
     """
     kept = ""
     for stage, score in scores.items():
-        gain = (score - scores[kept]) * (1 if higher_is_better else -1)
-        gain = gain[np.isfinite(gain)]
-        if len(gain) > 1 and gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+        if improves(score, scores[kept], higher_is_better):
             kept = stage
     return kept
 

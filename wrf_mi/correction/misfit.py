@@ -7,8 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -144,7 +143,7 @@ class Misfit:
         # Arrays that are made from NumPy's memory at first use must exist before a recording.
         model.arrays(mi.Float)
         report(self._device(self.start))
-        return Recorded(derivative if tangent else report, partial(_arrays, side, model))
+        return Recorded(derivative if tangent else report, lambda: [side.arrays, model.arrays(mi.Float)])
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
@@ -221,10 +220,6 @@ def _recorded_gain(side: TracedField) -> Recorded:
         return found
 
     return Recorded(gain, lambda: side.arrays)
-
-
-def _arrays(side: TracedField, model: ReceiverModel) -> Sequence[Any]:
-    return [side.arrays, model.arrays(mi.Float)]
 
 
 def _stride(length: int, most: int) -> int:

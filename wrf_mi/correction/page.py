@@ -9,7 +9,6 @@ correction.png   the scene, coloured by how far its surfaces were moved, and the
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from pathlib import Path
@@ -22,7 +21,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_atomically
+from ..core.files import atomic_folder, write_atomically, write_figure
 from ..tasks import task_of
 from ..tracing.corrected_scene import material_constants, moved_triangles, write_corrected_scene
 from ..tracing.material_parameters import SURFACE, name_of
@@ -65,7 +64,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
         )
         write_atomically(part / FIGURES, json.dumps(facts, indent=1, default=_plain) + "\n")
         write_atomically(part / PAGE, _text(correction, facts))
-        write_atomically(part / PICTURE, _picture(correction, facts))
+        write_figure(part / PICTURE, _picture(correction, facts))
     return facts
 
 
@@ -249,7 +248,7 @@ def _with_sd(value: float, sd: float) -> str:
     return f"{value:.1f} ± {sd:.1f}" if math.isfinite(sd) else "not fixed by any plane"
 
 
-def _picture(correction: Correction, facts: dict[str, Any]) -> bytes:
+def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     """The scene coloured by the shifts of its planes, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
     triangles = moved_triangles(surfaces, correction.parameters if correction.kept else {})
@@ -284,6 +283,4 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> bytes:
     axes.set(xlabel=task_of(correction.misfit.record).label, ylabel="share of the held-out rows", ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+    return figure

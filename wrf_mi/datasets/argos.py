@@ -1,21 +1,13 @@
 """Captures of many-antenna base stations in HDF5: Argos traces and those of RENEW's sounder.
 
-A base station's antennas receive the pilots of one user after another, frame by frame, as 16-bit I and Q. Two layouts:
+A base station's antennas receive the pilots of one user after another, frame by frame. ``docs/data.md`` has the two
+layouts and how channels are estimated. Sources, and what they add to it:
 
-- ArgosV2 (Shepard, Ding, Guerra, Zhong, "Understanding real many-antenna MU-MIMO channels", Asilomar 2016; reader:
-  ``samps2csi`` with ``legacy=True`` in RENEWLab's ``PYTHON/IrisUtils/hdf5_lib.py``): ``/Pilot_Samples``
-  [frames, antennas, samples, 2] with the attributes ``num_mob_ant`` (users), ``samples_per_user`` (224) and
-  ``measured_noise`` (1 where a further slot after the users' holds noise). In each slot the pilot begins at sample 15
-  with a guard of 32; its two symbols at 47.
-- RENEW's sounder (https://github.com/renew-wireless/RENEWLab, ``hdf5_lib.py`` and ``channel_analysis.py``):
-  ``/Data/Pilot_Samples`` (or ``/Pilot_Samples``) [frames, cells, users, antennas, 2 x samples], I and Q in turn, with
-  the attributes ``PREFIX_LEN``, ``POSTFIX_LEN``, ``CP_LEN``, ``FFT_SIZE``, ``PILOT_SEQ_TYPE``, ``FREQ`` and ``RATE``;
-  after the prefix, as many pilot symbols as fit, each after its cyclic prefix.
-
-Channels are estimated as both readers do: samples / 2^15, the discrete Fourier transform over each 64-sample symbol,
-zero frequency in the middle, divided by the long training symbol of IEEE 802.11 on its 52 subcarriers -26..-1 and
-1..26, and the mean over the symbols. As in NeRF2, FIRE and WRF-GS+, the first 26 subcarriers are the uplink and the
-last 26 the downlink. Frames by users, in that order, are the samples.
+- ArgosV2: Shepard, Ding, Guerra, Zhong, "Understanding real many-antenna MU-MIMO channels", Asilomar 2016; reader:
+  ``samps2csi`` with ``legacy=True`` in RENEWLab's ``PYTHON/IrisUtils/hdf5_lib.py``. The attribute ``measured_noise`` is
+  1 where a further slot after the users' holds noise. In each slot the pilot begins at sample 15 with a guard of 32.
+- RENEW's sounder: https://github.com/renew-wireless/RENEWLab, ``hdf5_lib.py`` and ``channel_analysis.py``. After the
+  prefix there are as many pilot symbols as fit, each after its cyclic prefix.
 """
 
 from __future__ import annotations
@@ -66,7 +58,7 @@ def read_argos(
     cell: int | None = None,
     start: int | None = None,
 ) -> Record:
-    """Read and check a capture of a many-antenna base station (see this module's head).
+    """Read and check a capture of a many-antenna base station (see ``docs/data.md``).
 
     Args:
         path: path of the ``.hdf5`` file, or of a folder with such a file.

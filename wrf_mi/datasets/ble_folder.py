@@ -1,22 +1,9 @@
-"""The layout of the BLE signal-strength data of a flat: one folder of CSV files.
+"""The layout of the BLE signal-strength data of a flat: one folder of CSV files (``docs/data.md`` has their columns).
 
-Format (M. Kolakowski, "Automated calibration of RSS fingerprinting based systems using a mobile robot and machine
-learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.5457591):
-
-- ``anchors.csv``: header ``id,x,y,z``; the receivers, metres. An id is a whole number or a name. The receiver of id 3
-  is called ``anchor3``, that of id ``kitchen`` is called ``kitchen``. Optional: ``pattern`` and ``polarization`` of the
-  receiver's antenna, and of the transmitter's ``tx_pattern`` and ``tx_polarization``, the same in every row, in Sionna
-  RT's terms (see `wrf_mi.core.Antenna`); an empty field is the default, isotropic and vertical.
-- ``calibration_df.csv``: one row per measurement: ``x``, ``y`` of the transmitter in metres, ``rssi_<id>`` at each
-  receiver in dBm, empty where nothing was received. These rows train.
-  Optional: ``z`` of the transmitter in metres, and ``heading`` of the robot that carried it in radians. Optional and
-  ours, for all receivers or none: ``count_<id>``, the number of readings of which ``rssi_<id>`` is the mean (0 or
-  empty where nothing was received), and ``std_<id>``, the standard deviation of that mean's noise in dB (empty where
-  nothing was received); and ``frequency_hz``, the carrier of the row. Other columns (``ts``, the time) are not used.
-- ``test_robot_df.csv``: the same for another run; these rows test. An optional column is in both files or in neither.
-
-Without a column ``z`` the height is that of the published data, whose transmitter stood on a pole 1.3 m above the
-floor. Each receiver averages the powers of two perpendicular antennas; their orientation is the identity.
+Source: M. Kolakowski, "Automated calibration of RSS fingerprinting based systems using a mobile robot and machine
+learning", Sensors 21, 6270, 2021; files at https://doi.org/10.5281/zenodo.5457591. Their transmitter stood on a pole
+1.3 m above the floor. Each receiver averages the powers of two perpendicular antennas; their orientation is the
+identity.
 """
 
 from __future__ import annotations
@@ -67,7 +54,7 @@ NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
 
 
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
-    """Read and check a folder in the layout of the BLE data (see this module's head).
+    """Read and check a folder in the layout of the BLE data (see ``docs/data.md``).
 
     Args:
         path: path of the folder.

@@ -1,18 +1,9 @@
 """The layout of NeRF2's signal strengths: one folder with gateways, positions and a table of powers.
 
-Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, class ``BLE_dataset`` of its
-``dataloader.py``):
-
-- ``gateway_position.yml``: ``name: [x, y, z]`` of each gateway, metres.
-- ``tx_pos.csv``: a header, then the transmitter's x, y, z in metres, one row per transmission.
-- ``gateway_rssi.csv``: a header with one column per gateway, then the power in dBm that each received, one row per
-  transmission; -100 where it received nothing. Columns are assigned by the gateways' names, or else by the order of
-  ``gateway_position.yml``, as NeRF2's loader does.
-  In both tables a header may number the columns, ``0,1,...``, as pandas does; any other header of numbers is refused,
-  because it is most likely a row. Blank lines are skipped.
-- ``train_index.txt``, ``test_index.txt``, optional: transmissions, counted from 0, one per line. Both or neither.
-
-The gateways' antennas are not stated: their orientation is the identity.
+Source: NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, class ``BLE_dataset`` of its
+``dataloader.py``. ``docs/data.md`` has the files. In both tables a header may number the columns, ``0,1,...``, as
+pandas does; any other header of numbers is refused, because it is most likely a row. Blank lines are skipped. The
+gateways' antennas are not stated: their orientation is the identity.
 """
 
 from __future__ import annotations
@@ -44,7 +35,7 @@ FEWEST = 2
 
 
 def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
-    """Read and check a folder in the layout of NeRF2's signal strengths (see this module's head).
+    """Read and check a folder in the layout of NeRF2's signal strengths (see ``docs/data.md``).
 
     Args:
         path: path of the folder.

@@ -1,20 +1,8 @@
 """The layout of NeRF2's channel coefficients: uplink and downlink of a base station with many antennas.
 
-Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, class ``CSI_dataset`` of its
-``dataloader.py``):
-
-- ``csidata.npy``: complex [n, antennas, subcarriers]; the first half of the subcarriers is the uplink, the second the
-  downlink. (The authors' data: 8 antennas, 26 and 26 subcarriers of the ArgosV2 traces.)
-- ``base-station.yml``: ``base_station``, a list of x, y, z in metres, one for each antenna.
-- ``train_index.txt``, ``test_index.txt``, optional: samples, counted from 0, one per line. Both or neither.
-
-Optional and ours: in ``base-station.yml`` ``orientation`` of the array (unit quaternion x, y, z, w, array's frame to
-world), ``frequencies_hz`` of all subcarriers, and ``antenna`` and ``tx_antenna`` as in ``gateway_info.yml`` (see
-`wrf_mi.datasets.spectrum_folder`); ``tx_pos.csv`` with the positions of the moving ends;
-``downlink_truth.npy``, the downlink without noise [n, antennas, subcarriers / 2], where it is synthetic.
-
-NeRF2 divides all coefficients, test rows included, by the largest magnitude among them, and treats each antenna as a
-sample. Neither is done here: a record holds measured values, and a model normalises by its training rows alone.
+Source: NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2, class ``CSI_dataset`` of its
+``dataloader.py``. The authors' data have 8 antennas, and 26 and 26 subcarriers of the ArgosV2 traces. ``docs/data.md``
+has the files, and what is ours and optional.
 """
 
 from __future__ import annotations
@@ -57,7 +45,7 @@ FEWEST = 2
 
 
 def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
-    """Read and check a folder in the layout of NeRF2's channel coefficients (see this module's head).
+    """Read and check a folder in the layout of NeRF2's channel coefficients (see ``docs/data.md``).
 
     Args:
         path: path of the folder.

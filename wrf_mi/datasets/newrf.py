@@ -1,15 +1,4 @@
-"""The layout of the NeWRF rooms: channels computed by an image-method ray tracer, one ``.npz`` file per room.
-
-Format of ``<room>.npz`` (ours, converted from the pickles of https://github.com/LuHaofan/NeWRF), with the
-room's mesh beside it as ``<room>.stl``, metres:
-
-- ``tx_pos`` [3] and ``rx_pos`` [n, 3], metres; ``frequency_hz``, a number;
-- ``csi`` [n] complex: sum over the paths to each receiver; ``line_of_sight`` [n], whether one of them is direct;
-- for each path ``path_gain`` [p] complex and ``path_last_point`` [p, 3], its last interaction point (the
-  transmitter's position for the line of sight); receiver i has paths ``path_offsets[i]:path_offsets[i + 1]``.
-
-The *receiver* of these data moves. By reciprocity the record's transmitter is the moving end, and its receiver stands
-at the file's ``tx_pos``.
+"""The layout of the NeWRF rooms (``docs/data.md`` has the files): channels computed by an image-method ray tracer.
 
 Original: ``data/dataset_<room>_ch1_rt_image_fc.pkl`` of https://github.com/LuHaofan/NeWRF, a pickled pandas table that
 their ``simulator/mat2pkl.py`` wrote, one row per receiver. ``TxPos``, ``RxPos`` (m), ``Frequency`` (GHz), ``CSI``,

@@ -1,21 +1,7 @@
-"""The NeRF2 spectrum layout: one folder of grey images, positions and receiver poses.
+"""The NeRF2 spectrum layout: one folder of grey images, positions and receiver poses (``docs/data.md`` has the files).
 
-Format (NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2):
-
-- ``gateway_info.yml``: one entry per receiver (``gateway1``, ``gateway2``, ...) with ``position`` (x, y, z in
-  metres) and ``orientation`` (unit quaternion x, y, z, w, array's frame to world). Optional and ours: ``frequency_hz``
-  of the carrier, one for all receivers; ``array`` with ``rows``, ``columns`` and ``spacing_m`` or with ``elements_m``,
-  a list of x, y, z in the array's frame, for all receivers or in the entry of each; ``antenna`` in a receiver's entry,
-  and ``tx_antenna`` beside these, with ``pattern`` and ``polarization`` in Sionna RT's terms (a receiver's with
-  ``frame`` too; see `wrf_mi.core.Antenna`; the default is isotropic and vertical in the world). ``dataset_name`` and
-  other plain values beside them are not used.
-- ``tx_pos.csv``: header ``x,y,z``, then one transmitter position in metres per row. Optional and ours: a fourth column
-  ``frequency_hz``, the carrier of the row, in place of that in ``gateway_info.yml``.
-- ``spectrum/00001.png``, ...: the spectrum of row 1, ...; grey, 8 bit (divided by 255) or 16 bit (by 65535),
-  row of the image = elevation, column = azimuth (see `wrf_mi.core.angles`). With several receivers the images
-  lie in ``spectrum/<receiver's name>/``.
-- ``train_index.txt``, ``test_index.txt``: row numbers from 1, one per line, as in the images' names. Both or neither.
-- ``blocked_folds.txt``, optional and ours: the spatial fold 0, 1, ... of each row, one per line.
+Source: NeRF2, Zhao et al., MobiCom 2023, https://github.com/XPengZhao/NeRF2. Carrier, arrays, antennas and folds are
+ours and optional. ``dataset_name`` and other plain values beside the receivers are not used.
 """
 
 from __future__ import annotations
@@ -64,7 +50,7 @@ GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 
 
 def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
-    """Read and check a folder in the NeRF2 spectrum layout (see this module's head).
+    """Read and check a folder in the NeRF2 spectrum layout (see ``docs/data.md``).
 
     Args:
         path: path of the folder.

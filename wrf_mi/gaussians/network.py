@@ -115,8 +115,3 @@ def dense_of_pairs(
     product = None if hidden is None else params[f"{name}.hidden"] @ hidden
     rectified: dr.ArrayBase = dr.custom(_Rectified, product, sum(gaussian[1:], gaussian[0]), biased)
     return rectified
-
-
-def relu(x: dr.ArrayBase) -> dr.ArrayBase:
-    """Rectified linear unit."""
-    return dr.maximum(x, 0)

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -197,9 +197,7 @@ def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: fl
     return whole
 
 
-@lru_cache(maxsize=1)
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
+_blas = cache(ThreadpoolController)
 
 
 def _workers() -> int:

@@ -10,10 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from ..core import InputError
-from ..core.angles import FloatArray, pixel_directions
 from ..core.registry import resolve
 from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
@@ -96,7 +94,7 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
 
     Returns:
         Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
-        hemisphere, then those of the lower one, see `hemisphere_pair`.
+        hemisphere, then those of the lower one, both in the order of `wrf_mi.core.pixel_directions`.
     """
     upper = splat(gaussians, pose, plane)
     if not sphere:
@@ -114,13 +112,3 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
 def facing_down(pose: Pose) -> Pose:
     """The pose after half a turn about the receiver's x axis: its upper hemisphere is the lower one of ``pose``."""
     return Pose(pose.position, [[row[0], -row[1], -row[2]] for row in pose.to_world])
-
-
-def hemisphere_pair(height: int, width: int) -> FloatArray:
-    """Unit vectors [2 * height * width, 3] of the pixels of the upper, then the lower hemisphere, receiver's frame.
-
-    The lower hemisphere is the upper one after half a turn about x, in the order of `wrf_mi.core.pixel_directions`; for
-    one grid over the full sphere see `wrf_mi.core.angles.equirectangular_sphere`.
-    """
-    upper = pixel_directions(height, width).reshape(-1, 3)
-    return np.concatenate([upper, upper * [1, -1, -1]])

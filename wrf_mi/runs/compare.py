@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..core import InputError
-from ..core.files import write_atomically
+from ..core.files import write_atomically, write_figure
 from ..models.ray_tracing import PATHS
 from ..tasks import TASKS
 from . import figures
@@ -79,7 +79,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path) -> Path:
     write_csv(folder / "compare.csv", table, list(COLUMNS))
     for _, pictures in sections:
         for name, _, figure in pictures:
-            figures.save(figures.without_formulas(figure), folder / name)
+            write_figure(folder / name, figures.without_formulas(figure))
     shown = [(heading, [(folder / name, title) for name, title, _ in pictures]) for heading, pictures in sections]
     return write_atomically(folder / "index.html", _page(table, shown))
 

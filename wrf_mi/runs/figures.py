@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +14,6 @@ from matplotlib.text import Text
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
-from ..core.files import write_atomically
 from ..gaussians.oracle import Projection
 
 PANEL_IN = 2.3
@@ -216,10 +213,3 @@ def without_formulas(figure: Figure) -> Figure:
     for text in figure.findobj(Text):
         text.set_parse_math(False)
     return figure
-
-
-def save(figure: Figure, path: Path, dpi: int = 110) -> Path:
-    """Write a figure as PNG atomically."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
-    return write_atomically(path, buffer.getvalue())

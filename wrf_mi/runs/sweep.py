@@ -165,7 +165,10 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
 
     def each(index: int, row: dict[str, Any]) -> None:
         finished[index] = row
-        _write_table(sweep, [finished[k] for k in sorted(finished)])  # after each run: a sweep may take days
+        rows = [finished[k] for k in sorted(finished)]  # written after each run: a sweep may take days
+        write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
+        write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
+        write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")
         headline = row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
         count = f"{len(finished)} of {len(sweep.runs)}"
         print(f"{sweep.runs[index].folder.name}: {headline} ({count})", file=sys.stderr, flush=True)
@@ -263,9 +266,3 @@ def _cell(key: str, value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.3f}" if key in (*SCORES, "reference_median") else f"{value:.1f}"
     return str(value).replace("|", "\\|")
-
-
-def _write_table(sweep: Sweep, rows: Sequence[Mapping[str, Any]]) -> None:
-    write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
-    write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
-    write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")

@@ -6,7 +6,6 @@ without pyplot: no global state, no window system.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
-from ..core.files import write_atomically
+from ..core.files import write_figure
 from ..core.paths import Paths
 from .surfaces import Surface
 
@@ -84,10 +83,7 @@ class GaussianCloud:
 
 def draw_preview(surfaces: Sequence[Surface], path: str | Path, points: ArrayLike | None = None) -> Path:
     """Write a picture of a scene and a scan [n, 3] or [n, 2] of it as PNG, atomically."""
-    figure = draw_scene(surfaces, points_m=points)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return write_atomically(Path(path), buffer.getvalue())
+    return write_figure(Path(path), draw_scene(surfaces, points_m=points))
 
 
 def draw_scene(

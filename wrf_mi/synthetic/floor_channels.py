@@ -1,12 +1,9 @@
 """Channels traced between a base station and users who walk through two made-up floors: uplink and downlink.
 
-The base station has 104 antennas, 8 rows of 13 half a wavelength apart, and each user a vertical antenna. Carrier and
-subcarriers are those of the ArgosV2 traces: 2.437 GHz, IEEE 802.11's 52 subcarriers 312.5 kHz apart at -26..-1 (the
-uplink) and 1..26 (the downlink). By reciprocity the base station is the record's receiver in both. Paths: transmission
-through walls, up to three reflections, and diffuse reflection by every surface (`wrf_mi_scenes.floor_plans`). Uplink
-and downlink are noisy; the downlink without noise is `Record.truth`, with which predictions are compared. Users walk
-closed routes through rooms and doors, two on each; rows run in the order of time, user after user. The mesh for
-models has no furniture, each wall off by some centimetres, all of a single generic material.
+``docs/data.md`` describes them. Subcarriers are IEEE 802.11's at -26..-1 (the uplink) and 1..26 (the downlink). By
+reciprocity the base station is the record's receiver in both. Each user has a vertical antenna and walks a closed
+route through rooms and doors (`wrf_mi_scenes.floor_plans`), two on each; rows run in the order of time, user after
+user.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """The traced room: spectra of transmitters anywhere in a furnished room, and its bare walls as input of models.
 
-The spectra are traced with furniture, windows, doors and eight materials (`wrf_mi_scenes.furnished`), diffraction at
-edges of metal and diffuse reflection. The mesh for models has walls, floor and ceiling, each plane off by some
-centimetres, all of a single generic material.
-
-Layout and array are those of the laboratory (`wrf_mi.synthetic.laboratory`): 4 x 4 elements with 0.16 m spacing at
-920 MHz, 8-bit spectra scaled to their minimum and maximum. Transmitters stand anywhere in the room's free volume
-between 0.5 and 2 m height, including the space behind the array and the inner room.
+``docs/data.md`` describes both. The furniture is `wrf_mi_scenes.furnished`, layout and array are those of the
+laboratory (`wrf_mi.synthetic.laboratory`). Transmitters stand anywhere in the room's free volume between 0.5 and 2 m
+height, including the space behind the array and the inner room.
 """
 
 from __future__ import annotations

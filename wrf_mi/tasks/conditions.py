@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
+from ..core.antenna import UPRIGHT
 from ..core.types import IntArray
 from . import task_of
-
-UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-"""Quaternion x, y, z, w of a frame parallel to the world's."""
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
@@ -120,7 +118,7 @@ def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
                     "need; give its position and orientation, or channels with an uplink"
                 )
             position = position if np.isfinite(position).all() else np.zeros(3)
-            turned = turned if np.isfinite(turned).all() else UPRIGHT
+            turned = turned if np.isfinite(turned).all() else np.array(UPRIGHT)
         placed.append(replace(receiver, position_m=position, orientation_xyzw=turned))
     return tuple(placed)
 

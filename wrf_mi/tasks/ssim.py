@@ -20,7 +20,6 @@ from ..core import InputError
 from .scores import SSIM_C1, SSIM_C2, SSIM_SAMPLE, WINDOW
 
 BORDER = WINDOW - 1
-PIXELS = WINDOW**2
 
 
 def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:

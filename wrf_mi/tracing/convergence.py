@@ -1,18 +1,9 @@
 """Choice of depth, rays and kinds of path by convergence of the received power to a stated error.
 
-On a sample of the transmitters, settings grow one after the other until the change in received power is small:
-
-1. *depth*, from 1, with few rays, until two consecutive changes and the remainder stay below the part's share of the
-   error. The remainder extrapolates the last two changes as a geometric series: each further interaction adds a share q
-   of the last, in all q / (1 - q) times the last change (in a room, power falls by about as much at each bounce).
-2. *rays*, doubled, until two consecutive changes stay below the share.
-3. *diffraction*, then *scattering*: on where they change power by more than the share, and then rays again.
-
-The change is the largest over all sampled pairs, in dB; a pair that has a path in one of two traces only counts as
-infinite. Where an array reports spectra, waves interfere: there the change is that of power or that of the reported
-spectrum, whichever is larger. A spectrum that changes by a share e of itself (relative L2 norm of the difference)
-counts as 20 log10(1 + e) dB. The shares are equal and their sum is the target. Not covered: places outside the sample,
-and errors of materials and mesh.
+On a sample of the transmitters, settings grow one after the other until the change is below an equal share of the error
+(``docs/speed.md`` has the steps and the change). The remainder of the depth extrapolates the last two changes as a
+geometric series: each further interaction adds a share q of the last, in all q / (1 - q) times the last change (in a
+room, power falls by about as much at each bounce).
 """
 
 from __future__ import annotations

@@ -7,10 +7,8 @@ The file is a cache: its key is a digest of everything that the weights depend o
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +19,7 @@ from scipy.sparse import csr_array
 from .. import __version__
 from ..backend.device import to_tensor
 from ..core import Receiver
+from ..core.digest import content_digest
 from ..core.files import write_arrays
 from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
@@ -62,16 +61,10 @@ class StaticOperator:
     def key(self, receiver: int) -> str:
         """Digest of everything that the weights at a receiver depend on."""
         pose = self._receivers[receiver]
-        constants = (FORMAT, __version__, *self._size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M)
-        digest = hashlib.sha256(repr((constants, self._field)).encode())
-        arrays: dict[str, NDArray[Any]] = {"position of the receiver": pose.position_m, "its turn": pose.to_world}
+        constants = (FORMAT, __version__, *self._size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, repr(self._field))
         signal_alone = self._field.signal_parameters
-        arrays |= {name: a for name, a in self._params.items() if not name.startswith(signal_alone)}
-        for name in sorted(arrays):
-            values = np.ascontiguousarray(arrays[name])
-            digest.update(f"{name} {values.dtype} {values.shape}".encode())
-            digest.update(values.tobytes())
-        return digest.hexdigest()
+        arrays = {name: a for name, a in self._params.items() if not name.startswith(signal_alone)}
+        return content_digest(constants, pose.position_m, pose.to_world, arrays)
 
     def weights(self, receiver: int) -> csr_array:
         """Weights [pixels, n] at a receiver: stored ones if they are valid, else built and stored.

@@ -8,7 +8,7 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Split
+from ...core import InputError, Receiver, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
@@ -84,8 +84,6 @@ class Kriged:
         like: empty array of the shape and type of observations, [0, ...].
         trend: columns of the trend.
         noise: variance of the noise as a share of the field's.
-        variance: variance of the field for each component [q]; None, as ``system``, in a stored model.
-        system: covariance of the rows, factored.
     """
 
     kernel: str
@@ -97,17 +95,6 @@ class Kriged:
     like: NDArray[np.inexact]
     trend: Trend
     noise: float = 0.0
-    variance: FloatArray | None = None
-    system: KrigingSystem | None = None
-
-    def _correlations(self, positions_m: FloatArray, tx_heading_rad: ArrayLike | None) -> FloatArray:
-        """Correlations [m, n] of positions [m, 3] with the rows."""
-        if (tx_heading_rad is None) != (self.circle is None):
-            had = "no headings" if self.circle is None else "headings"
-            raise InputError(f"kriging: fitted with {had}; predict with the same")
-        turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
-        requested = _coordinates(positions_m, turned, self.lengths)
-        return correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
         """Interpolate: [m, ...], in the observations' unit and type.
@@ -119,24 +106,15 @@ class Kriged:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
+        if (tx_heading_rad is None) != (self.circle is None):
+            had = "no headings" if self.circle is None else "headings"
+            raise InputError(f"kriging: fitted with {had}; predict with the same")
         positions = np.atleast_2d(np.asarray(tx_pos, float))
-        cross = self._correlations(positions, tx_heading_rad)
+        turned = None if tx_heading_rad is None else _circle(tx_heading_rad)
+        requested = _coordinates(positions, turned, self.lengths)
+        cross = correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
-
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
-        """Interpolate, with the standard deviation of a new observation, noise included, about the prediction.
-
-        The trend's uncertainty is in it with ``gls``, that of the chosen lengths and noise never.
-        """
-        assert self.system is not None
-        assert self.variance is not None
-        mean = self.predict(tx_pos, tx_heading_rad)
-        positions = np.atleast_2d(np.asarray(tx_pos, float))
-        columns = self.trend(positions)[:, : self.system.trend.shape[1]]
-        share = self.system.variance(1.0, self._correlations(positions, tx_heading_rad), columns) + self.noise
-        std = np.sqrt(share)[:, None] * np.sqrt(self.variance)
-        return Prediction(mean, std.reshape(mean.shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
@@ -223,11 +201,7 @@ class Kriging(CovarianceSettings):
         beta = system.coefficients(field)
         weights = system.weights(field, beta)
         coefficients = beta if ordinary is None else ordinary
-        quadratic = (field.conj() * weights).real.sum(axis=0)
-        # The trend's degrees of freedom make the residual too small by their share.
-        variance = np.maximum(quadratic, 0) / max(1, len(y) - columns.shape[1])
-        rows = lengths, positions, circle
-        return Kriged(self.kernel, *rows, coefficients, weights, like, self.trend, noise, variance, system)
+        return Kriged(self.kernel, lengths, positions, circle, coefficients, weights, like, self.trend, noise)
 
     def _factored(self, coordinates: FloatArray, noise: float, columns: FloatArray) -> KrigingSystem:
         return KrigingSystem(correlation(coordinates, coordinates, self.kernel), noise, columns)
@@ -319,9 +293,7 @@ def _fit(
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-    model = Kriging(*given, _trend(name, receiver), how, problem.seed)
-    # The factored covariance of all receivers would fill the memory.
-    return replace(model.fit(tx_pos, observed, heading), system=None)
+    return Kriging(*given, _trend(name, receiver), how, problem.seed).fit(tx_pos, observed, heading)
 
 
 MODEL = model_by_receiver(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Prediction, Receiver, Split
+from ...core import InputError, Receiver, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
 from ..model import Problem
@@ -72,7 +72,6 @@ class Trees(CheckedSettings):
             value=joined("value")[:, 0, 0],
             depth=np.asarray(max(part.max_depth for part in parts)),
             like=like,
-            variance=joined("impurity"),
         )
 
 
@@ -89,7 +88,6 @@ class GrownTrees:
         value: mean of the training rows in the node.
         depth: longest path from a root to a leaf.
         like: empty array [0, features] of the observations' type.
-        variance: variance of the training rows in the node; None in a stored model.
     """
 
     root: NDArray[np.int32]
@@ -100,7 +98,6 @@ class GrownTrees:
     value: FloatArray
     depth: NDArray[Any]
     like: NDArray[Any]
-    variance: FloatArray | None = None
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
         """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].
@@ -108,22 +105,6 @@ class GrownTrees:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
-        value = self.value[self._leaves(tx_pos, tx_heading_rad)]
-        return np.asarray(value.mean(axis=0), self.like.dtype)
-
-    def estimate(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Prediction:
-        """Average of the trees, and the standard deviation of a training row drawn from a leaf of a random tree.
-
-        The variance within leaves and that between trees add up (law of total variance).
-        """
-        assert self.variance is not None
-        leaf = self._leaves(tx_pos, tx_heading_rad)
-        value = self.value[leaf]
-        variance = self.variance[leaf].mean(axis=0) + value.var(axis=0)
-        return Prediction(value.mean(axis=0).astype(self.like.dtype), np.sqrt(variance))
-
-    def _leaves(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None) -> NDArray[np.int32]:
-        """Leaf of each tree for each position [trees, m]."""
         # scikit-learn cuts features in single precision.
         single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
         rows = np.arange(len(single))
@@ -131,11 +112,11 @@ class GrownTrees:
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
-        return node
+        return np.asarray(self.value[node].mean(axis=0), self.like.dtype)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
-        return {name: values for name, values in vars(self).items() if name != "variance"}
+        return dict(vars(self))
 
 
 def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray[Any]) -> FloatArray:

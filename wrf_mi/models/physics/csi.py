@@ -1,12 +1,9 @@
-"""Complex channels: image sources in a scene's planes, corrected by measurements.
+"""Complex channels: image sources in a scene's planes, corrected by measurements (``docs/physics.md`` has the steps).
 
-A mesh from LiDAR gives planes to millimetres or centimetres, and rough outlines. Phases need tenths of millimetres, and
-the error is mostly decided by which paths exist. So, with measured channels, three steps alternate: the probability of
-each path is inferred from a row's channel (`csi_fit`), planes are shifted and tilted until all phases fit
-(`csi_paths`), and outlines, obstacles and missing parts of mirrors are learned from these paths and predict visibility
-elsewhere (`csi_visibility`). The residual is a diffuse field, useful within half a wavelength of measurements.
-
-Without measurements this is the image method on the mesh; without a mesh the line of sight and the diffuse field.
+With measured channels three steps alternate: the probability of each path is inferred from a row's channel (`csi_fit`),
+planes are shifted and tilted until all phases fit (`csi_paths`), and visibility elsewhere is learned from these paths
+(`csi_visibility`). Without measurements this is the image method on the mesh; without a mesh the line of sight and the
+diffuse field, which is useful within half a wavelength of measurements.
 """
 
 from __future__ import annotations

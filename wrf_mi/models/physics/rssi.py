@@ -1,10 +1,7 @@
-"""Received signal strength: expectation by mesh and physics, corrected by measurements.
+"""Received signal strength: expectation by mesh (`PowerMap`) or free space, corrected by measurements.
 
-The expected value is the traced power, averaged over a neighbourhood (`PowerMap`), or free space without a mesh. It is
-corrected by an offset of each receiver, the exponent of the distance, and patterns, whose common parts are learned from
-all receivers (`rssi_terms`); shadowing and the body's effect at a position are a Gaussian process. Hyperparameters, the
-noise of each receiver, and the calibration of predictions come from held-out stretches of the training rows
-(`rssi_fit`). With few rows the priors dominate, with none the mesh, and the standard deviation is accordingly large.
+``docs/physics.md`` has the corrections. Their common parts are in `rssi_terms`; hyperparameters, the noise of each
+receiver, and the calibration of predictions come from held-out stretches of the training rows (`rssi_fit`).
 """
 
 from __future__ import annotations

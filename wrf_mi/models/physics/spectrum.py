@@ -1,14 +1,9 @@
-"""The physics model for spatial spectra: a traced room with kriging of its residuals.
+"""The physics model for spatial spectra: a traced room with kriging of its residuals (steps: ``docs/physics.md``).
 
 Element signals are a coherent sum of specular paths: those of the given mesh, with displaced planes and fitted
 materials (`spectrum_fit`), and those of surfaces that the mesh lacks (`spectrum_search`), which also obstruct; each
-times a learned complex amplitude that varies slowly with the transmitter's image. All phases come from path lengths, so
-the fit extrapolates between and beyond the training rows. Residuals near a transmitter are kriged, or kriging of the
-spectra replaces the room. Every step must lower the loss of validation rows, which are taken from the training rows.
-
-Few rows leave none for validation, and suffice only for planes and materials of the given mesh, which have priors. Then
-all candidates (room as given, fitted room, kriging of the spectra, mixes) are fitted without each of some groups of
-rows, and the best one on held-out rows is fitted to all rows.
+times a learned complex amplitude that varies slowly with the transmitter's image. Every step must lower the loss of
+validation rows, or with few rows that of rows held out in turn.
 """
 
 from __future__ import annotations
