@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from wrf_mi.core.files import write_figure
 from wrf_mi.runs.api import train
-from wrf_mi.runs.figures import save
 from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
@@ -122,5 +122,5 @@ def main() -> dict[str, Any]:
                 one = kept(place / f"{name}.json", partial(measure, cell, seed, place / name))
                 found.append({"dataset": dataset, "rows": n, "seed": seed, **one})
     if PICTURE.parent.is_dir():
-        save(picture(found), PICTURE)
+        write_figure(PICTURE, picture(found))
     return {"rows": saved(found), "scores": found}
