@@ -76,7 +76,9 @@ def shape_parameters(gaussians: Gaussians, transmitter: int = 0) -> dict[str, An
     if not 0 <= transmitter < gaussians.batch:
         raise ValueError(f"transmitter {transmitter}: these Gaussians are for {gaussians.batch}, counted from 0")
     count = gaussians.count
-    index = dr.arange(mi.UInt32, count) + transmitter * count
+    index = dr.arange(mi.UInt32, count)
+    if transmitter:  # opaque: as a constant of kernels, each number would compile new ones
+        index += dr.opaque(mi.UInt32, transmitter * count)
 
     def selected(columns: list[Any]) -> list[Any]:
         return [dr.gather(mi.Float, mi.Float(c), index) for c in columns]

@@ -33,6 +33,8 @@ def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made: tuple[
     assert same == {"missing": 0, "wrong": 0, "phase_error_rad": 0}
 
 
+# Eight seconds. tests/correction/test_correct.py requires 20 dB of a correction by channels, in a smaller room.
+@pytest.mark.slow
 def test_correction_brings_channels_closer_than_the_scan(made: tuple[Record, Path, Path], tmp_path: Path) -> None:
     """By 3 dB at the test rows, 60 training rows; 7 dB with seed 103 and 90 rows."""
     record, _, scan = made

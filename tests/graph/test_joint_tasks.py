@@ -36,6 +36,7 @@ SETTINGS = (
     "deterministic=true",
 )
 SPECTRA = ("batch=4", "steps=60", "density.every=0")
+CHANNELS = ("steps=200", "validate_every=100")
 FLOAT32 = 1e-4
 """Relative difference between a batch of transmitters and a single one: sums in single precision."""
 
@@ -78,7 +79,7 @@ def thirds(record: Record) -> Split:
 
 
 def trained(record: Record, scene: Path | None, *settings: str) -> Trainer:
-    own = SPECTRA if record.task == "spectrum" else ()
+    own = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task, ())
     config = with_settings(default_config(record.task), [*SETTINGS, *own, *settings])
     trainer = Trainer(record, thirds(record), config, scene=None if scene is None else open_scene(scene, HZ))
     trainer.run()

@@ -143,11 +143,14 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
     Raises:
         InputError: a gain that is not a number.
     """
+    import drjit as dr
+
     gain = np.zeros(len(legs), np.complex128)
     for start in range(0, len(legs), PATHS_PER_CHUNK):
         part = slice(start, start + PATHS_PER_CHUNK)
         buffer = to_buffer(legs.select(part), surfaces, valid=True)
         real, imaginary = field_of(scene, buffer, ends, rays)
+        dr.eval(real, imaginary)  # in one kernel, not in one for each part
         gain[part] = real.numpy() + 1j * imaginary.numpy()
     if not np.isfinite(gain).all():
         raise InputError("gains that are not numbers: give materials constants that single precision can hold")
