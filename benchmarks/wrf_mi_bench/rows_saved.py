@@ -22,7 +22,7 @@ from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.task import Task
 
 from .bench import FLAT
-from .comparison import Row, kept, line
+from .comparison import Row, data_folder, kept, line
 from .ingredients import LAB, Cell, scene_of_cell
 from .table_plan import SEEDS
 
@@ -113,7 +113,12 @@ def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def main() -> dict[str, Any]:
-    """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture."""
+    """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture.
+
+    Raises:
+        InputError: signal strengths that are not on this machine; the other data are made here.
+    """
+    data_folder(FLAT)
     place, found = RUNS / fit_key(source_files()), list[dict[str, Any]]()
     for seed in SEEDS:
         for dataset, rows in ROWS.items():
