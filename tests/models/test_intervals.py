@@ -38,7 +38,7 @@ def test_every_training_row_is_held_out_and_no_test_row_is_used(flat_folder: Pat
 def test_distances_are_those_to_the_rows_that_remain(flat_folder: Path):
     record = load(flat_folder)
     _, folds = folds_of(record)
-    held = HeldOut.of(record, folds)
+    held = HeldOut.of(record, folds, 0)
     for place in (0, len(held) // 2, len(held) - 1):
         rows = folds[held.fold[place]].all_train
         seen = rows[np.isfinite(record.observation[held.receiver[place], rows])]

@@ -74,7 +74,7 @@ def with_intervals(entry: Model) -> Model:
         record = problem.record
         fitted = entry.fit(problem, split, session)
         folds = _folds(entry, problem, split)
-        held = HeldOut.of(record, folds).thinned(problem.seed)
+        held = HeldOut.of(record, folds, problem.seed)
         place = replace(session, folder=session.folder / "held_out")
         found = held_out_predictions(entry, problem, folds, held, place, entry.name)
         place.folder.rmdir()

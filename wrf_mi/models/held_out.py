@@ -24,8 +24,10 @@ FEW_ROWS = 10
 MANY_ROWS = 600
 """Number of training rows from which two folds are enough."""
 FOLDS = 5
-MOST_HELD_OUT = 600
-"""Largest number of held-out observations that weights and intervals are chosen from."""
+MOST_HELD_OUT, MOST_VALUES = (200, 600), 20_000
+"""Largest number of held-out observations that weights and intervals are chosen from: 600 single numbers, fewer of many
+values, but 200.
+"""
 
 
 def hold_out_folds(record: Record, split: Split) -> list[Split]:
@@ -91,8 +93,8 @@ class HeldOut:
     distance_m: FloatArray
 
     @classmethod
-    def of(cls, record: Record, folds: Sequence[Split]) -> HeldOut:
-        """Held-out rows of folds."""
+    def of(cls, record: Record, folds: Sequence[Split], seed: int) -> HeldOut:
+        """Held-out rows of folds, or as many of them, drawn with a seed, as `MOST_HELD_OUT` allows."""
         parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
         for number, fold in enumerate(folds):
             for receiver, seen in enumerate(record.observation):
@@ -100,7 +102,11 @@ class HeldOut:
                 rows = rows[np.isfinite(seen[rows]).reshape(len(rows), -1).all(axis=1)]
                 away = distance_to_rows(record, fold.all_train, record.tx_pos_m[rows], receiver)
                 parts.append((np.full(len(rows), number), np.full(len(rows), receiver), rows, away))
-        return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        every = cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        most = int(np.clip(MOST_VALUES // int(np.prod(record.observation.shape[2:])), *MOST_HELD_OUT))
+        if len(every) <= most:
+            return every
+        return every.chosen(np.sort(np.random.default_rng([seed, 5]).permutation(len(every))[:most]))
 
     def __len__(self) -> int:
         """Number of held-out observations."""
@@ -109,12 +115,6 @@ class HeldOut:
     def chosen(self, keep: NDArray[np.bool_] | IntArray) -> HeldOut:
         """A part of the held-out observations."""
         return HeldOut(self.fold[keep], self.receiver[keep], self.row[keep], self.distance_m[keep])
-
-    def thinned(self, seed: int) -> HeldOut:
-        """At most `MOST_HELD_OUT` of the observations, drawn with a seed."""
-        if len(self) <= MOST_HELD_OUT:
-            return self
-        return self.chosen(np.sort(np.random.default_rng([seed, 5]).permutation(len(self))[:MOST_HELD_OUT]))
 
     def observed(self, record: Record) -> NDArray[np.float32] | NDArray[np.complex64]:
         """Observations [q, ...]."""

@@ -51,9 +51,10 @@ class Inputs:
         """Number of rows."""
         return len(self.tx_pos_m)
 
-    def rows(self, chosen: slice) -> Inputs:
-        """Inputs of some rows."""
-        return Inputs(**_chosen(self, chosen), first_row=self.first_row + (chosen.start or 0))
+    def rows(self, chosen: slice | IntArray) -> Inputs:
+        """Inputs of some rows; ``first_row`` of an array is that of all rows."""
+        start = (chosen.start or 0) if isinstance(chosen, slice) else 0
+        return Inputs(**_chosen(self, chosen), first_row=self.first_row + start)
 
 
 def inputs_of(record: Record, rows: IntArray) -> Inputs:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calling import refused
+from made_channels import channels
 
 import wrf_mi
-from wrf_mi.core import Record
+from wrf_mi.core import InputError, Record, Split
 from wrf_mi.models import Interrupted
+from wrf_mi.models.held_out import HeldOut
 from wrf_mi.models.hybrid.ingredients import INGREDIENTS
+from wrf_mi.tasks.scores import cea_db
+
+EXACT_DB = 30.0
+"""CEA of a downlink that is its uplink turned, from twenty rows: single precision and a little penalty."""
 
 
 def test_hybrid_is_never_far_below_its_ingredients_on_held_out_rows(flat_folder: Path, tmp_path: Path):
@@ -72,3 +79,27 @@ def test_ingredients_that_do_not_serve_the_data_are_left_out_or_refused(
 
 def test_every_named_ingredient_is_a_model():
     assert {ingredient.model for ingredient in INGREDIENTS.values()} <= set(wrf_mi.models.MODELS)
+
+
+def test_hybrid_mixes_models_from_positions_and_from_the_uplink(tmp_path: Path):
+    record = channels()
+    run = wrf_mi.train(record, tmp_path / "run", "hybrid", settings=("ingredients=linear,kriging",))
+    held, weights = run.metrics["held_out"], run.metrics["weights"]
+    assert held["hybrid"] >= held["linear"] > held["kriging"]
+    assert all(one["linear"] > 0.5 for one in weights)
+    again = wrf_mi.open_run(run.folder, record)
+    rows = slice(20, 24)
+    found = again.predict(record.tx_pos_m[rows], uplink=record.uplink[rows]).mean
+    assert cea_db(found, record.observation[0, rows]).min() > EXACT_DB
+    with pytest.raises(InputError, match="linear has a weight and predicts from the uplink"):
+        again.predict(record.tx_pos_m[rows])
+
+
+def test_held_out_observations_are_limited_by_their_size(one_gateway: Record):
+    rows = np.arange(1000)
+    many = Record("many", "spectrum", np.random.default_rng(0).random((1000, 3)), one_gateway.receivers, np.zeros(0))
+    fold = [Split("fold", 0, rows[500:], rows[:0], rows[:500])]
+    for shape, most in (((), 500), ((20, 20), 200), ((50,), 400)):
+        record = replace(many, observation=np.zeros((1, 1000, *shape), np.float32))
+        assert len(HeldOut.of(record, fold, 0)) == most
+        assert np.array_equal(HeldOut.of(record, fold, 0).row, HeldOut.of(record, fold, 0).row)

@@ -31,7 +31,6 @@ class Ingredient:
     default: bool = True
 
 
-SURFACE = "calibration=gain,materials,surface", "transmission=true"
 INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
@@ -43,11 +42,17 @@ INGREDIENTS = {
     "trees": Ingredient("trees"),
     "mri": Ingredient("mri"),
     "idw": Ingredient("idw"),
+    **{name: Ingredient(name) for name in ("r2f2", "optml", "fire", "linear")},
     "learned": Ingredient("wrf-gs+", default=False),
     "joint": Ingredient("wrf-gs+", scene=True, default=False),
 }
 """Ingredients by name, the first of which is used where held-out rows do not tell them apart; any other name is that of
 a model without the scene."""
+
+
+def from_uplink(name: str) -> bool:
+    """Whether an ingredient needs the uplink."""
+    return MODELS[INGREDIENTS.get(name, Ingredient(name)).model].uplink == "required"
 
 
 def problems(problem: Problem, names: Sequence[str] | None) -> dict[str, tuple[Model, Problem]]:
@@ -81,8 +86,6 @@ def _problem(problem: Problem, ingredient: Ingredient) -> tuple[Model, Problem]:
     if ingredient.scene and problem.scene is None:
         raise InputError(f"ingredient {ingredient.model}: needs a scene; give --scene SCENE")
     chosen = entry.serving(record.task, ingredient.scene)
-    if chosen.uplink == "required":
-        raise InputError(f"ingredient {ingredient.model}: predicts from the uplink, the hybrid from positions")
     given = {"model": ingredient.model, "seed": problem.seed}
     settings = default_settings(chosen, ingredient.settings, given)
     scene = problem.scene if ingredient.scene else None

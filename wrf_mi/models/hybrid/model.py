@@ -48,7 +48,7 @@ from ..model import (
     known_positions,
     under,
 )
-from .ingredients import problems, serving
+from .ingredients import from_uplink, problems, serving
 from .mixture import Mixture, choose, constant
 
 logger = logging.getLogger(__name__)
@@ -63,9 +63,9 @@ class HybridSettings(CheckedSettings):
 
     Attributes:
         ingredients: names of the mixed models, separated by commas: idw, kriging, trees, mri, physics-no-mesh, learned
-            (wrf-gs+), or a model's name; with a scene ray-tracing, surface (its gain, materials and Gaussians on its
-            surfaces trained), physics and joint (wrf-gs+ with the scene). null: all of them that serve the data, but
-            learned and joint, each fit of which takes minutes.
+            (wrf-gs+), or a model's name; with an uplink r2f2, optml, fire and linear; with a scene ray-tracing, surface
+            (its gain, materials and Gaussians on its surfaces trained), physics and joint (wrf-gs+ with the scene).
+            null: all of them that serve the data, but learned and joint, each fit of which takes minutes.
     """
 
     ingredients: str | None = None
@@ -97,16 +97,10 @@ class FittedHybrid(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the ingredients' predictions, [m, ...], with its standard deviation."""
-
-        def of(fitted: Fitted, rows: IntArray) -> Prediction:
-            chosen = Inputs(
-                inputs.tx_pos_m[rows],
-                None if inputs.tx_heading_rad is None else inputs.tx_heading_rad[rows],
-                first_row=inputs.first_row,
-            )
-            return fitted.predict(chosen, receiver)
-
-        return self._mixed(inputs.tx_pos_m, receiver, of)
+        needed = [name for name in self.ingredients if inputs.uplink is None and from_uplink(name)]
+        if needed:
+            raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
+        return self._mixed(inputs.tx_pos_m, receiver, lambda one, some: one.predict(inputs.rows(some), receiver))
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; ingredients use what they have stored."""
@@ -164,7 +158,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     found = serving(problems(problem, asked), split, required=asked is not None)
     folder = session.folder / FOLDER
     folds = hold_out_folds(record, split)
-    held = HeldOut.of(record, folds).thinned(problem.seed) if folds else None
+    held = HeldOut.of(record, folds, problem.seed) if folds else None
     predictions: dict[str, Prediction] = {}
     if held is not None:
         for name, (entry, inner) in list(found.items()):
@@ -260,6 +254,7 @@ MODEL = Model(
     load,
     "docs/hybrid.md",
     scene="optional",
+    uplink="optional",
     headings=True,
     check=check,
 )
