@@ -104,7 +104,15 @@ _OWN: Mapping[str, Check] = {
     "operator": _here("prediction by operator", "operator:main"),
     "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
-    "ingredients": _here("hybrid and its ingredients", "ingredients:main", RFID, FLAT, CONFERENCE, resumes=True),
+    "ingredients": _here(
+        "hybrid and its ingredients",
+        "ingredients:main",
+        RFID,
+        FLAT,
+        CONFERENCE,
+        resumes=True,
+        table="ingredients:table",
+    ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "sentinels": _here(

@@ -182,6 +182,40 @@ def main() -> dict[str, Any]:
     return {"rows": rows, **_verdict(rows)}
 
 
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table, a line for each cell: the hybrid, its best ingredient by mean score, kriging and IDW."""
+    head = (
+        "data",
+        "hybrid",
+        "inside",
+        "CRPS",
+        "best ingredient",
+        "gain over it",
+        "kriging",
+        "IDW",
+        "clearly worse than",
+    )
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        hybrid, *others = (row for row in rows if row["cell"] == cell)
+        known = {row["model"]: f"{row['score']['median']:.3g}" for row in others}
+        best = min(others, key=lambda row: row["gain"])
+        worse = [row["model"] for row in others if row["gain_high"] < 0]
+        inside, crps = hybrid["inside_90"], hybrid["crps"]
+        cells = (
+            hybrid["what"].rpartition(":")[0],
+            f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
+            "" if inside is None else f"{inside:.0%}",
+            "" if crps is None else f"{crps:.3g}",
+            f"{best['model']} {known[best['model']]} ({best['score']['mean']:.3g})",
+            f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
+            *(known.get(name, "") for name in ("kriging", "idw")),
+            ", ".join(worse),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     pairs = [row for row in rows if "gain" in row]
     worse = [row for row in pairs if row["gain_high"] < 0]
