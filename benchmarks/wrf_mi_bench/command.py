@@ -46,11 +46,10 @@ def bench_command(a: argparse.Namespace) -> int:
             found = quick_checks(a.names)
             print_json(found) if a.json else print(check_table(found))
             return 0
-        from .quick import quick
+        from .quick import quick, ratio_table
 
         result = quick(Path(a.out), a.store)
-        if a.json:
-            print_json(result)
+        print_json(result) if a.json else print(ratio_table(result["figures"]["ratios"]))
         return 0
     with open_scheduler(a.scheduler) as scheduler:
         given = scheduler if a.scheduler else None

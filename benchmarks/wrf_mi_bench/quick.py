@@ -272,3 +272,15 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
     if backend != (name := init().name):
         raise InputError(f"{file}: ratios of the backend {backend}; store those of {name} in another folder with --out")
     return ratios
+
+
+def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
+    """Markdown table of measured ratios."""
+    titles = {pair.name: pair.title for pair in PAIRS}
+    lines = ["| ratio | measured (95 % interval) | medians |", "| --- | --- | --- |"]
+    for name, one in ratios.items():
+        lines.append(
+            f"| {titles[name]} | **{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g}) "
+            f"| {one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms |"
+        )
+    return "\n".join(lines)

@@ -79,7 +79,7 @@ def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Rows of the table: scores of each data set and size, and the rows that joint training needs."""
     lines = []
     for dataset, rows in ROWS.items():
-        task = task_of(found, dataset)
+        task = _task(found, dataset)
         means = {name: curves(found, dataset, name).mean(axis=1) for name in (RANDOM, MESH, JOINT)}
         for number, n in enumerate(rows):
             shown = ", ".join(f"{name} {means[name][number]:.{task.digits}f}" for name in means)
@@ -89,7 +89,7 @@ def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
     return lines
 
 
-def task_of(found: Sequence[Mapping[str, Any]], dataset: str) -> Task:
+def _task(found: Sequence[Mapping[str, Any]], dataset: str) -> Task:
     """Task of a data set."""
     return TASKS[next(one["task"] for one in found if one["dataset"] == dataset)]
 
@@ -104,7 +104,7 @@ def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
             (drawn,) = axes.plot(rows, scores.mean(axis=1), marker="o", label=name)
             axes.fill_between(rows, scores.min(axis=1), scores.max(axis=1), alpha=0.2, color=drawn.get_color())
         axes.plot(rows, curves(found, dataset, IDW).mean(axis=1), "k--", label=IDW)
-        label = task_of(found, dataset).label
+        label = _task(found, dataset).label
         axes.set(xscale="log", xticks=rows, xticklabels=rows, xlabel="training rows", ylabel=label, title=dataset)
         axes.minorticks_off()
         axes.grid(alpha=0.3)

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 from wrf_mi_bench import quick as bench_quick
 from wrf_mi_bench.bench import BenchFailed
-from wrf_mi_bench.quick import FILE, PAIRS, Pair, measure_pairs, quick, read_stored, worse
+from wrf_mi_bench.quick import FILE, PAIRS, Pair, measure_pairs, quick, ratio_table, read_stored, worse
 from wrf_mi_bench.stock import StockRenderer
 from wrf_mi_bench.traced import difference, random_field, splatted
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.core import InputError
-from wrf_mi.runs.timing import Interval
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 STORED = CHECKOUT / "benchmarks" / "results" / FILE
@@ -134,19 +132,6 @@ def test_stock_integrator_refuses_attenuation() -> None:
     gaussians, receiver = random_field(0, "product", 5)
     with pytest.raises(ValueError, match="opacity"):
         StockRenderer(receiver, 9, 36).field(gaussians)
-
-
-def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
-    """Markdown table of stored ratios."""
-    titles = {pair.name: pair.title for pair in PAIRS}
-    lines = ["| ratio | measured (95 % interval) | medians |", "| --- | --- | --- |"]
-    for name, one in ratios.items():
-        value = Interval(one["value"], one["low"], one["high"])
-        lines.append(
-            f"| {titles[name]} | **{value.value:.2g}** ({value.low:.2g} to {value.high:.2g}) "
-            f"| {one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms |"
-        )
-    return "\n".join(lines)
 
 
 def test_documents_show_the_stored_ratios() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ...training.reach import improves
 
 KNOTS, KNOT_ROWS = 4, 20
 """Largest number of distances at which weights are chosen, and least number of held-out observations for each."""
@@ -46,7 +47,7 @@ def best_single(score: RowScores, distance_m: FloatArray, rows: IntArray, count:
     every = np.eye(count)
     scores = np.stack([score(np.broadcast_to(one, (len(rows), count)), rows) for one in every])
     best = int(np.argmax(scores.mean(axis=1)))
-    return constant(every[best if _gains(scores[best] - scores[0]) else 0])
+    return constant(every[best if improves(scores[best], scores[0], True) else 0])
 
 
 def mixed(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
@@ -104,14 +105,9 @@ def choose(
         on_fold((done + 1) / len(folds))
     best = next(iter(FORMS))
     for name in FORMS:
-        if _gains(found[name] - found[best]):
+        if improves(found[name], found[best], True):
             best = name
     return best, FORMS[best](score, distance_m, every, count)
-
-
-def _gains(gain: FloatArray) -> bool:
-    """Whether the mean gain [n] exceeds its standard error."""
-    return len(gain) > 1 and bool(gain.mean() > gain.std(ddof=1) / len(gain) ** 0.5)
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
