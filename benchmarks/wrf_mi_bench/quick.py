@@ -197,7 +197,11 @@ PAIRS: list[Pair] = [
     Pair("integrator", "our Mitsuba integrator over `volprim_rf_basic`, geometry new", _integrator),
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
-    Pair("paths-alone", f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such", _paths_alone),
+    Pair(
+        "paths-alone",
+        f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such",
+        _paths_alone,
+    ),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
     Pair("physics", "a physics model's prediction over the ray tracer's, one transmitter", _physics),
