@@ -220,7 +220,7 @@ def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("searched")
 
-    for name in ("_shoot", "count_crossings"):
+    for name in ("_shoot", "_count_crossings"):
         monkeypatch.setattr(search_module, name, refuse)
     monkeypatch.setattr(solve_module, "sampled_paths", refuse)
     tx, rx = inside(2), receiver([1.0, 1.0, 1.0])

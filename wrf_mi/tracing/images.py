@@ -13,7 +13,7 @@ from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, join, specular_le
 from .fields import point_array
 from .image_method import meeting_point
 from .options import TraceOptions
-from .search import ReflectionChains, count_crossings, possible
+from .search import Crossings, ReflectionChains, possible
 from .surfaces import Surfaces
 
 CANDIDATES_PER_CHUNK = 1 << 20
@@ -25,6 +25,7 @@ PARALLEL = 1e-9
 def specular_paths(
     scene: Any,
     surfaces: Surfaces,
+    crossings: Crossings,
     chains: ReflectionChains,
     source_m: FloatArray,
     targets_m: FloatArray,
@@ -35,6 +36,7 @@ def specular_paths(
     Args:
         scene: ``sionna.rt.Scene``.
         surfaces: surfaces of the scene.
+        crossings: count of the surfaces between points of the scene.
         chains: chains from this source, see `wrf_mi.tracing.search.shoot`.
         source_m: position [3], metres.
         targets_m: positions [n, 3], metres.
@@ -54,7 +56,7 @@ def specular_paths(
         chain, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         through = np.zeros((len(chain), chains.plane.shape[1] + 1), np.int64)
         if options.transmission:
-            through = _transmissions(scene, surfaces, chains, chain, target, source_m, targets_m, depth)
+            through = _transmissions(crossings, surfaces, chains, chain, target, source_m, targets_m, depth)
             short = through.sum(axis=1) + _lengths(chains, chain) <= depth
             chain, target, through = chain[short], target[short], through[short]
         legs, plane = _candidates(surfaces, chains, chain, target, through, depth)
@@ -72,7 +74,7 @@ def _lengths(chains: ReflectionChains, chain: IntArray) -> IntArray:
 
 
 def _transmissions(
-    scene: Any,
+    crossings: Crossings,
     surfaces: Surfaces,
     chains: ReflectionChains,
     chain: IntArray,
@@ -89,9 +91,9 @@ def _transmissions(
         has = length > level
         plane, image = chains.plane[chain[has], level], chains.image[chain[has], level]
         here = meeting_point(there[has], image, surfaces.normal[plane], surfaces.offset[plane])[0]
-        through[has, level + 1] = count_crossings(scene, here, there[has], depth)
+        through[has, level + 1] = crossings(here, there[has], depth)
         there[has] = here
-    through[:, 0] = count_crossings(scene, np.broadcast_to(source_m, there.shape), there, depth)
+    through[:, 0] = crossings(np.broadcast_to(source_m, there.shape), there, depth)
     return through
 
 

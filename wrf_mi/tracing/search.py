@@ -203,33 +203,54 @@ def possible(
             yield part[kept // count], kept % count
 
 
-def count_crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
-    """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
+class Crossings:
+    """Counts the surfaces of a scene between pairs of points.
+
+    Rays are recorded at the first call: to trace the operations of each hit takes longer than to shoot a few thousand
+    rays.
 
     Args:
-        scene: ``sionna.rt.Scene``.
-        start_m: first points [n, 3], metres.
-        end_m: second points [n, 3], metres.
-        most: largest number that is counted.
+        scene: ``sionna.rt.Scene`` of constant geometry.
     """
+
+    def __init__(self, scene: Any) -> None:
+        from ..backend.recorded import Recorded
+
+        self._scene = scene
+        self._count = Recorded(_count_crossings)
+
+    def __call__(self, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
+        """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
+
+        Args:
+            start_m: first points [n, 3], metres.
+            end_m: second points [n, 3], metres.
+            most: largest number that is counted.
+        """
+        import mitsuba as mi
+
+        from ..backend.device import to_vectors
+
+        if not len(start_m) or not self._scene.objects:
+            return np.zeros(len(start_m), np.int64)
+        start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
+        return np.asarray(self._count(self._scene.mi_scene, start, end, most), np.int64)
+
+
+def _count_crossings(mi_scene: Any, start: Any, end: Any, most: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
-
-    if not len(start_m) or not scene.objects:
-        return np.zeros(len(start_m), np.int64)
-    start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
     way = end - start
     length = dr.norm(way)
     direction = way / length
     ray = mi.Ray3f(start + direction * END_M, direction)
     active: Any = length > 2 * END_M
-    crossings: Any = dr.zeros(mi.UInt32, len(start_m))
+    crossings: Any = dr.zeros(mi.UInt32, dr.width(start))
     for _ in range(most + 1):
-        hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
+        hit = mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
         # From the start: the ray's origin is moved off the last surface by up to a millimetre.
         active &= hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
         crossings += dr.select(active, mi.UInt32(1), mi.UInt32(0))
         ray = hit.spawn_ray(direction)
-    return np.asarray(crossings, np.int64)
+    return crossings

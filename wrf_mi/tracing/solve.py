@@ -24,7 +24,7 @@ from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
 from .sampled import sampled_paths
-from .search import ReflectionChains, shoot
+from .search import Crossings, ReflectionChains, shoot
 from .surfaces import Surfaces, scene_surfaces
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Prepared:
     """
 
     def __init__(self, scene: Any) -> None:
-        self.surfaces = scene_surfaces(scene)
+        self.surfaces, self.crossings = scene_surfaces(scene), Crossings(scene)
         self._scene = scene
         self._chains: dict[tuple[bytes, TraceOptions, int], ReflectionChains] = {}
         self._rays: dict[TraceOptions, int] = {}
@@ -87,7 +87,9 @@ class Prepared:
         if options.rays != "auto":
             return options.rays
         if options not in self._rays:
-            self._rays[options] = converged_rays(self._scene, self.surfaces, sources_m, targets_m, options)
+            self._rays[options] = converged_rays(
+                self._scene, self.surfaces, self.crossings, sources_m, targets_m, options
+            )
         return self._rays[options]
 
     def chains(self, source_m: FloatArray, options: TraceOptions, rays: int) -> ReflectionChains:
@@ -183,7 +185,7 @@ def _search(
             chains = shared.chains(source, options, rays)
             for start in range(0, len(targets), TARGETS_PER_CHUNK):
                 batch = targets[start : start + TARGETS_PER_CHUNK]
-                found = [specular_paths(scene, shared.surfaces, chains, source, batch, options)]
+                found = [specular_paths(scene, shared.surfaces, shared.crossings, chains, source, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
                     found.append(sampled_paths(scene, shared.surfaces, source, batch, options, rays))
                 legs = join(found, depth)
@@ -201,7 +203,12 @@ def _chains(
 
 
 def converged_rays(
-    scene: Any, surfaces: Surfaces, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
+    scene: Any,
+    surfaces: Surfaces,
+    crossings: Crossings,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    options: TraceOptions,
 ) -> int:
     """Number of rays that find (nearly) every path, judged on up to 4 sources and 256 targets.
 
@@ -222,7 +229,7 @@ def converged_rays(
         found = np.zeros(2)
         for source in sources:
             chains = _chains(scene, surfaces, source, plain, rays, options.seed + rays.bit_length())
-            legs = specular_paths(scene, surfaces, chains, source, targets, plain)
+            legs = specular_paths(scene, surfaces, crossings, chains, source, targets, plain)
             found += len(legs), (_lengths(legs, source[None], targets) ** -2).sum()
         calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
         best = np.maximum(best, found)

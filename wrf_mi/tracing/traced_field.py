@@ -160,7 +160,7 @@ class TracedField:
         self._weights: PathWeights | None = None
         self.frequency_hz = float(scene.frequency[0])
         self.searches = 0
-        self.surfaces: Surfaces = scene_surfaces(scene)
+        self.surfaces: Surfaces = prepared.surfaces if prepared else scene_surfaces(scene)
         self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
         self._constants = self.slabs.constants(Float64)
         self._planes = PlaneTables.of(self.surfaces)

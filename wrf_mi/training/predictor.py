@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 TOGETHER = 16
 """Transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch."""
 TRACED_NUMBERS = 512
-"""With paths, numbers in a batch of small observations: each search for paths has a fixed cost."""
+"""With paths, numbers in a batch of small observations."""
+SEARCHED = 512
+"""Transmitters whose paths are searched together: a search has a fixed cost."""
 
 
 class Predictor:
@@ -139,7 +141,12 @@ class Predictor:
         return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
 
     def of_side(
-        self, tx_pos_m: FloatArray, receiver: int, side: TracedField | None, slots: IntArray, weight: NDArray[Any]
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        side: TracedField | None,
+        slots: IntArray,
+        weight: NDArray[Any] | None,
     ) -> NDArray[Any]:
         """Predictions for transmitters whose paths are known.
 
@@ -148,14 +155,15 @@ class Predictor:
             receiver: number of the receiver.
             side: its traced side, or None.
             slots: rows of the traced side [m].
-            weight: weight of the Gaussians' signal [m], 0 to 1.
+            weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
 
         Returns:
             Predictions as of `__call__`.
         """
 
         def found(part: slice) -> Any:
-            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weight[part])
+            weights = None if weight is None else weight[part]
+            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weights)
 
         return self._in_parts(len(tx_pos_m), receiver, found)
 
@@ -205,16 +213,22 @@ class Predictor:
         if self.graph.scene is None and weight is not None and not weight.any():
             return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
 
-        def evaluate(part: slice) -> Any:
-            weights = None if weight is None else weight[part]
-            if self._recordable:
-                return self._learned(given[part].T, receiver, weights)
+        if self._recordable or not len(given):
+
+            def recorded(part: slice) -> Any:
+                return self._learned(given[part].T, receiver, None if weight is None else weight[part])
+
+            return self._in_parts(len(given), receiver, recorded)
+
+        parts = []
+        for start in range(0, len(given), SEARCHED):
+            part = slice(start, start + SEARCHED)
             side = self.graph.trace(given[part], receiver, None if heading_rad is None else heading_rad[part])
             if side is not None:
                 side.refresh(self._params)
-            return self._evaluated(given[part], receiver, side, None, weights)
-
-        return self._in_parts(len(given), receiver, evaluate)
+            weights = None if weight is None else weight[part]
+            parts.append(self.of_side(given[part], receiver, side, np.arange(len(given[part])), weights))
+        return np.concatenate(parts)
 
     def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
         """Reports for all transmitters, from flat reports of batches."""
