@@ -23,16 +23,13 @@ from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.folder import METRICS
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.timing import bootstrap
-from wrf_mi.scene.make import make_scene
-from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
-from wrf_mi.synthetic.laboratory import SCAN
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, RFID
 from .comparison import data_folder, kept
 from .table_plan import PARTS
-from .tables import scene_of
+from .tables import meshed_scan, scene_of
 
 RUNS = Path("runs/bench/ingredients")
 LAB = "laboratory"
@@ -82,12 +79,7 @@ CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in cou
 def scene_of_cell(cell: Cell, folder: Path) -> str | None:
     """Scene of a cell's data set, made where needed; None: none is known."""
     if cell.dataset in (LAB, ROOM):
-        load_record(cell.dataset)  # made where needed
-        scan = data_folder(cell.dataset) / SCAN
-        made = folder / f"{cell.dataset}-{fit_key(scan)}"
-        if not made.exists():
-            make_scene(scan, made)
-        return str(made)
+        return str(meshed_scan(cell.dataset, folder))
     part = next(part for part in PARTS if part.dataset == cell.dataset)
     return None if part.scene == "open" else scene_of(part, folder)[1]
 

@@ -42,13 +42,14 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
     return ("--model", name, *more)
 
 
-NAMED = "{scene}"
-"""Argument that is replaced by the arguments of a scene."""
-IN_A_FLAT = ("--paths", "line-of-sight,reflection,transmission", "--depth", "6", "--reflections", "2")
+NAMED, CORRECTED = "{scene}", "{corrected}"
+"""Arguments that are replaced by the arguments of a scene, as stated and corrected by the row's training rows."""
+THROUGH_WALLS = ("--paths", "line-of-sight,reflection,transmission")
+IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")
 """Transmission through walls of two surfaces each."""
 CALIBRATED = ("--calibrate", "gain,patterns")
 """Calibration of uncalibrated strengths."""
-ON_A_FLOOR = ("--paths", "line-of-sight,reflection,transmission", "--depth", "5", "--reflections", "3")
+ON_A_FLOOR = (*THROUGH_WALLS, "--depth", "5", "--reflections", "3")
 """Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
 """Schedules of the small version: networks, and networks with slow steps."""
@@ -71,7 +72,15 @@ FURNISHED = {
     **SPECTRUM,
     "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
     "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
-    "physics": Entry("physics, knows the bare walls", _model("physics", "--scene", NAMED), (), SEEDS),
+    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
+    "hybrid": Entry("hybrid, knows the scan", _model("hybrid", "--scene", NAMED)),
+    "physics": Entry("physics, knows the scan", _model("physics", "--scene", NAMED), (), SEEDS),
+    "ray-tracing": Entry(
+        "ray tracing in the scan", _model("ray-tracing", "--scene", NAMED, *THROUGH_WALLS), published="0.38, p90 0.61"
+    ),
+    "ray-tracing-corrected": Entry(
+        "ray tracing in the scan, corrected", _model("ray-tracing", "--scene", CORRECTED, *THROUGH_WALLS)
+    ),
 }
 UNSEEN = {
     **SPECTRUM,
@@ -87,11 +96,16 @@ RSSI: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
     "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
+    "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED)),
     "physics": Entry("physics, knows walls and heading", _model("physics", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
         "ray tracing, calibrated, knows walls and heading",
         _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT, *CALIBRATED),
+    ),
+    "ray-tracing-corrected": Entry(
+        "ray tracing, calibrated, walls corrected, knows heading",
+        _model("ray-tracing", "--scene", CORRECTED, *IN_A_FLAT, *CALIBRATED),
     ),
     "ray-tracing-offsets": Entry(
         "ray tracing, one offset a receiver", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
@@ -105,10 +119,15 @@ RSSI: Mapping[str, Entry] = {
 POSITION: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
+    "wrf-gs+-joint": Entry("WRF-GS+ with the scanned room's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
+    "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED)),
     "physics": Entry("physics, in the scanned room", _model("physics", "--scene", NAMED), (), SEEDS),
     "physics-no-mesh": Entry("physics without a mesh", _model("physics")),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
+    "ray-tracing-corrected": Entry(
+        "ray tracing, in the scanned room, corrected", _model("ray-tracing", "--scene", CORRECTED)
+    ),
     "kriging": Entry("kriging", _model("kriging")),
     "idw": Entry("IDW", _model("idw")),
 }
@@ -120,12 +139,13 @@ UPLINK: Mapping[str, Entry] = {
     "r2f2": Entry("R2F2", _model("r2f2"), (), SEEDS, published="8.57"),
     "optml": Entry("OptML", _model("optml"), FEWER, SEEDS, published="8.47"),
     "linear": Entry("linear map", _model("linear"), (), SEEDS),
+    "hybrid": Entry("hybrid, from the uplink and positions", _model("hybrid")),
     "kriging": Entry("kriging, from positions", _model("kriging")),
     "ray-tracing": Entry(
         "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
     ),
 }
-CHEAP = ("physics", "ray-tracing", "linear", "trees", "kriging", "idw", "mri")
+CHEAP = ("physics", "ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
 FEW = ("wrf-gs+", "physics", "nerf2", "linear", "kriging", "idw", "ray-tracing")
 """Methods measured with fewer rows too."""
@@ -165,12 +185,12 @@ PARTS = (
         "traced-room",
         "official",
         FURNISHED,
-        scene="room",
+        scene="scan",
         once=("wrf-gs+", "wrf-gs", "physics"),
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
-    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
-    Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
+    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "simulated-scan", once=("nerf2",)),
+    Part("csi", "positions", "newrf-office", "official", POSITION, scene="simulated-scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
     Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
 )
@@ -207,19 +227,25 @@ class Row:
     @property
     def command(self) -> str:
         """Command with a placeholder for the scene, the same on every machine."""
-        return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}}}"])])
+        corrected = ", corrected" if CORRECTED in self.entry.arguments else ""
+        return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}{corrected}}}"])])
+
+    @property
+    def rows(self) -> list[str]:
+        """Arguments of split, seed and number of training rows."""
+        few = [] if self.share == 1 else ["--n-train", str(self.share)]
+        return ["--split", self.part.split, "--seed", str(self.seed), *few]
 
     def arguments(self, scene: Sequence[str]) -> list[str]:
-        """Arguments of ``wrf-mi`` without ``--out``; ``scene`` replaces ``--scene {scene}``."""
+        """Arguments of ``wrf-mi`` without ``--out``; ``scene`` replaces the arguments of the scene."""
         words = list(self.entry.arguments)
-        if NAMED in words:
-            words[words.index(NAMED) - 1 : words.index(NAMED) + 1] = scene
+        for place in [words.index(name) for name in (NAMED, CORRECTED) if name in words]:
+            words[place - 1 : place + 1] = scene
         if self.quick:
             words += self.entry.quick
         elif self.part.split == "blocked":
             words += BLOCKED_SETTINGS.get((self.part.task, self.method), ())
-        few = [] if self.share == 1 else ["--n-train", str(self.share)]
-        return ["train", self.part.dataset, *words, "--split", self.part.split, "--seed", str(self.seed), *few]
+        return ["train", self.part.dataset, *words, *self.rows]
 
 
 def plan(quick: bool = False) -> list[Row]:

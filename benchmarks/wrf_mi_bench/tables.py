@@ -25,21 +25,22 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
 from wrf_mi.core.files import atomic_folder, one_line, write_atomically
+from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.parallel import Scheduler
-from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files
+from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files, source_files
 from wrf_mi.runs.folder import CONFIG, METRICS, package_versions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_channels import MEASURED
-from wrf_mi.synthetic.furnished_room import traced_room
+from wrf_mi.synthetic.laboratory import SCAN
 from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
 from .scene import SCANNED, scanned_scene
 from .table_pages import read_rows, write_tables
-from .table_plan import NAMED, Part, Row, available, plan
+from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
 
 FOLDER = "tables"
 """Folder of the rows; ``tables-quick`` for the small version."""
@@ -58,8 +59,8 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     """Arguments with the scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
         return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
-    if part.scene == "room":
-        return ["--scene", str(traced_room()[1])]
+    if part.scene == "scan":
+        return ["--scene", str(meshed_scan(part.dataset, folder))]
     if part.scene == "floor":
         load_record(part.dataset)  # made where needed
     place = data_folder(part.dataset)
@@ -78,6 +79,25 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     return ["--scene", str(scanned / SCANNED)]
 
 
+def meshed_scan(dataset: str, folder: Path) -> Path:
+    """Scene in ``folder`` from the scan of a data set, which is made where needed."""
+    load_record(dataset)
+    scan = data_folder(dataset) / SCAN
+    made = folder / f"{dataset}-{fit_key(scan)}"
+    if not made.exists():
+        make_scene(scan, made)
+    return made
+
+
+def corrected_scene(row: Row, folder: Path) -> Path:
+    """Scene of a row in ``folder``, corrected by its training rows."""
+    stated = scene_of(row.part, folder)[1]
+    made = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
+    if not made.exists():
+        run_command(["correct", stated, row.part.dataset, *row.rows], made, resumes=False)
+    return made
+
+
 def _once(place: Path, make: Callable[[Path], object]) -> Path:
     """A folder, made completely or not at all."""
     if not place.exists():
@@ -91,13 +111,15 @@ def _open_scene(folder: Path) -> None:
     write_scene(folder, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
 
 
-def _scene(part: Part, runs: Path) -> list[str]:
-    return scene_of(part, runs / "scenes") if part.scene else []
+def _scene(row: Row, runs: Path) -> list[str]:
+    if CORRECTED in row.entry.arguments:
+        return ["--scene", str(corrected_scene(row, runs / "scenes"))]
+    return scene_of(row.part, runs / "scenes") if NAMED in row.entry.arguments else []
 
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
     """Figures of a row, from a finished run of the same key or a new one."""
-    scene = _scene(row.part, runs) if NAMED in row.entry.arguments else []
+    scene = _scene(row, runs)
     data = _data_digest(row.part.dataset)
     folder = runs / f"{row.name}-{fit_key(row.command, data, [scene_files(place) for place in scene[1:]])}"
     wall = None
@@ -111,6 +133,9 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         wall = run_command(row.arguments(scene), folder, resumes=resumes)
     run = read_run(folder)
     scores = np.sort(run.score[~np.isnan(run.score)])
+    figures = {key: run.metrics[key] for key in KEPT}
+    if CORRECTED in row.entry.arguments:
+        figures["train_seconds"] += json.loads((Path(scene[1]) / CORRECTION).read_text(encoding="utf-8"))["seconds"]
     return {
         "row": row.name,
         "label": row.entry.label,
@@ -120,7 +145,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         **provenance(),
         "data": data,
         "wall_seconds": wall,
-        **{key: run.metrics[key] for key in KEPT},
+        **figures,
         "score": summary(scores),
         "quantiles": [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))],
     }
@@ -160,10 +185,10 @@ def tables(
         print(text, file=sys.stderr, flush=True)
         write_tables(place, quick)
 
-    for part in dict.fromkeys(row.part for row in left if NAMED in row.entry.arguments):
+    for part in dict.fromkeys(row.part for row in left if {NAMED, CORRECTED} & set(row.entry.arguments)):
         # Before workers need them at the same time; failures are reported row by row.
         with suppress(InputError):
-            _scene(part, runs / place.name)
+            scene_of(part, runs / place.name / "scenes")
     call = partial(_guarded, runs / place.name, None if most_s is None else time.time() + most_s)
     (scheduler or Scheduler()).map(call, left, what="measuring", each=each)
     write_tables(place, quick)

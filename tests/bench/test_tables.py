@@ -3,13 +3,16 @@
 import json
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from wrf_mi_bench import table_pages, tables
 from wrf_mi_bench.bench import BenchFailed
 from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, plan
 
 from wrf_mi.core import InputError
+from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.models import MODELS
 from wrf_mi.tracing import open_scene
 
@@ -200,3 +203,29 @@ def test_readme_shows_the_stored_overviews(name):
     shown = (CHECKOUT / "README.md").read_text(encoding="utf-8").split(f"<!-- {name} -->")[1]
     overview = table_pages.overview(name, {row["row"]: row for row in stored})
     assert shown.split(f"<!-- /{name} -->")[0].strip() == overview
+
+
+def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(tables, "data_folder", lambda name: flat_folder)
+    monkeypatch.setattr(tables, "_data_digest", lambda name: "digest")
+    calls = []
+
+    def run_command(words, folder, resumes=True):
+        calls.append(words)
+        folder.mkdir(parents=True)
+        (folder / CORRECTION).write_text(json.dumps({"seconds": 40.0}))
+        return 50.0
+
+    run = SimpleNamespace(score=np.array([1.0, 2.0]), metrics=dict.fromkeys(tables.KEPT, 1) | {"train_seconds": 3.0})
+    monkeypatch.setattr(tables, "run_command", run_command)
+    monkeypatch.setattr(tables, "read_run", lambda folder: run)
+    part = next(part for part in PARTS if part.dataset == "flat-ble")
+    row = Row(part, "ray-tracing-corrected", 1.0, 0)
+    assert "--scene {flat, corrected}" in row.command
+    assert tables.measure(tmp_path, row)["train_seconds"] == 43
+    assert tables.measure(tmp_path, row)["train_seconds"] == 43
+    assert [words[0] for words in calls] == ["correct", "train", "train"]  # the run is not finished: no metrics
+    stated = tables.scene_of(part, tmp_path / "scenes")[1]
+    assert calls[0] == ["correct", stated, "flat-ble", "--split", "official", "--seed", "0"]
+    corrected = calls[1][calls[1].index("--scene") + 1]
+    assert Path(corrected).name.startswith("corrected-flat-ble-")
