@@ -42,22 +42,17 @@ def constant(weights: FloatArray) -> Mixture:
     return Mixture(np.zeros(1), weights[None])
 
 
-def best_single(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
-    """The first prediction, or the one with the best mean score, if that is better by more than its standard error."""
-    every = np.eye(count)
-    scores = np.stack([score(np.broadcast_to(one, (len(rows), count)), rows) for one in every])
-    best = int(np.argmax(scores.mean(axis=1)))
-    return constant(every[best if improves(scores[best], scores[0], True) else 0])
+def averaged(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+    """One mixture for all distances, by forward selection that starts from equal weights.
+
+    Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
+    """
+    return constant(_selected(score, rows, np.ones(len(rows)), np.full(count, 1 / count), count))
 
 
 def mixed(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
-    """One mixture for all distances, by forward selection with replacement.
-
-    The selection starts from the best single prediction and goes on while the mean score increases.
-
-    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
-    """
-    return constant(_selected(score, rows, np.ones(len(rows)), count))
+    """One mixture for all distances, by forward selection that starts from the best single prediction."""
+    return constant(_best_selected(score, rows, np.ones(len(rows)), count))
 
 
 def by_distance(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
@@ -68,11 +63,11 @@ def by_distance(score: RowScores, distance_m: FloatArray, rows: IntArray, count:
     distance_m = distance_m[rows]
     knots = _knots(distance_m)
     shares = np.stack([np.interp(distance_m, knots, column) for column in np.eye(len(knots))])
-    weights = [_selected(score, rows[share > 0], share[share > 0], count) for share in shares]
+    weights = [_best_selected(score, rows[share > 0], share[share > 0], count) for share in shares]
     return Mixture(knots, np.stack(weights))
 
 
-FORMS = {"single": best_single, "mixed": mixed, "by distance": by_distance}
+FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
 """Forms of the weights, in the order of their freedom."""
 
 
@@ -110,19 +105,36 @@ def choose(
     return best, FORMS[best](score, distance_m, every, count)
 
 
-def _selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
-    """Weights [k] of the forward selection on some observations, which count by their shares."""
-    every = np.eye(count)
-    values = [_mean(score, one, rows, share) for one in every]
-    weights: FloatArray = every[int(np.argmax(values))]
-    best = max(values)
-    for step in range(FIRST, FIRST + STEPS):
+def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:
+    """Weights [k] of a forward selection with replacement on some observations, which count by their shares.
+
+    The selection goes on while the mean score increases.
+
+    Args:
+        score: scores by weights.
+        rows: observations.
+        share: their shares.
+        weights: weights at the start [k].
+        begun: number of steps that the start counts as.
+
+    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
+    """
+    every = np.eye(len(weights))
+    best = _mean(score, weights, rows, share)
+    for step in range(begun, begun + STEPS):
         changed = (weights * step + every) / (step + 1)
         values = [_mean(score, one, rows, share) for one in changed]
         if max(values) <= best:
             break
         best, weights = max(values), changed[int(np.argmax(values))]
     return weights
+
+
+def _best_selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
+    """`_selected` from the best single prediction."""
+    every = np.eye(count)
+    first = every[int(np.argmax([_mean(score, one, rows, share) for one in every]))]
+    return _selected(score, rows, share, first, FIRST)
 
 
 def _knots(distance_m: FloatArray) -> FloatArray:

@@ -197,7 +197,7 @@ def _weights(
 ) -> tuple[str, Mixture, Intervals | None, dict[str, float]]:
     """Form of the weights, weights, intervals, and mean held-out scores of the ingredients."""
     if held is None or not len(held):
-        return "single", constant(np.ones(1)), None, {}
+        return "alone", constant(np.ones(1)), None, {}
     task, observed = task_of(record), held.observed(record)
     means = np.stack([one.mean for one in predictions.values()])
     score = task.mixtures(means, observed)
