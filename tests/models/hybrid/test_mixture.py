@@ -46,7 +46,7 @@ def test_equal_weights_hedge_where_few_rows_tell_predictions_apart_by_chance():
     for seed in range(40):
         errors = np.random.default_rng(seed).normal(size=(3, 105))
         score, rows = errors_of(errors), np.arange(105)
-        form, mixture = choose(errors_of(errors[:, :5]), np.zeros(5), rows[:5], 3, lambda share: None)
+        _, mixture = choose(errors_of(errors[:, :5]), np.zeros(5), rows[:5], 3, lambda share: None)
         single = np.eye(3)[np.argmin(np.abs(errors[:, :5]).mean(axis=1))]
         others = score(mixture(np.zeros(100)), rows[5:]).mean()
         better.append(others - score(np.broadcast_to(single, (100, 3)), rows[5:]).mean())
