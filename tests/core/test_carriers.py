@@ -117,8 +117,6 @@ def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder
         InputError, match=r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position"
     ):
         run.predict(place)
-    with pytest.raises(InputError, match="row 2: no training row at 2000000000 Hz; trained on rows at 2 carriers"):
-        run.predict(place, carriers_hz=[LOW, 2e9])
     with pytest.raises(InputError, match=r"2 positions and carriers \(1,\); give one positive frequency_hz for each"):
         run.predict(place, carriers_hz=LOW)
     one = train(flat_folder, tmp_path / "one", "idw")
@@ -126,12 +124,38 @@ def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder
         one.predict(place, carriers_hz=[LOW, LOW])
 
 
-def test_a_carrier_without_training_rows_is_refused_before_the_fit(flat: Record, tmp_path: Path) -> None:
-    assert flat.carriers_hz is not None
-    low = flat.carriers_hz == LOW
-    split = Split("band", 0, np.flatnonzero(~low), np.zeros(0, np.int64), np.flatnonzero(low))
-    with pytest.raises(InputError, match="anchor1: received none of 0 training rows at 1100000000 Hz; leave that carr"):
-        train(flat, tmp_path / "run", "idw", split=split)
+def test_between_carriers_methods_are_linear_in_the_logarithm_of_the_frequency(flat: Record, tmp_path: Path) -> None:
+    run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
+    low, high = (run.predict(place, carriers_hz=[carrier] * 2).mean for carrier in (LOW, HIGH))
+    between = run.predict(place, carriers_hz=[np.sqrt(LOW * HIGH)] * 2).mean
+    np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
+    np.testing.assert_array_equal(run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean, [low[0], high[1]])
+
+
+@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_path: Path) -> None:
+    """Free-space loss grows by 20 dB a decade: half way between two carriers lies the mean of both."""
+    n, middle = len(flat), float(np.sqrt(LOW * HIGH))
+    carriers = np.repeat([LOW, middle, HIGH], n)
+    loss = 20 * np.log10(carriers / LOW)
+    heading = None if flat.tx_heading_rad is None else np.tile(flat.tx_heading_rad, 3)
+    three = replace(
+        flat.at_carriers(carriers),
+        tx_pos_m=np.tile(flat.tx_pos_m, (3, 1)),
+        tx_heading_rad=heading,
+        observation=(np.tile(flat.observation, 3) - loss).astype(np.float32),
+        official=None,
+    )
+    settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
+    found = read_run(train(three, tmp_path / "run", name, split="frequency-known:1", settings=settings).folder)
+    assert (carriers[found.row] == middle).all()
+    lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
+    low = train(three, tmp_path / "low", name, split=lowest, settings=settings)
+    turned = heading[found.row] if heading is not None and name in ("kriging", "trees") else None
+    for receiver in range(len(flat.receivers)):
+        known = low.predict(three.tx_pos_m[found.row], receiver, turned, carriers_hz=np.full(len(found.row), LOW)).mean
+        expected = known - 20 * np.log10(middle / LOW)
+        np.testing.assert_allclose(found.prediction[receiver], expected, atol=FLOAT32_DB)
 
 
 def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,43 @@ def test_blocks_are_the_tightest_of_several_starts():
     assert spread(position_folds(record)) <= np.percentile(starts, 25)
 
 
+def several_carriers(official: bool) -> Record:
+    """50 positions at three carriers."""
+    one = make_record()
+    assert one.official is not None
+    tests = np.concatenate([one.official[1] + 50 * number for number in range(3)])
+    return replace(
+        one,
+        tx_pos_m=np.tile(one.tx_pos_m, (3, 1)),
+        observation=np.zeros((1, 150), np.float32),
+        carriers_hz=np.repeat([5e9, 1e9, 2e9], 50),
+        official=(np.setdiff1d(np.arange(150), tests), tests) if official else None,
+        folds=None,
+    )
+
+
+@pytest.mark.parametrize("official", [True, False])
+def test_carriers_and_positions_are_held_out_together(official: bool):
+    record = several_carriers(official)
+    assert record.carriers_hz is not None
+    splits, known = (make_splits(record, name, seed=2) for name in ("frequency", "frequency-known"))
+    assert [split.name for split in splits] == ["frequency:0", "frequency:1", "frequency:2"]
+    for split, beside, carrier_hz in zip(splits, known, [1e9, 2e9, 5e9], strict=True):
+        assert_partition(split, 150, all_rows=False)
+        assert (record.carriers_hz[split.test] == carrier_hz).all()
+        assert carrier_hz not in record.carriers_hz[split.all_train]
+        places, trained = (set(map(tuple, record.tx_pos_m[rows])) for rows in (split.test, split.all_train))
+        assert len(places) == (12 if official else 10)
+        assert not places & trained
+        np.testing.assert_array_equal(beside.test, split.test)
+        np.testing.assert_array_equal(beside.all_train, np.flatnonzero(record.carriers_hz != carrier_hz))
+    if official:
+        assert record.official is not None
+        assert set(np.concatenate([split.test for split in splits])) == set(record.official[1])
+    (second,) = make_splits(record, "frequency:1", seed=2)
+    np.testing.assert_array_equal(second.test, splits[1].test)
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_rows_that_no_receiver_received_are_left_out(rule: str):
     record = make_record()
@@ -176,6 +213,7 @@ def test_fractions_count_from_the_rows_of_each_split():
         ({"name": "blocked:5"}, "no such fold.*blocked:0 to blocked:4"),
         ({"name": "blocked:"}, "no such fold"),
         ({"name": "blocked:-1"}, "no such fold"),
+        ({"name": "frequency"}, "split frequency holds out carriers, and these data have one"),
         ({"name": "random", "n_train": 0}, "n_train 0; choose 1 to 40 rows"),
         ({"name": "random", "n_train": 41}, "n_train 41; choose 1 to 40 rows"),
         ({"name": "random", "n_train": 1.5}, "n_train 1.5"),
@@ -198,6 +236,9 @@ def test_records_that_cannot_follow_a_rule():
         make_splits(make_record(4, folds=False), "blocked")
     with pytest.raises(InputError, match="2 rows"):
         make_splits(make_record(2), "trajectory")
+    nowhere = several_carriers(False)
+    with pytest.raises(InputError, match="positions are not known, which this split holds out"):
+        make_splits(replace(nowhere, tx_pos_m=np.full_like(nowhere.tx_pos_m, np.nan)), "frequency")
 
 
 def test_a_split_is_stored_with_arrays_only(tmp_path: Path):

@@ -23,20 +23,15 @@ def check_observations(record: Record, split: Split, complete: bool = False) -> 
         complete: refuse rows without reception too, for a model that is trained at every receiver on every row.
 
     Raises:
-        InputError: a receiver without any training row, overall or at a carrier; an observation of a training row that
+        InputError: a receiver without any training row; an observation of a training row that
             is not finite; an uplink of any row that is not finite, or all zero.
     """
     known, used = split.all_train, np.concatenate([split.all_train, split.test])
     states = [_states(observed, known) for observed in record.observation]
-    groups = [] if complete else [(np.ones(len(known), bool), "", "it")]
-    if record.carriers_hz is not None:
-        for carrier in np.unique(record.carriers_hz[used]):
-            groups.append((record.carriers_hz[known] == carrier, f" at {carrier:.10g} Hz", "that carrier"))
-    for rows, at, what in groups:
-        for receiver, (missing, _) in zip(record.receivers, states, strict=True):
-            if missing[rows].all():
-                text = f"receiver {receiver.name}: received none of {rows.sum()} training rows{at}"
-                raise InputError(f"{place_of(record)}, {text}; leave {what} out or use another split")
+    for receiver, (missing, _) in zip(record.receivers, [] if complete else states, strict=not complete):
+        if missing.all():
+            text = f"receiver {receiver.name}: received none of {len(known)} training rows"
+            raise InputError(f"{place_of(record)}, {text}; leave it out or use another split")
     for receiver, observed, (missing, broken) in zip(record.receivers, record.observation, states, strict=True):
         bad = np.flatnonzero(missing | broken if complete else broken)
         if len(bad):

@@ -5,13 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.vq import ClusterError, kmeans2
 
 from ..core import InputError, Record, Split
 from ..core.files import readable, stored_arrays, write_arrays
 from ..core.types import IntArray
 
-SPLIT_NAMES = ("official", "random", "blocked", "trajectory")
+FOLDED = ("blocked", "frequency", "frequency-known")
+"""Splits of several folds."""
+SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory")
 TRAIN_FRACTION = 0.8
 """Training share of ``random`` and ``trajectory``, as in the authors' split of rfid-lab (160 of 200)."""
 FOLDS = 5
@@ -31,27 +34,33 @@ def make_splits(
     n_train: int | float | None = None,
     validation_fraction: float = 0.1,
 ) -> list[Split]:
-    """Split a record's rows by one of four rules.
+    """Split a record's rows by one of six rules.
 
     - ``official``: the split of the data.
     - ``random``: seeded, 80 % train and 20 % test.
     - ``blocked``: a split per spatial fold, which is its test set; the folds are ``record.folds`` or else five k-means
-      clusters of the positions. ``blocked:2`` is the split of fold 2 alone.
+      clusters of the positions.
+    - ``frequency``: a split per carrier, whose rows at held-out positions are its test set; rows of the other carriers
+      at the other positions train. Held out are the positions of the official test rows, or else a seeded 20 %.
+    - ``frequency-known``: the same test rows; all rows of the other carriers train, at the held-out positions, too.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
+
+    One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier) or ``frequency-known:0``.
 
     Rows that no receiver received (NaN throughout) are in no part of any split. Validation rows are a seeded draw from
     the training rows. Subsets by ``n_train`` and their validation rows are nested for equal seeds.
 
     Args:
         record: any record with n rows.
-        name: ``official``, ``random``, ``blocked``, ``blocked:K`` or ``trajectory``.
-        seed: seed of the random split, the subset and the validation rows; not of the folds.
+        name: ``official``, ``random``, ``trajectory``, or ``blocked``, ``frequency``, ``frequency-known`` with or
+            without the number of a fold.
+        seed: seed of the random split, the held-out positions, the subset and the validation rows; not of the folds.
         n_train: number of training rows to keep, validation rows included, or their share (a float up to 1); by default
             all.
         validation_fraction: share of the kept training rows that is set aside to choose settings, in [0, 1).
 
     Returns:
-        A single split, or a split per fold for ``blocked``; rows are sorted.
+        A single split, or a split per fold; rows are sorted.
 
     Raises:
         InputError: an unknown name, a rule that the record cannot follow, a part without any row that was received, or
@@ -151,25 +160,49 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
     received = np.asarray(~missing.all(axis=(0, 2)))
     rows = np.flatnonzero(received)
     kind, _, fold = name.partition(":")
-    if kind not in SPLIT_NAMES or (":" in name and kind != "blocked"):
-        raise InputError(f"split {name!r}: unknown; choose official, random, blocked, blocked:K or trajectory")
+    if kind not in SPLIT_NAMES or (":" in name and kind not in FOLDED):
+        known = f"{', '.join(SPLIT_NAMES)}, or a fold such as blocked:0"
+        raise InputError(f"split {name!r}: unknown; choose {known}")
     if kind == "official":
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
         train, test = (part[received[part]] for part in record.official)
         return [(name, train, test)]
-    if kind == "blocked":
-        folds = position_folds(record)
-        count = int(folds.max()) + 1
+    if kind in FOLDED:
+        of_row = (position_folds(record) if kind == "blocked" else _carrier_numbers(record, kind))[rows]
+        held = np.ones(len(rows), bool) if kind == "blocked" else _held_out_positions(record, seed)[rows]
+        trains = np.ones(len(rows), bool) if kind != "frequency" else ~held
+        count = int(of_row.max(initial=0)) + 1
         chosen = range(count)
         if ":" in name:
             if not (fold.isascii() and fold.isdecimal() and int(fold) < count):
-                raise InputError(f"split {name!r}: no such fold; {record.name} has blocked:0 to blocked:{count - 1}")
+                raise InputError(f"split {name!r}: no such fold; {record.name} has {kind}:0 to {kind}:{count - 1}")
             chosen = range(int(fold), int(fold) + 1)
-        of_row = folds[rows]
-        return [(f"blocked:{k}", rows[of_row != k], rows[of_row == k]) for k in chosen]
+        return [(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [(name, order[:first], order[first:])]
+
+
+def _carrier_numbers(record: Record, kind: str) -> IntArray:
+    """Number of each row's carrier [n], 0 for the lowest."""
+    if record.carriers_hz is None:
+        text = f"split {kind} holds out carriers, and these data have one"
+        raise InputError(f"{record.name}: {text}; give rows of several carriers or choose another split")
+    return np.unique(record.carriers_hz, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def _held_out_positions(record: Record, seed: int) -> NDArray[np.bool_]:
+    """Rows [n] at held-out positions: those of the official test rows, or a seeded fifth of the distinct ones."""
+    if not record.has_positions:
+        raise InputError(f"{record.name}: positions are not known, which this split holds out; use another split")
+    distinct, number = np.unique(record.tx_pos_m, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    if record.official is not None:
+        held = np.unique(number[record.official[1]])
+    else:
+        order = np.random.default_rng([seed, 2]).permutation(len(distinct))
+        held = order[round(TRAIN_FRACTION * len(distinct)) :]
+    return np.isin(number, held)

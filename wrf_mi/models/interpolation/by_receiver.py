@@ -74,8 +74,11 @@ class ByReceiver(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of a receiver, [m, ...].
 
+        At a carrier without training rows they are linear in the logarithm of the frequency between the two next
+        carriers with rows, and beyond all of them those of the nearest.
+
         Raises:
-            InputError: positions or headings that are not known, or a carrier without training rows.
+            InputError: positions, headings or carriers that are not known.
         """
         if not np.isfinite(inputs.tx_pos_m).all():
             raise InputError(f"{self.name}: predicts from positions; give finite x, y, z in metres for every row")
@@ -86,17 +89,20 @@ class ByReceiver(Fitted):
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
             return Prediction(self.models[receiver].predict(inputs.tx_pos_m, heading))
-        known, receivers = carriers_text(self.carriers_hz), len(self.models) // len(self.carriers_hz)
         if inputs.carriers_hz is None:
+            known = carriers_text(self.carriers_hz)
             raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
+        known_log, receivers = np.log(self.carriers_hz), len(self.models) // len(self.carriers_hz)
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
-            number = np.flatnonzero(self.carriers_hz == carrier_hz)
-            if not len(number):
-                row = inputs.first_row + rows[0] + 1
-                raise InputError(f"{self.name}: row {row}: no training row at {carrier_hz:.10g} Hz; trained on {known}")
-            model = self.models[number[0] * receivers + receiver]
-            return np.asarray(model.predict(inputs.tx_pos_m[rows], None if heading is None else heading[rows]))
+            place = np.interp(np.log(carrier_hz), known_log, np.arange(len(known_log)))
+            turned = None if heading is None else heading[rows]
+
+            def at(number: int) -> NDArray[Any]:
+                return np.asarray(self.models[number * receivers + receiver].predict(inputs.tx_pos_m[rows], turned))
+
+            below, share = int(place), place % 1
+            return at(below) if share == 0 else (1 - share) * at(below) + share * at(below + 1)
 
         return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
 
