@@ -266,9 +266,10 @@ def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
     assert flat.official is not None
     known, rows = flat.official
     key = TASKS["rssi"].reference
-    found = reference_predictions(flat, known, rows)[key]
+    split = Split("two", 0, known, known[:0], rows)
+    found = reference_predictions(flat, split)[key]
     shifted = replace(flat, observation=flat.observation + np.where(flat.carriers_hz == LOW, 30, 0).astype(np.float32))
-    moved = reference_predictions(shifted, known, rows)[key] - found
+    moved = reference_predictions(shifted, split)[key] - found
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 

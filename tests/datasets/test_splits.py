@@ -126,6 +126,41 @@ def test_carriers_and_positions_are_held_out_together(official: bool):
     np.testing.assert_array_equal(second.test, splits[1].test)
 
 
+def several_receivers(count: int, official: bool = True) -> Record:
+    """50 positions; each receiver misses a row in ten, and the last one the rows from 20 on."""
+    one = make_record()
+    observation = np.zeros((count, 50), np.float32)
+    observation[np.arange(50) % 10 == np.arange(count)[:, None] % 10] = np.nan
+    observation[-1, 20:] = np.nan
+    receivers = tuple(replace(one.receivers[0], name=f"gateway{number}") for number in range(count))
+    return replace(one, receivers=receivers, observation=observation, official=one.official if official else None)
+
+
+@pytest.mark.parametrize(("count", "folds"), [(3, 3), (16, 4)])
+@pytest.mark.parametrize("official", [True, False])
+def test_each_receiver_is_held_out_once(count: int, folds: int, official: bool):
+    record = several_receivers(count, official)
+    splits = make_splits(record, "receiver", seed=3)
+    assert [split.name for split in splits] == [f"receiver:{k}" for k in range(folds)]
+    assert sorted(sum((split.held_receivers for split in splits), ())) == list(range(count))
+    (base,) = make_splits(record, "official" if official else "random", seed=3)
+    received = np.isfinite(record.observation)
+    for split in splits:
+        held = list(split.held_receivers)
+        others = np.setdiff1d(np.arange(count), held)
+        assert abs(len(held) - count / folds) < 1
+        np.testing.assert_array_equal(split.test, base.test[received[held][:, base.test].any(axis=0)])
+        np.testing.assert_array_equal(split.all_train, base.all_train[received[others][:, base.all_train].any(axis=0)])
+    (second,) = make_splits(record, "receiver:1", seed=3)
+    assert second.held_receivers == splits[1].held_receivers
+
+
+def test_a_split_keeps_its_held_receivers(tmp_path: Path):
+    (split,) = make_splits(several_receivers(3), "receiver:2")
+    save_split(tmp_path / "split.npz", split)
+    assert load_split(tmp_path / "split.npz").held_receivers == (2,)
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_rows_that_no_receiver_received_are_left_out(rule: str):
     record = make_record()
@@ -213,6 +248,7 @@ def test_fractions_count_from_the_rows_of_each_split():
         ({"name": "blocked:5"}, "no such fold.*blocked:0 to blocked:4"),
         ({"name": "blocked:"}, "no such fold"),
         ({"name": "blocked:-1"}, "no such fold"),
+        ({"name": "receiver"}, "one receiver, and split receiver holds receivers out"),
         ({"name": "frequency"}, "split frequency holds out carriers, and these data have one"),
         ({"name": "random", "n_train": 0}, "n_train 0; choose 1 to 40 rows"),
         ({"name": "random", "n_train": 41}, "n_train 41; choose 1 to 40 rows"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +107,18 @@ class Record:
         """The record with the same array, elements [m, 3] in metres or None, at every receiver."""
         return replace(self, receivers=tuple(replace(receiver, array_m=array_m) for receiver in self.receivers))
 
+    def without(self, receivers: Sequence[int]) -> Record:
+        """The record as if some receivers, by their numbers, had received nothing; the uplink is kept."""
+        if not receivers:
+            return self
+        hidden: dict[str, Any] = {}
+        for name, nothing in (("observation", np.nan), ("truth", np.nan), ("std", np.nan), ("n_readings", 0)):
+            values = getattr(self, name)
+            if values is not None:
+                hidden[name] = values.copy()
+                hidden[name][list(receivers)] = nothing
+        return replace(self, **hidden)
+
     def at_carrier(self, carrier_hz: float) -> Record:
         """The record with one carrier in Hz for every row."""
         return replace(self, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
@@ -144,6 +158,7 @@ class Record:
 class Split:
     """Rows for training, for the choice of settings and for scores; rows count from 0.
 
+    With ``held_receivers``, numbers of receivers, models see no observation of these, and scores are of these alone.
     ``validation`` rows are training data, kept apart from ``train`` while settings are chosen; the final fit uses both
     (``all_train``).
     """
@@ -153,6 +168,7 @@ class Split:
     train: IntArray
     validation: IntArray
     test: IntArray
+    held_receivers: tuple[int, ...] = ()
 
     @property
     def all_train(self) -> IntArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from ..core import InputError, Record, Split
 from ..core.files import readable, stored_arrays, write_arrays
 from ..core.types import IntArray
 
-FOLDED = ("blocked", "frequency", "frequency-known")
+FOLDED = ("blocked", "frequency", "frequency-known", "receiver")
 """Splits of several folds."""
 SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory")
 TRAIN_FRACTION = 0.8
@@ -21,6 +22,8 @@ FOLDS = 5
 """Number of spatial blocks of data without folds."""
 FOLD_SEED = 0
 """Seed of the spatial blocks, which belong to the data and do not depend on the seed of a run."""
+MOST_RECEIVERS, RECEIVER_FOLDS = 8, 4
+"""Largest number of receivers that are held out in turn, and number of folds of more."""
 CLUSTER_STARTS = 10
 """Starts of k-means; the tightest clusters without an empty one are used."""
 SPLIT_FORMAT = 1
@@ -34,7 +37,7 @@ def make_splits(
     n_train: int | float | None = None,
     validation_fraction: float = 0.1,
 ) -> list[Split]:
-    """Split a record's rows by one of six rules.
+    """Split a record's rows by one of seven rules.
 
     - ``official``: the split of the data.
     - ``random``: seeded, 80 % train and 20 % test.
@@ -43,18 +46,22 @@ def make_splits(
     - ``frequency``: a split per carrier, whose rows at held-out positions are its test set; rows of the other carriers
       at the other positions train. Held out are the positions of the official test rows, or else a seeded 20 %.
     - ``frequency-known``: the same test rows; all rows of the other carriers train, at the held-out positions, too.
+    - ``receiver``: a split per receiver, or per fold of four of more than eight receivers (seeded), whose test set is
+      what these receive in the test rows; the other receivers' training rows train. Rows are those of the official
+      split, or else of the random one.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
 
-    One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier) or ``frequency-known:0``.
+    One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier), ``frequency-known:0`` or ``receiver:1``.
 
     Rows that no receiver received (NaN throughout) are in no part of any split. Validation rows are a seeded draw from
     the training rows. Subsets by ``n_train`` and their validation rows are nested for equal seeds.
 
     Args:
         record: any record with n rows.
-        name: ``official``, ``random``, ``trajectory``, or ``blocked``, ``frequency``, ``frequency-known`` with or
-            without the number of a fold.
-        seed: seed of the random split, the held-out positions, the subset and the validation rows; not of the folds.
+        name: ``official``, ``random``, ``trajectory``, or ``blocked``, ``frequency``, ``frequency-known``, ``receiver``
+            with or without the number of a fold.
+        seed: seed of the random split, the held-out positions, folds of receivers, the subset and the validation rows;
+            not of spatial folds.
         n_train: number of training rows to keep, validation rows included, or their share (a float up to 1); by default
             all.
         validation_fraction: share of the kept training rows that is set aside to choose settings, in [0, 1).
@@ -71,7 +78,7 @@ def make_splits(
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0")
     splits = []
-    for label, train, test in _train_and_test(record, name, seed):
+    for label, train, test, held in _train_and_test(record, name, seed):
         what = f"{record.name}, split {label}"
         for verb, part in (("trains", train), ("scores", test)):
             if len(part) == 0:
@@ -90,16 +97,20 @@ def make_splits(
         # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
         counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
         validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
-        splits.append(Split(label, seed, np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)))
+        parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)
+        splits.append(Split(label, seed, *parts, held))
     return splits
 
 
 def save_split(path: str | Path, split: Split) -> None:
     """Write a split as an npz file of plain arrays (no pickle), atomically.
 
-    Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0).
+    Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0), and of splits that hold out
+    receivers ``held_receivers`` (numbers from 0).
     """
     parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    if split.held_receivers:
+        parts["held_receivers"] = np.asarray(split.held_receivers, np.int64)
     facts = {"format": np.int64(SPLIT_FORMAT), "name": np.str_(split.name), "seed": np.int64(split.seed)}
     write_arrays(Path(path), {**facts, **parts})
 
@@ -114,6 +125,7 @@ def load_split(path: str | Path) -> Split:
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
         arrays = stored_arrays(Path(path))
         content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
+    held = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
     if content["format"] != SPLIT_FORMAT:
         raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
     parts = [content[key] for key in ("train", "validation", "test")]
@@ -123,7 +135,7 @@ def load_split(path: str | Path) -> Split:
     if len(np.unique(rows)) != len(rows):
         raise InputError(f"{path}: a row is in the split twice; make the split again")
     train, validation, test = (part.astype(np.int64) for part in parts)
-    return Split(str(content["name"]), int(content["seed"]), train, validation, test)
+    return Split(str(content["name"]), int(content["seed"]), train, validation, test, held)
 
 
 def position_folds(record: Record) -> IntArray:
@@ -155,11 +167,20 @@ def position_folds(record: Record) -> IntArray:
     return folds
 
 
-def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, IntArray, IntArray]]:
+class _Rows(NamedTuple):
+    """Name, training and test rows of a split, and the receivers that it holds out."""
+
+    name: str
+    train: IntArray
+    test: IntArray
+    held_receivers: tuple[int, ...] = ()
+
+
+def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
     received = np.asarray(~missing.all(axis=(0, 2)))
     rows = np.flatnonzero(received)
-    kind, _, fold = name.partition(":")
+    kind, *_ = name.partition(":")
     if kind not in SPLIT_NAMES or (":" in name and kind not in FOLDED):
         known = f"{', '.join(SPLIT_NAMES)}, or a fold such as blocked:0"
         raise InputError(f"split {name!r}: unknown; choose {known}")
@@ -167,23 +188,20 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[tuple[str, Int
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
         train, test = (part[received[part]] for part in record.official)
-        return [(name, train, test)]
+        return [_Rows(name, train, test)]
+    if kind == "receiver":
+        return _receivers_held_out(record, name, seed)
     if kind in FOLDED:
         of_row = (position_folds(record) if kind == "blocked" else _carrier_numbers(record, kind))[rows]
         held = np.ones(len(rows), bool) if kind == "blocked" else _held_out_positions(record, seed)[rows]
         trains = np.ones(len(rows), bool) if kind != "frequency" else ~held
-        count = int(of_row.max(initial=0)) + 1
-        chosen = range(count)
-        if ":" in name:
-            if not (fold.isascii() and fold.isdecimal() and int(fold) < count):
-                raise InputError(f"split {name!r}: no such fold; {record.name} has {kind}:0 to {kind}:{count - 1}")
-            chosen = range(int(fold), int(fold) + 1)
-        return [(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
+        chosen = _folds(record, name, int(of_row.max(initial=0)) + 1)
+        return [_Rows(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
-    return [(name, order[:first], order[first:])]
+    return [_Rows(name, order[:first], order[first:])]
 
 
 def _carrier_numbers(record: Record, kind: str) -> IntArray:
@@ -206,3 +224,34 @@ def _held_out_positions(record: Record, seed: int) -> NDArray[np.bool_]:
         order = np.random.default_rng([seed, 2]).permutation(len(distinct))
         held = order[round(TRAIN_FRACTION * len(distinct)) :]
     return np.isin(number, held)
+
+
+def _folds(record: Record, name: str, count: int) -> range:
+    """Folds that a name asks for, of ``count``."""
+    kind, colon, fold = name.partition(":")
+    if not colon:
+        return range(count)
+    if not (fold.isascii() and fold.isdecimal() and int(fold) < count):
+        raise InputError(f"split {name!r}: no such fold; {record.name} has {kind}:0 to {kind}:{count - 1}")
+    return range(int(fold), int(fold) + 1)
+
+
+def _receivers_held_out(record: Record, name: str, seed: int) -> list[_Rows]:
+    """A split for each receiver, or for each fold of many, with rows that the trained and the held-out receive."""
+    count = len(record.receivers)
+    if count < 2:
+        raise InputError(f"{record.name}: one receiver, and split receiver holds receivers out; use another split")
+    order = np.arange(count)
+    if count > MOST_RECEIVERS:
+        order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
+    base = "random" if record.official is None else "official"
+    (rows,) = _train_and_test(record, base, seed)
+    received = np.asarray(np.isfinite(record.observation).reshape(count, len(record), -1).all(axis=2), bool)
+    found = []
+    for k in _folds(record, name, int(order.max()) + 1):
+        held = np.asarray(order == k)
+        train, test = (
+            part[received[who][:, part].any(axis=0)] for who, part in ((~held, rows.train), (held, rows.test))
+        )
+        found.append(_Rows(f"receiver:{k}", train, test, tuple(np.flatnonzero(held).tolist())))
+    return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core import InputError, Record
+from ..core import InputError, Record, Split
 from ..core.carriers import carriers_text
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
@@ -46,6 +46,25 @@ def check_record(method: Model, record: Record, others: Iterable[Model] = ()) ->
         named = f" ({', '.join(able)})" if able else ""
         text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
         raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
+
+
+def check_held_receivers(record: Record, split: Split, method: Model, others: Iterable[Model]) -> None:
+    """Refuse a split that holds out receivers, for a model or data that do not serve it.
+
+    Raises:
+        InputError: a model that predicts for trained receivers alone, other data than signal strengths, or a receiver
+            that is not in the data.
+    """
+    if not split.held_receivers:
+        return
+    if max(split.held_receivers) >= len(record.receivers) or len(split.held_receivers) == len(record.receivers):
+        numbers = ", ".join(map(str, split.held_receivers))
+        text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
+        raise InputError(f"{place_of(record)}: {text}; leave some to train on")
+    if not method.new_receivers or not task_of(record).in_decibel:
+        able = [other.name for other in others if other.new_receivers and other.serves(record.task)]
+        remedy = f"choose {' or '.join(able)}" if task_of(record).in_decibel else "it serves signal strengths"
+        raise InputError(f"split {split.name}: {method.name} predicts for the receivers it is trained on; {remedy}")
 
 
 def check_parts(record: Record) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
@@ -123,6 +123,12 @@ class Problem:
 
         return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
 
+    def seen(self, split: Split) -> Problem:
+        """The problem with what a fit to a split may see: receivers that it holds out received nothing."""
+        if not split.held_receivers:
+            return self
+        return replace(self, dataset=self.record.without(split.held_receivers), antennas=AS_STATED)
+
     def rows(self, split: Split) -> IntArray:
         """Rows that a fit may use."""
         return split.all_train if self.use_rows else np.zeros(0, np.int64)
@@ -198,6 +204,8 @@ class Model:
         several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from the transmitter's heading.
+        new_receivers: whether it predicts what receivers observe that it was not trained on, in a split that holds out
+            receivers.
         complete: whether it needs every receiver's observation of every training row.
         given: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
             ``receiver`` or ``evaluation``.
@@ -221,6 +229,7 @@ class Model:
     several_carriers: bool = False
     uplink: Literal["none", "optional", "required"] = "none"
     headings: bool = False
+    new_receivers: bool = False
     complete: bool = False
     given: tuple[str, ...] = ()
     defaults: tuple[str, ...] = ()

@@ -298,6 +298,7 @@ MODEL = Model(
     "Hoydis et al., 'Sionna RT' (2023)",
     scene="required",
     several_carriers=True,
+    new_receivers=True,
     check=check,
     prepare=prepare,
 )

@@ -51,7 +51,7 @@ from ..datasets import make_splits
 from ..datasets.observations import check_observations, place_of
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.calibrated import with_intervals
-from ..models.checks import check_record
+from ..models.checks import check_held_receivers, check_record
 from ..models.model import default_settings
 from ..parallel import Scheduler
 from ..synthetic import load_record
@@ -119,6 +119,7 @@ def plan_run(
     splits = [split] if isinstance(split, Split) else make_splits(record, split, seed, None if scene_only else n_train)
     for rows in splits:
         check_rows(rows, record, f"split {rows.name}")
+        check_held_receivers(record, rows, chosen, MODELS.values())
         check_observations(record, rows, complete=chosen.complete)
     problem = Problem(record, found, seed, scene_name, material, antennas, not scene_only)
     checked = with_intervals(chosen) if intervals else chosen
@@ -256,7 +257,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                fitted = config.entry.fit(problem, rows, replace(session, folder=part))
+                fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             (part / CHECKPOINT).unlink(missing_ok=True)

@@ -20,9 +20,9 @@ from ..datasets import make_splits
 from ..datasets.observations import scorable
 from ..models import Fitted, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
-from ..models.interpolation.idw import IdwSettings
-from ..models.model import inputs_of
-from ..tasks import TASKS, UPLINK
+from ..models.interpolation.mri import MODEL as MRI
+from ..models.model import default_settings, inputs_of
+from ..tasks import LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from ..training.trainer import peak_memory_mb
 from .folder import METRICS, PREDICTIONS, RunConfig
@@ -54,13 +54,13 @@ class Part(NamedTuple):
     seconds: float
 
 
-def _milliseconds_per_sample(predict: Predict, rows: IntArray) -> float:
+def _milliseconds_per_sample(predict: Predict, rows: IntArray, receiver: int) -> float:
     """Median time of one prediction at one transmitter position, warm, in ms."""
-    predict(rows[:1], 0)
+    predict(rows[:1], receiver)
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < TIMED_S:
         start = time.perf_counter()
-        predict(rows[:1], 0)
+        predict(rows[:1], receiver)
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times))
 
@@ -78,35 +78,41 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
         receivers ``receivers``, with standard deviations ``inside_90`` and ``crps``, ``n_train``, ``n_test``,
         ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite
-        is not scored: its truth is NaN.
+        is not scored: its truth is NaN; so are all of the trained receivers in a split that holds out others.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
             received no training row.
     """
-    rows, known = split.test, split.all_train
+    rows = split.test
     if len(rows) == 0:
         raise InputError(f"split {split.name}: no test rows to score; use another split")
     truth, broken = scorable(record.scored[:, rows])
+    scored = split.held_receivers or tuple(range(len(truth)))
+    trained = np.setdiff1d(np.arange(len(truth)), scored)
+    truth[trained] = np.nan
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    given = [predict(rows, receiver) for receiver in range(len(truth))]
+    given = [predict(rows, receiver) for receiver in scored]
     found = [one if isinstance(one, Prediction) else Prediction(one) for one in given]
+    prediction = np.full((len(truth), *found[0].mean.shape), np.nan, truth.dtype)
+    prediction[list(scored)] = [one.mean for one in found]
     arrays = {
         "row": rows,
-        "prediction": np.stack([prediction.mean for prediction in found]).astype(truth.dtype),
+        "prediction": prediction,
         "truth": truth,
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
-        **{reference_key(key): values for key, values in reference_predictions(record, known, rows).items()},
+        **{reference_key(key): values for key, values in reference_predictions(record, split).items()},
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
     if found[0].std is not None:
-        arrays["std"] = np.stack([prediction.stated_std for prediction in found]).astype(np.float32)
+        arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
+        arrays["std"][list(scored)] = [one.stated_std for one in found]
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
-        "n_train": len(known),
-        "ms_per_sample": _milliseconds_per_sample(single or predict, rows),
+        "n_train": len(split.all_train),
+        "ms_per_sample": _milliseconds_per_sample(single or predict, rows, scored[0]),
     }
     return metrics, arrays
 
@@ -242,25 +248,27 @@ def stored_metrics(folder: Path) -> dict[str, Any]:
     return stored if isinstance(stored, dict) else {}
 
 
-def reference_predictions(record: Record, known: IntArray, rows: IntArray) -> dict[str, Observations]:
-    """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] by key.
+def reference_predictions(record: Record, split: Split) -> dict[str, Observations]:
+    """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] of the test rows by key.
 
-    Inverse-distance weighting (IDW) needs positions of training rows ``known`` and scored ``rows``; the copy of the
-    uplink needs an uplink.
+    Inverse-distance weighting (IDW) needs positions of training and test rows; the copy of the uplink needs an uplink.
+    At receivers that the split holds out, the path-loss law of the others' training rows takes their place.
 
     Raises:
         InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
             received no training row.
     """
-    task, kind = TASKS[record.task], record.observation.dtype
+    task, kind, rows = TASKS[record.task], record.observation.dtype, split.test
     found: dict[str, Any] = {}
     if record.uplink is not None and task.from_uplink:
         found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
-    if np.isfinite(record.tx_pos_m[np.concatenate([known, rows])]).all():
-        split, inputs = Split("reference", 0, known, known[:0], rows), inputs_of(record, rows)
-        fitted = IDW.fit(Problem(record, IdwSettings()), split, Session(Path(), Path()))  # writes no file
-        means = [fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))]
-        found[task.reference] = np.stack(means).astype(kind)
+    if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
+        key, entry = (LAW, MRI) if split.held_receivers else (task.reference, IDW)
+        plain = replace(split, train=split.all_train, validation=split.validation[:0])
+        problem = Problem(record, default_settings(entry, (), {})).seen(split)
+        fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
+        inputs, receivers = inputs_of(record, rows), range(len(record.receivers))
+        found[key] = np.stack([fitted.predict(inputs, receiver).mean for receiver in receivers]).astype(kind)
     if not found:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")

@@ -16,6 +16,8 @@ from .mixtures import MixtureScores, mixture_scores
 
 UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
+LAW = "law"
+"""Key of the reference at receivers that were held out."""
 
 
 class Task(ABC):
@@ -98,8 +100,9 @@ class Task(ABC):
     @property
     def references(self) -> dict[str, str]:
         """Words for each possible reference by its key; the first that a run has is its headline."""
-        idw = {self.reference: f"IDW of {self.neighbours} nearest"}
-        return {UPLINK: self.from_uplink} | idw if self.from_uplink else idw
+        known = {self.reference: f"IDW of {self.neighbours} nearest"}
+        known |= {LAW: "one path-loss law of all receivers"} if self.in_decibel else {}
+        return {UPLINK: self.from_uplink} | known if self.from_uplink else known
 
     def headline(self, stored: Container[str]) -> str | None:
         """The first of `references` among the stored ones; None without any."""

@@ -32,18 +32,24 @@ class Offsets:
 def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
     """Fit an offset to each receiver: the median of measured minus traced, which minimises the absolute error.
 
+    A receiver that received nothing takes the mean offset of the others, and their weakest signal.
+
     Args:
         traced_dbm: shape [n_rx, n], NaN where no path arrives.
         measured_dbm: measured training rows [n_rx, n], NaN where nothing was received.
 
     Raises:
-        InputError: a receiver without any row that was both traced and received.
+        InputError: a receiver that received rows, but none that was traced.
     """
     traced, measured = np.asarray(traced_dbm, float), np.asarray(measured_dbm, float)
     difference = measured - traced
+    heard = ~np.isnan(measured).all(axis=1)
     for receiver, known in enumerate(~np.isnan(difference)):
-        if not known.any():
+        if heard[receiver] and not known.any():
             raise InputError(
                 f"receiver {receiver}: no training row is both received and reached by a path; trace more kinds of path"
             )
-    return Offsets(np.nanmedian(difference, axis=1), np.nanmin(measured, axis=1))
+    offset_db, floor_dbm = np.empty((2, len(measured)))
+    offset_db[heard], floor_dbm[heard] = np.nanmedian(difference[heard], axis=1), np.nanmin(measured[heard], axis=1)
+    offset_db[~heard], floor_dbm[~heard] = offset_db[heard].mean(), floor_dbm[heard].min()
+    return Offsets(offset_db, floor_dbm)

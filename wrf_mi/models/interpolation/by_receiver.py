@@ -124,6 +124,7 @@ def model_by_receiver(
     load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
     source: str,
     heading: Callable[[Record, Any], bool] = lambda record, settings: False,
+    new_receivers: bool = False,
 ) -> Model:
     """Entry of the registry for a method that fits every receiver to all training rows, those of each carrier alone.
 
@@ -135,6 +136,7 @@ def model_by_receiver(
         load_single: the model of a receiver from its arrays.
         source: publication.
         heading: ``heading(record, settings)``: whether headings count where the record has them.
+        new_receivers: whether ``fit_single`` serves receivers without training rows.
     """
 
     def fit(problem: Problem, split: Split, session: FitSession) -> ByReceiver:
@@ -162,4 +164,4 @@ def model_by_receiver(
         return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
 
     how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}
-    return Model(name, tasks, settings, fit, load, source, **how)
+    return Model(name, tasks, settings, fit, load, source, new_receivers=new_receivers, **how)

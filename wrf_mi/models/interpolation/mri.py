@@ -28,7 +28,8 @@ class MriSettings:
     """Settings of MRI.
 
     Attributes:
-        shared: whether all receivers share a power at one metre and an exponent.
+        shared: whether all receivers share a power at one metre and an exponent; receivers that were not trained on
+            take that law in any case.
     """
 
     shared: bool = False
@@ -59,7 +60,7 @@ def _fit(
     problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
 ) -> PathLoss:
     columns = log_distance(receiver.position_m)(tx_pos)
-    if problem.settings.shared:
+    if problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
         record, rows = problem.record, split.all_train
         columns = np.stack([log_distance(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
         observed = record.observation[:, rows]
@@ -81,4 +82,5 @@ MODEL = model_by_receiver(
     _fit,
     lambda receiver, arrays: PathLoss(receiver.position_m, arrays["law"]),
     "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss",
+    new_receivers=True,
 )
