@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from ..core import InputError
 from .options import DATASET, Arguments, add_command, add_n_train, add_scheduler, add_tracing
 from .train import RAY_TRACING, run_training, training_arguments
 
@@ -21,6 +23,8 @@ def add_parser(commands: Any) -> None:
     add_tracing(parser)
     target = "choose depth, rays, diffraction and scattering until power and spectra are converged to DB decibels"
     add("--target-error", type=float, metavar="DB", help=target)
+    text = "write the traced paths as a scenario of DeepMIMO, which deepmimo.load opens (docs/data.md)"
+    add("--deepmimo", metavar="FOLDER", help=text)
     add("--split", help="as for train (default: official)")
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
@@ -32,5 +36,21 @@ def trace_command(a: Arguments) -> int:
     from ..parallel import open_scheduler
 
     training_arguments(a)  # refused before workers start
+    if a.deepmimo is not None:
+        _check_deepmimo(a)
     with open_scheduler(a.scheduler) as scheduler:
-        return run_training(a, scheduler=scheduler if a.scheduler else None)
+        status = run_training(a, scheduler=scheduler if a.scheduler else None)
+    if a.deepmimo is not None:
+        from ..models.ray_tracing import PATHS
+        from ..tracing import load_trace, write_deepmimo
+
+        write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS))
+    return status
+
+
+def _check_deepmimo(a: Arguments) -> None:
+    from ..tracing.deepmimo import check_deepmimo_folder
+
+    if a.calibrate is not None:
+        raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
+    check_deepmimo_folder(a.deepmimo)

@@ -2,6 +2,7 @@
 
 from .argos import read_argos
 from .ble_folder import read_ble_folder, write_ble_folder
+from .deepmimo import read_deepmimo
 from .fetch import fetch
 from .nerf2_ble import read_nerf2_ble
 from .nerf2_csi import read_nerf2_csi, write_nerf2_csi
@@ -22,6 +23,7 @@ __all__ = [
     "make_splits",
     "read_argos",
     "read_ble_folder",
+    "read_deepmimo",
     "read_nerf2_ble",
     "read_nerf2_csi",
     "read_newrf",

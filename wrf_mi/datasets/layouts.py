@@ -13,6 +13,7 @@ from ..core import Record
 from ..core.registry import Registry, resolve
 from .argos import SUFFIXES
 from .ble_folder import ANCHORS
+from .deepmimo import OLD_PARAMS, PARAMS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
 from .nerf2_ble import POWERS
 from .nerf2_csi import CHANNELS, STATION
@@ -55,6 +56,7 @@ BUILT_IN = (
     Layout("nerf2-ble", "rssi", "wrf_mi.datasets.nerf2_ble:read_nerf2_ble", (POWERS, BLE_GATEWAYS)),
     Layout("nerf2-csi", "csi", "wrf_mi.datasets.nerf2_csi:read_nerf2_csi", (CHANNELS, STATION)),
     Layout("ble", "rssi", "wrf_mi.datasets.ble_folder:read_ble_folder", (ANCHORS,)),
+    Layout("deepmimo", "csi", "wrf_mi.datasets.deepmimo:read_deepmimo", (PARAMS, OLD_PARAMS)),
     Layout("newrf", "csi", "wrf_mi.datasets.newrf:read_newrf", suffixes=(".npz",)),
     Layout("argos", "csi", "wrf_mi.datasets.argos:read_argos", suffixes=SUFFIXES),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .deepmimo import write_deepmimo
 from .materials import set_frequency
 from .options import TraceOptions
 from .result import TraceResult, load_trace, recompute, save_trace
@@ -19,4 +20,5 @@ __all__ = [
     "save_trace",
     "set_frequency",
     "trace_paths",
+    "write_deepmimo",
 ]

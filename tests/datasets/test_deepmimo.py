@@ -1,0 +1,282 @@
+"""Scenarios of DeepMIMO 4: channels against the package's own, the record, what is refused, and the command.
+
+``data/deepmimo_channels.npz`` holds the channels that the package, version 4.0.5, computed from the scenario of
+`made_scenarios.write_scenario` with each entry of `CHOSEN`; where the package is installed, it computes them again.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused
+from changed_folders import Change, refusal, remove, write
+from made_scenarios import CARRIER_HZ, CHOSEN, package_channels, package_dataset, params, write_scenario
+from scipy.constants import speed_of_light
+
+from wrf_mi.core import Antenna
+from wrf_mi.datasets import load, make_splits, read_deepmimo
+from wrf_mi.datasets.deepmimo import PARAMS
+from wrf_mi.datasets.deepmimo_params import CHANNEL_PARAMS
+from wrf_mi.receivers.array import array_response
+
+STORED = Path(__file__).parent / "data" / "deepmimo_channels.npz"
+SINGLE = 2e-5
+"""Relative to a user's largest coefficient. The package computes angles, patterns and responses in float32 and sums in
+complex64: of 2,000 users the median differs by 4e-7, and up to 4e-5 where paths cancel out or leave along a dipole."""
+SINGLE_PHASE = 1e-4
+"""Likewise for uneven subcarriers, for which the package computes the phases 2 pi k B tau / N, up to 250 rad here, in
+float32: to 1.5e-5 rad."""
+
+
+def scenario(folder: Path, **options: Any) -> Path:
+    return write_scenario(folder / "street", **options)
+
+
+def three_axes(observation: np.ndarray) -> np.ndarray:
+    """Channels of a receiver [n, m, k]."""
+    return observation if observation.ndim == 3 else observation[:, None]
+
+
+def assert_close(ours: np.ndarray, package: np.ndarray, tolerance: float) -> None:
+    """Equal channels; those of users without a path are NaN, and the package's 0."""
+    ours, silent = three_axes(ours), ~np.abs(package).any(axis=(1, 2))
+    assert silent.any()
+    np.testing.assert_array_equal(np.isnan(ours).all(axis=(1, 2)), silent)
+    scale = np.abs(package[~silent]).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_array_less(np.abs(ours[~silent] - package[~silent]) / scale, tolerance)
+
+
+@pytest.mark.parametrize("name", CHOSEN)
+@pytest.mark.parametrize("suffix", [".npz", ".mat", ".npy"])
+def test_channels_equal_stored_ones_of_the_package(tmp_path: Path, name: str, suffix: str) -> None:
+    folder = scenario(tmp_path, suffix=suffix)
+    with np.load(STORED) as stored:
+        assert_close(read_deepmimo(folder, params=CHOSEN[name]).observation[0], stored[name], SINGLE)
+
+
+@pytest.mark.parametrize("name", CHOSEN)
+def test_package_computes_the_stored_channels(tmp_path: Path, name: str) -> None:
+    channels = package_channels(package_dataset(scenario(tmp_path)), CHOSEN[name])
+    with np.load(STORED) as stored:
+        np.testing.assert_allclose(channels, stored[name], atol=SINGLE * np.abs(channels).max(), rtol=0)
+
+
+@pytest.mark.parametrize("selected", [[0, 21, 42, 63], [0, 1, 5, 63]])
+def test_channels_of_several_base_stations_and_sets_of_users_equal_those_of_the_package(
+    tmp_path: Path, selected: list[int]
+) -> None:
+    folder = scenario(tmp_path, stations=2, users=(60, 30))
+    chosen = {**CHOSEN["array"], "ofdm": {**CHOSEN["array"]["ofdm"], "selected_subcarriers": selected}}
+    record = read_deepmimo(folder, params={**chosen, "base_stations": "all"})
+    dataset = package_dataset(folder)  # ordered by set of users, then by base station
+    tolerance = SINGLE if len(set(np.diff(selected))) == 1 else SINGLE_PHASE
+    for index in range(2):
+        pairs = [dataset[2 * k + index] for k in range(2)]
+        assert_close(record.observation[index], np.concatenate([package_channels(p, chosen) for p in pairs]), tolerance)
+        np.testing.assert_array_equal(record.tx_pos_m, np.concatenate([pair.rx_pos for pair in pairs]))
+        np.testing.assert_array_equal(record.receivers[index].position_m, pairs[0].tx_pos[0])
+
+
+def test_record_has_users_base_station_and_subcarriers(tmp_path: Path) -> None:
+    folder = scenario(tmp_path, users=(11,))
+    record = load(folder)
+    assert (record.name, record.task, record.source) == ("street", "csi", str(folder))
+    assert record.observation.shape == (1, 11, 1)
+    assert record.observation.dtype == np.complex64
+    assert np.isnan(record.observation[0, 0]).all()
+    np.testing.assert_array_equal(record.frequencies_hz, [CARRIER_HZ])
+    (receiver,) = record.receivers
+    assert (receiver.name, receiver.antenna, receiver.array_m) == ("bs0", Antenna(), None)
+    np.testing.assert_array_equal(receiver.position_m, [0, 5, 20])
+    assert record.official is not None
+    assert [len(rows) for rows in record.official] == [8, 2]
+    np.testing.assert_array_equal(np.sort(np.concatenate(record.official)), np.arange(1, 11))  # user 0 has no path
+    (folder / "train_index.txt").write_text("5\n3\n")
+    (folder / "test_index.txt").write_text("7\n")
+    (split,) = make_splits(load(folder), "official")
+    assert (split.all_train.tolist(), split.test.tolist()) == ([3, 5], [7])
+
+
+def test_parameters_in_the_folder_are_those_of_the_call(tmp_path: Path) -> None:
+    folder = scenario(tmp_path, stations=3)
+    chosen = {**CHOSEN["array"], "base_stations": [2, 0]}
+    (folder / CHANNEL_PARAMS).write_text(json.dumps(chosen))
+    record = load(folder)
+    assert [receiver.name for receiver in record.receivers] == ["bs2", "bs0"]
+    np.testing.assert_array_equal(record.observation, read_deepmimo(folder, params=chosen).observation)
+    assert record.receivers[0].antenna == Antenna("hw_dipole", frame="array")
+    assert record.tx_antenna == Antenna("hw_dipole")
+    np.testing.assert_array_equal(record.frequencies_hz, CARRIER_HZ + 20e6 / 64 * np.array([0, 21, 42, 63]))
+
+
+def test_array_of_the_record_explains_the_phases_of_its_elements(tmp_path: Path) -> None:
+    """One path: the coefficients of the elements are those of a plane wave at `Receiver.array_m`."""
+    folder = scenario(tmp_path, paths=1, users=(6,))
+    record = read_deepmimo(folder, params=CHOSEN["array"])
+    receiver = record.receivers[0]
+    with np.load(folder / "aod_az_t000_tx000_r001.npz") as az, np.load(folder / "aod_el_t000_tx000_r001.npz") as el:
+        azimuth, zenith = np.radians(az["aod_az"][1:, 0], dtype=float), np.radians(el["aod_el"][1:, 0], dtype=float)
+    world = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
+    assert receiver.array_m is not None
+    waves = array_response(receiver.array_m, world @ receiver.to_world, CARRIER_HZ)
+    ratio = record.observation[0, 1:, :, 0] / record.observation[0, 1:, :1, 0]
+    np.testing.assert_allclose(ratio, waves, atol=SINGLE)
+
+
+def test_carrier_phase_is_added_where_asked(tmp_path: Path) -> None:
+    folder = scenario(tmp_path, paths=1)
+    with np.load(folder / "delay_t000_tx000_r001.npz") as stored:
+        delay = stored["delay"].astype(float)
+    plain, added = (read_deepmimo(folder, params={"add_carrier_phase": a}).observation[0, 1:] for a in (False, True))
+    turned = plain * np.exp(-2j * np.pi * np.remainder(CARRIER_HZ * delay[1:], 1))
+    np.testing.assert_allclose(added, turned, rtol=SINGLE)
+
+
+def test_amplitude_and_phase_follow_one_convention(tmp_path: Path) -> None:
+    """A line of sight as stored: gain lambda / (4 pi d) exp(-j 2 pi f d / c) at every subcarrier."""
+    folder = scenario(tmp_path, paths=1, users=(4,))
+    frequencies, distance = CARRIER_HZ + 1e5 * np.arange(4), np.array([np.nan, 10, 20, 30.0])[:, None]
+    wavelength = speed_of_light / CARRIER_HZ
+    stored = {
+        "power": 20 * np.log10(wavelength / (4 * np.pi * distance)),
+        "phase": -360 * np.remainder(distance / wavelength, 1),
+        "delay": distance / speed_of_light,
+    }
+    for key, values in stored.items():
+        np.savez(folder / f"{key}_t000_tx000_r001.npz", **{key: values})
+    ofdm = {"bandwidth": 6.4e6, "subcarriers": 64, "selected_subcarriers": [0, 1, 2, 3]}
+    record = read_deepmimo(folder, params={"ofdm": ofdm})
+    np.testing.assert_allclose(record.frequencies_hz, frequencies)
+    d = distance[1:]
+    expected = wavelength / (4 * np.pi * d) * np.exp(-2j * np.pi * frequencies * d / speed_of_light)
+    np.testing.assert_allclose(record.observation[0, 1:], expected, rtol=SINGLE)
+
+
+def edited(**changes: Any) -> Change:
+    return write(PARAMS, json.dumps(params() | changes))
+
+
+def stored(key: str, values: Any) -> Change:
+    return lambda folder: np.savez(folder / f"{key}_t000_tx000_r001.npz", **{key: values})
+
+
+NO_STATION = {"txrx_set_1": params()["txrx_sets"]["txrx_set_1"]}
+NO_USERS = {"txrx_set_0": params()["txrx_sets"]["txrx_set_0"]}
+WRONG: dict[str, tuple[Change, str]] = {
+    "matrix missing": (remove("delay_t000_tx000_r001.npz"), r"delay_t000_tx000_r001: no \.mat, \.npz, \.npy file"),
+    "damaged matrix": (write("power_t000_tx000_r001.npz", "no zip"), r"power_t000_tx000_r001\.npz: not readable"),
+    "damaged .mat": (write("power_t000_tx000_r001.mat", "no mat"), r"power_t000_tx000_r001\.mat: not readable"),
+    "other array in the file": (
+        lambda folder: np.savez(folder / "phase_t000_tx000_r001.npz", angle=np.zeros((10, 5))),
+        r"phase_t000_tx000_r001\.npz: no array phase",
+    ),
+    "words": (stored("phase", np.full((10, 5), "a")), "phase holds <U1; give real numbers"),
+    "pickled objects": (stored("phase", np.full((10, 5), None)), "not readable"),
+    "other number of users": (
+        stored("power", np.zeros((9, 5))),
+        r"power_.* has shape \[9, 5\], expected \[10, 5\]",
+    ),
+    "other number of paths": (
+        stored("aod_el", np.zeros((10, 4))),
+        r"aod_el_.* has shape \[10, 4\], expected \[10, 5\]",
+    ),
+    "flat matrix": (stored("power", np.zeros(10)), r"power_t000_tx000_r001 has shape \[10\]"),
+    "two positions of a base station": (stored("tx_pos", np.zeros((2, 3))), r"tx_pos_.* has shape \[2, 3\]"),
+    "users in a plane": (stored("rx_pos", np.zeros((10, 2))), r"rx_pos_.* has shape \[10, 2\]"),
+    "NaN position": (stored("rx_pos", np.full((10, 3), np.nan)), "rx_pos_.* not finite"),
+    "NaN phase": (stored("phase", np.full((10, 5), np.nan)), r"user 1 \(from 0\) of t000_tx000_r001: power, phase"),
+    "infinite power": (stored("power", np.full((10, 5), np.inf)), "user 0 .* is not finite"),
+    "no paths": (stored("power", np.full((10, 5), np.nan)), r"0 of 10 users have a path to the base stations \[0\]"),
+    "delay beyond the symbol": (
+        stored("delay", np.full((10, 5), 1e-3)),
+        "a delay of 0.001 s, and a symbol .* 5.12e-05 s",
+    ),
+    "no version": (edited(version=None), "version None of DeepMIMO; give a scenario of version 4"),
+    "other version": (edited(version="3.2.9"), "version '3.2.9' of DeepMIMO"),
+    "parameters of another program": (write(PARAMS, "[1, 2]"), "scene is missing; give a scenario of DeepMIMO 4"),
+    "no JSON": (write(PARAMS, "{"), r"params\.json: not readable"),
+    "dynamic": (edited(scene={"num_scenes": 4}), "dynamic scenario of 4 scenes; give the folder of one scene"),
+    "no carrier": (edited(rt_params={}), "frequency is None; give the carrier in Hz"),
+    "carrier of words": (edited(rt_params={"frequency": "mmWave"}), "frequency is 'mmWave'"),
+    "no sets": (edited(txrx_sets=None), "txrx_sets is missing"),
+    "no base station": (edited(txrx_sets=NO_STATION), r"no base station \(is_tx\) in txrx_sets"),
+    "no users": (edited(txrx_sets=NO_USERS), "no set of users"),
+    "points of words": (
+        edited(txrx_sets=NO_STATION | {"txrx_set_0": {"is_tx": True, "id": 0, "num_points": "two"}}),
+        "num_points is 'two'; give a whole number",
+    ),
+    "several base stations": (
+        edited(txrx_sets=params(3)["txrx_sets"]),
+        r"3 base stations, 0 to 2; choose in channel_params\.yml, base_stations: \[0\] or base_stations: all",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_scenario_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    folder = scenario(tmp_path)
+    change, message = WRONG[case]
+    change(folder)
+    assert refusal(load, folder, message).startswith(str(folder))
+
+
+WRONG_PARAMS: dict[str, tuple[dict[str, Any], str]] = {
+    "unknown key": ({"antenna": {}}, "'antenna' is not known; give some of base_stations"),
+    "unknown part": ({"bs_antenna": {"fov": 90}}, "bs_antenna: 'fov' is not known; give some of shape"),
+    "part of words": ({"ofdm": "wide"}, "ofdm is 'wide'; give some of bandwidth"),
+    "out of range": ({"base_stations": [1]}, "base station 1 is out of range; the scenario has 0 to 0"),
+    "names": ({"base_stations": ["roof"]}, r"base_stations is \['roof'\]; give all or a list"),
+    "twice": ({"base_stations": [0, 0]}, "with a number twice"),
+    "subcarrier out of range": ({"ofdm": {"selected_subcarriers": [512]}}, "give a list of different whole numbers"),
+    "no subcarrier": ({"ofdm": {"selected_subcarriers": []}}, "selected_subcarriers is"),
+    "half a subcarrier": ({"ofdm": {"subcarriers": 1.5}}, "subcarriers is 1.5; give a whole number from 1"),
+    "no bandwidth": ({"ofdm": {"bandwidth": 0}}, "bandwidth is 0; give a positive number of Hz"),
+    "flat array": ({"bs_antenna": {"shape": 8}}, "shape is 8; give two whole numbers"),
+    "no spacing": ({"bs_antenna": {"spacing": True}}, "spacing is True; give a positive number of wavelengths"),
+    "one angle": ({"bs_antenna": {"rotation": 90}}, "rotation is 90; give the angles about x, y and z in degrees"),
+    "pattern": ({"ue_antenna": {"radiation_pattern": "horn"}}, "radiation_pattern is 'horn'; choose from isotropic"),
+    "carrier phase": ({"add_carrier_phase": "yes"}, "add_carrier_phase is 'yes'; give true or false"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_PARAMS)
+def test_wrong_parameters_are_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    folder = scenario(tmp_path)
+    given, message = WRONG_PARAMS[case]
+    (folder / CHANNEL_PARAMS).write_text(json.dumps(given))
+    assert refusal(load, folder, message).startswith(str(folder / CHANNEL_PARAMS))
+
+
+def test_scenario_before_version_4_and_users_who_differ_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "params.mat").write_bytes(b"")
+    assert "before version 4" in refusal(load, tmp_path / "old", "fetch it in version 4")
+    folder = scenario(tmp_path, stations=2)
+    np.savez(folder / "rx_pos_t000_tx001_r001.npz", rx_pos=np.ones((10, 3)))
+    (folder / CHANNEL_PARAMS).write_text("base_stations: all")
+    refusal(load, folder, "users of base station 1 are at other positions than those of 0; choose one")
+
+
+def test_command_summarises_and_trains_on_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = scenario(tmp_path, stations=2, users=(60,))
+    refused(["data", "info", folder], r"2 base stations, 0 to 1; choose in channel_params\.yml", capsys)
+    (folder / CHANNEL_PARAMS).write_text("base_stations: all\nofdm: {bandwidth: 10e6, selected_subcarriers: [0, 256]}")
+    status, out, err = call(["data", "info", folder, "--json"], capsys)
+    assert (status, err) == (0, "")
+    found = json.loads(out)
+    assert (found["task"], found["rows"], found["observation"]) == ("csi", 60, [2])
+    assert found["receivers"] == {"bs0": 59, "bs1": 59}
+    np.testing.assert_allclose(found["frequencies_hz"], [CARRIER_HZ, CARRIER_HZ + 5e6])
+    status, out, err = call(["train", folder, "--model", "kriging", "--out", tmp_path / "run", "--json"], capsys)
+    assert status == 0, err
+    metrics = json.loads(out)
+    assert (metrics["task"], metrics["n_test"]) == ("csi", 12)
+    assert set(metrics["receivers"]) == {"bs0", "bs1"}
+    assert np.isfinite(metrics["cea_db"]["median"])
+    status, out, err = call(["evaluate", tmp_path / "run", "--json"], capsys)
+    assert (status, err) == (0, "")
+    assert json.loads(out)["cea_db"] == metrics["cea_db"]

@@ -1,0 +1,178 @@
+"""Traced paths as scenarios of DeepMIMO: read back by this package and by deepmimo itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused
+from made_scenarios import package_channels, package_dataset
+from scipy.constants import speed_of_light
+from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room
+
+from wrf_mi.core import InputError, Paths
+from wrf_mi.datasets import load, read_deepmimo
+from wrf_mi.receivers.channel import csi
+from wrf_mi.scene.make import make_scene
+from wrf_mi.tracing import TraceOptions, TraceResult, load_trace, trace_paths, write_deepmimo
+
+OFDM = {"bandwidth": 20e6, "subcarriers": 64, "selected_subcarriers": [0, 21, 42, 63]}
+FREQUENCIES_HZ = FREQUENCY_HZ + np.array(OFDM["selected_subcarriers"]) * 20e6 / 64
+SINGLE = 1e-6
+"""Relative to the sum of a user's amplitudes: phases are stored in float32, to 1.3e-7 rad, powers to 4e-6 dB."""
+PACKAGE = 5e-6
+"""Likewise for the package, which computes in float32 from there."""
+ANGLE_DEG = 2e-5
+"""Spacing of float32 at 180."""
+DELAY = 1e-7
+"""Relative spacing of float32."""
+CODES = {1: "1", 2: "3", 4: "4", 8: "2"}
+
+
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory: pytest.TempPathFactory) -> TraceResult:
+    """All kinds of path from five users to two base stations."""
+    options = TraceOptions(transmission=True, diffraction=True, scattering=True, max_depth=3, rays=1 << 9)
+    stations = [receiver(p, f"roof{k}") for k, p in enumerate(inside(2, 2))]
+    found = trace_paths(room(tmp_path_factory.mktemp("room"), {**SHOEBOX, **PARTITION}), inside(5), stations, options)
+    assert set(np.unique(found.paths.interactions)) == {0, 1, 2, 4, 8}
+    return found
+
+
+@pytest.fixture(scope="module")
+def scenario(traced: TraceResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_deepmimo(tmp_path_factory.mktemp("scenarios") / "shoebox", traced)
+
+
+def ordered(paths: Paths, user: int, station: int) -> np.ndarray:
+    """Paths of a pair as they are written: the line of sight, then by falling power."""
+    of = np.flatnonzero((paths.tx == user) & (paths.rx == station) & (paths.gain != 0))
+    return of[np.lexsort((-np.abs(paths.gain[of]), paths.bounces[of] > 0))]
+
+
+def amplitudes(paths: Paths) -> np.ndarray:
+    """Sum of the amplitudes of all paths of each pair [n_rx, n_tx, 1]."""
+    total = np.zeros((paths.n_rx, paths.n_tx))
+    np.add.at(total, (paths.rx, paths.tx), np.abs(paths.gain))
+    return total[..., None]
+
+
+def test_channels_read_back_are_those_of_the_paths(traced: TraceResult, scenario: Path) -> None:
+    record = read_deepmimo(scenario, params={"base_stations": "all", "ofdm": OFDM})
+    error = np.abs(record.observation - csi(traced.paths, FREQUENCIES_HZ)) / amplitudes(traced.paths)
+    assert error.max() < SINGLE
+    np.testing.assert_allclose(record.tx_pos_m, traced.tx_pos_m, rtol=DELAY)
+    np.testing.assert_allclose(record.frequencies_hz, FREQUENCIES_HZ)
+    for read, station in zip(record.receivers, traced.receivers, strict=True):
+        np.testing.assert_allclose(read.position_m, station.position_m, rtol=DELAY)
+
+
+def test_package_computes_the_channels_of_the_paths(traced: TraceResult, scenario: Path) -> None:
+    most = int(np.bincount(traced.paths.tx + 5 * traced.paths.rx).max())
+    expected, scale = csi(traced.paths, FREQUENCIES_HZ), amplitudes(traced.paths)
+    dataset = package_dataset(scenario, max_paths=most)
+    for station in range(2):
+        channels = package_channels(dataset[station], {"ofdm": OFDM}, num_paths=most)[:, 0]
+        assert (np.abs(channels - expected[station]) / scale[station]).max() < PACKAGE
+
+
+def test_package_reads_angles_delays_interactions_and_positions(traced: TraceResult, scenario: Path) -> None:
+    paths, dataset = traced.paths, package_dataset(scenario, max_paths=10**6)
+    for station in range(2):
+        read = dataset[station]
+        np.testing.assert_allclose(read.tx_pos[0], traced.receivers[station].position_m, rtol=DELAY)
+        np.testing.assert_allclose(read.rx_pos, traced.tx_pos_m, rtol=DELAY)
+        for user in range(5):
+            of = ordered(paths, user, station)
+            assert read.num_paths[user] == len(of)
+            first = np.arange(len(of))
+            np.testing.assert_allclose(read.delay[user, first], paths.length_m[of] / speed_of_light, rtol=DELAY)
+            np.testing.assert_allclose(read.power[user, first], 20 * np.log10(np.abs(paths.gain[of])), rtol=DELAY)
+            for kind, directions in (("aod", paths.arrival[of]), ("aoa", paths.departure[of])):
+                azimuth = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
+                np.testing.assert_allclose(read[f"{kind}_az"][user, first], azimuth, atol=ANGLE_DEG)
+                zenith = np.degrees(np.arccos(directions[:, 2]))
+                np.testing.assert_allclose(read[f"{kind}_el"][user, first], zenith, atol=ANGLE_DEG)
+            for place, path in enumerate(of):
+                kinds = paths.interactions[path, : paths.bounces[path]][::-1]
+                assert int(read.inter[user, place]) == int("".join(CODES[kind] for kind in kinds) or 0)
+                points = paths.vertices_m[path, : paths.bounces[path]][::-1]
+                np.testing.assert_allclose(read.inter_pos[user, place, : len(points)], points, atol=1e-6)
+                assert np.isnan(read.inter_pos[user, place, len(points) :]).all()
+            assert read.los[user] == (0 in paths.bounces[of])
+
+
+def test_users_without_a_path_and_long_chains_of_interactions(traced: TraceResult, tmp_path: Path) -> None:
+    """Twelve interactions need codes of twelve digits; a user whom only other users' paths remain of is NaN."""
+    paths = traced.paths.select(traced.paths.tx != 3)
+    depth = 12
+    wide = replace(
+        paths,
+        interactions=np.full((len(paths), depth), 4, np.uint8),
+        vertices_m=np.ones((len(paths), depth, 3)),
+        objects=np.zeros((len(paths), depth), np.int32),
+    )
+    folder = write_deepmimo(tmp_path / "deep", replace(traced, paths=wide), max_paths=2)
+    record = read_deepmimo(folder, params={"base_stations": [0]})
+    np.testing.assert_array_equal(np.isnan(record.observation[0, :, 0]), np.arange(5) == 3)
+    with np.load(folder / "inter_t000_tx000_r001.npz") as stored:
+        codes = stored["inter"]
+    assert codes.shape == (5, 2)
+    assert (codes[np.isfinite(codes)] == 444444444444).all()
+
+
+def test_largest_number_of_paths_keeps_the_first_ones(
+    traced: TraceResult, scenario: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    few = write_deepmimo(tmp_path / "few", traced, max_paths=4)
+    assert not caplog.records
+    file = "power_t000_tx001_r001.npz"
+    with np.load(few / file) as first, np.load(scenario / file) as every:
+        np.testing.assert_array_equal(first["power"], every["power"][:, :4])
+    write_deepmimo(tmp_path / "few", traced, replace=True)
+    (warning,) = caplog.records
+    assert "of which DeepMIMO uses 25 by default; load with max_paths=" in warning.getMessage()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "options", "message"),
+    [
+        ("Street", {}, {}, "'Street' as name of a scenario, which deepmimo.load turns into lower case; choose small"),
+        ("a:b", {}, {}, "choose small letters"),
+        ("there", {}, {}, "exists; remove it or choose another folder"),
+        ("none", {"paths": None}, {}, "no path from 5 users to 2 base stations"),
+        ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, {}, "several carriers"),
+        ("zero", {}, {"max_paths": 0}, "max_paths 0; give 1 or more"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(
+    traced: TraceResult, tmp_path: Path, name: str, changes: dict[str, Any], options: dict[str, Any], message: str
+) -> None:
+    (tmp_path / "there").mkdir()
+    if "paths" in changes:
+        changes = {"paths": traced.paths.select(np.zeros(len(traced.paths), bool))}
+    with pytest.raises(InputError, match=message) as error:
+        write_deepmimo(tmp_path / name, replace(traced, **changes), **options)
+    assert "\n" not in str(error.value)
+    assert {path.name for path in tmp_path.iterdir()} == {"there"}
+
+
+def test_command_writes_the_traced_paths(flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7).folder
+    asked = ["trace", scene, flat_folder, "--depth", "1", "--rays", "1024", "--json"]
+    refused([*asked, "--out", tmp_path / "run", "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
+    calibrated = [*asked, "--out", tmp_path / "run", "--calibrate", "gain", "--deepmimo", tmp_path / "flat"]
+    refused(calibrated, "--calibrate trains paths and stores none; omit it, or --deepmimo", capsys)
+    assert not (tmp_path / "run").exists()
+    status, _, err = call([*asked, "--out", tmp_path / "run", "--deepmimo", tmp_path / "flat"], capsys)
+    assert status == 0, err
+    traced = load_trace(tmp_path / "run" / "paths.npz")
+    record = read_deepmimo(tmp_path / "flat", params={"base_stations": "all"})
+    expected = csi(traced.paths, [traced.frequency_hz])
+    np.testing.assert_allclose(record.observation, expected, atol=SINGLE * np.abs(expected).max())
+    users = json.loads((tmp_path / "flat" / "params.json").read_text())["txrx_sets"]["txrx_set_1"]
+    assert users["num_points"] == len(record) == len(load(flat_folder))

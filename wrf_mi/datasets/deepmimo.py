@@ -1,0 +1,279 @@
+"""The layout of DeepMIMO 4: ray-traced paths between base stations and users; ``docs/data.md`` has the files.
+
+Sources: DeepMIMO, Alkhateeb, "DeepMIMO: A generic deep learning dataset for millimeter wave and massive MIMO
+applications", ITA 2019; format and channel: https://github.com/DeepMIMO/DeepMIMO, version 4.0.5, its
+``datasets/load.py``, ``consts.py`` and ``generator/channel.py``. That package is not needed here.
+
+Channel of subcarrier k at element m, over the paths of power P (dBW for 0 dBW sent), phase phi, delay tau and
+direction of departure u in the base station's frame::
+
+    h[m, k] = sum sqrt(10^(P / 10)) exp(j phi) exp(+j k0 p_m . u) exp(-j 2 pi k bandwidth / N tau)
+
+which is DeepMIMO's times sqrt(N): DeepMIMO divides the sent power among all N subcarriers. By reciprocity it is the
+coefficient from the user to the base station, as in the other layouts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from ..core import InputError, Receiver, Record
+from ..core.angles import FloatArray, unit_vectors
+from ..core.antenna import DEVICE_TO_ARRAY
+from ..core.files import readable, stored_arrays, text_lines
+from ..core.types import IntArray
+from .deepmimo_params import ALL, BASE_STATIONS, CHANNEL_PARAMS, ChannelParams, channel_params
+from .folder_files import data_folder, numbers_of, read_official, read_yaml, shown
+
+PARAMS = "params.json"
+OLD_PARAMS = "params.mat"
+"""File of scenarios before version 4."""
+VERSION = "4.0.5"
+"""Version of the package whose format is described here; scenarios of all versions 4 are read."""
+SUFFIXES = (".mat", ".npz", ".npy")
+"""Formats of a matrix, in the order in which the package tries them."""
+PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
+"""Matrices [users, paths]: dBW, degrees, seconds; azimuths and zenith angles in degrees. NaN: no path."""
+TEST_FRACTION = 0.2
+"""Share of the users with a path in the official test rows."""
+SPLIT_SEED = 0
+VALUES_PER_CHUNK = 1 << 20
+"""Complex values of the largest array in a chunk of users."""
+
+
+@dataclass(frozen=True)
+class _Scenario:
+    """Folder, carrier in Hz, base stations as (set, number in the set), and sets of users."""
+
+    folder: Path
+    carrier_hz: float
+    stations: list[tuple[int, int]]
+    user_sets: list[int]
+
+
+def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str, Any] | None = None) -> Record:
+    """Read and check a scenario of DeepMIMO 4 and compute its channels.
+
+    Args:
+        path: folder of the scenario.
+        name: name of the record; by default that of the folder.
+        params: content of `CHANNEL_PARAMS`, in place of that file: ``base_stations``, ``ofdm``, ``bs_antenna``,
+            ``ue_antenna`` and ``add_carrier_phase``, see ``docs/data.md``.
+
+    Returns:
+        A record with ``task="csi"``: users as transmitters, a receiver for each chosen base station, ``observation``
+        [n_rx, n, subcarriers] for a single antenna or [n_rx, n, antennas, subcarriers]; NaN for users without a path.
+
+    Raises:
+        InputError: anything missing, unreadable or inconsistent, or several base stations without a choice.
+    """
+    folder = data_folder(path, f"a scenario of DeepMIMO, {PARAMS} and its matrices")
+    scenario, file = _read_scenario(folder), folder / CHANNEL_PARAMS
+    if params is None:
+        params = read_yaml(file) if file.exists() else {}
+    chosen = channel_params(file, params)
+    numbers = _choose(scenario, chosen)
+    found = [_of_station(scenario, scenario.stations[number], chosen) for number in numbers]
+    users = found[0][1]
+    for number, (_, others, _) in zip(numbers, found, strict=True):
+        if not np.array_equal(others, users):
+            text = f"users of base station {number} are at other positions than those of {numbers[0]}"
+            raise InputError(f"{folder}: {text}; choose one of them in {CHANNEL_PARAMS}")
+    observation = np.stack([channel for _, _, channel in found])
+    received = np.flatnonzero(np.isfinite(observation).reshape(len(found), len(users), -1).all(axis=2).any(axis=0))
+    if len(received) < 2:
+        text = f"{len(received)} of {len(users)} users have a path to the base stations {numbers}"
+        raise InputError(f"{folder}: {text}; two at least are needed, to train on and to score")
+    array_m = (chosen.elements @ DEVICE_TO_ARRAY.T) * (speed_of_light / scenario.carrier_hz)
+    several = len(array_m) > 1
+    receivers = (
+        Receiver(
+            f"bs{number}", position, chosen.orientation_xyzw, chosen.bs_antenna, array_m=array_m if several else None
+        )
+        for number, (position, _, _) in zip(numbers, found, strict=True)
+    )
+    return Record(
+        name=name or folder.resolve().name,
+        task="csi",
+        tx_pos_m=users,
+        receivers=tuple(receivers),
+        observation=observation if several else observation[:, :, 0],
+        official=read_official(folder, len(users), first=0, source=folder.name) or _draw_split(received),
+        frequencies_hz=scenario.carrier_hz + chosen.offsets_hz,
+        tx_antenna=chosen.ue_antenna,
+        source=str(folder),
+    )
+
+
+def _draw_split(rows: IntArray) -> tuple[IntArray, IntArray]:
+    order = np.random.default_rng(SPLIT_SEED).permutation(rows)
+    n_test = max(1, round(TEST_FRACTION * len(rows)))
+    return np.sort(order[n_test:]), np.sort(order[:n_test])
+
+
+def _read_scenario(folder: Path) -> _Scenario:
+    file = folder / PARAMS
+    if not file.exists() and (folder / OLD_PARAMS).exists():
+        text = f"{folder / OLD_PARAMS}: a scenario before version 4 of DeepMIMO"
+        raise InputError(f"{text}; fetch it in version 4, which has {PARAMS}")
+    lines = text_lines(file)
+    with readable(file, "", "fetch the scenario again"):
+        stated = json.loads("\n".join(lines))
+    stated = stated if isinstance(stated, dict) else {}
+    version = stated.get("version", VERSION)  # the first scenarios of version 4 do not state it
+    if not isinstance(version, str) or version.partition(".")[0] != "4":
+        text = f"version {shown(version)} of DeepMIMO"
+        raise InputError(f"{file}: {text}; give a scenario of version 4, such as {VERSION}")
+    scene, rt_params = (_mapping(file, stated, key) for key in ("scene", "rt_params"))
+    if (scenes := scene.get("num_scenes", 1)) != 1:
+        text = f"dynamic scenario of {shown(scenes)} scenes"
+        raise InputError(f"{file}: {text}; give the folder of one scene, with a {PARAMS} that states num_scenes 1")
+    carrier = numbers_of(rt_params.get("frequency"))
+    if carrier.size != 1 or not 0 < carrier.item() < np.inf:
+        raise InputError(f"{file}: rt_params: frequency is {shown(rt_params.get('frequency'))}; give the carrier in Hz")
+    known = _mapping(file, stated, "txrx_sets")
+    sets = [_mapping(file, known, key) for key in sorted(known, key=str) if str(key).startswith("txrx_set_")]
+    stations = [
+        (_number(file, entry, "id"), index)
+        for entry in sets
+        if entry.get("is_tx")
+        for index in range(_number(file, entry, "num_points"))
+    ]
+    users = [_number(file, entry, "id") for entry in sets if entry.get("is_rx") and not entry.get("is_tx")]
+    for what, found_sets in (("base station (is_tx)", stations), ("set of users (is_rx, not is_tx)", users)):
+        if not found_sets:
+            raise InputError(f"{file}: no {what} in txrx_sets; give a scenario that has one")
+    return _Scenario(folder, float(carrier.item()), stations, users)
+
+
+def _mapping(file: Path, stated: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
+    value = stated.get(key)
+    if not isinstance(value, Mapping):
+        found = "missing" if value is None else shown(value)
+        raise InputError(f"{file}: {key} is {found}; give a scenario of DeepMIMO 4")
+    return value
+
+
+def _number(file: Path, entry: Mapping[Any, Any], key: str) -> int:
+    value = entry.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 30:
+        raise InputError(f"{file}: txrx_sets: {key} is {shown(value)}; give a whole number from 0")
+    return value
+
+
+def _choose(scenario: _Scenario, chosen: ChannelParams) -> list[int]:
+    """Numbers of the chosen base stations."""
+    count, file = len(scenario.stations), scenario.folder / CHANNEL_PARAMS
+    every = list(range(count))
+    if chosen.base_stations is None:
+        if count > 1:
+            text = f"{scenario.folder}: {count} base stations, 0 to {count - 1}"
+            raise InputError(f"{text}; choose in {CHANNEL_PARAMS}, {BASE_STATIONS}: [0] or {BASE_STATIONS}: {ALL}")
+        return every
+    if isinstance(chosen.base_stations, str):
+        return every
+    if beyond := [number for number in chosen.base_stations if number >= count]:
+        raise InputError(f"{file}: base station {beyond[0]} is out of range; the scenario has 0 to {count - 1}")
+    return list(chosen.base_stations)
+
+
+def _of_station(
+    scenario: _Scenario, station: tuple[int, int], chosen: ChannelParams
+) -> tuple[FloatArray, FloatArray, NDArray[np.complex64]]:
+    """Position [3], users [n, 3] and channels [n, m, k] of a base station, over all sets of users."""
+    positions, users, channels = [], [], []
+    for user_set in scenario.user_sets:
+        pair = f"t{station[0]:03}_tx{station[1]:03}_r{user_set:03}"
+        here = _matrix(scenario.folder, "tx_pos", pair)
+        if here.size != 3 or not np.isfinite(here).all():
+            text = f"tx_pos_{pair} has shape {list(here.shape)} or is not finite"
+            raise InputError(f"{scenario.folder}: {text}; it must be x, y, z in metres")
+        there = _matrix(scenario.folder, "rx_pos", pair)
+        if there.ndim != 2 or there.shape[1] != 3 or not np.isfinite(there).all():
+            text = f"rx_pos_{pair} has shape {list(there.shape)} or is not finite"
+            raise InputError(f"{scenario.folder}: {text}; it must be [users, 3] in metres")
+        paths = {key: _matrix(scenario.folder, key, pair) for key in PATH_MATRICES}
+        expected = (len(there), *paths["power"].shape[1:2])
+        for key, values in paths.items():
+            if values.ndim != 2 or values.shape != expected:
+                text = f"{key}_{pair} has shape {list(values.shape)}, expected {list(expected)} as rx_pos and power"
+                raise InputError(f"{scenario.folder}: {text}; fetch the scenario again")
+        positions.append(here.reshape(3).astype(float))
+        users.append(there.astype(float))
+        channels.append(_channels(scenario, pair, paths, chosen))
+    if any(not np.array_equal(position, positions[0]) for position in positions):
+        text = f"base station {station[1]} of set {station[0]} has several positions"
+        raise InputError(f"{scenario.folder}: {text}; fetch the scenario again")
+    return positions[0], np.concatenate(users), np.concatenate(channels)
+
+
+def _matrix(folder: Path, key: str, pair: str) -> NDArray[Any]:
+    """A matrix of a pair of a base station and a set of users, in whichever format it is stored."""
+    from scipy.io import loadmat
+
+    stem = f"{key}_{pair}"
+    file = next((folder / f"{stem}{s}" for s in SUFFIXES if (folder / f"{stem}{s}").exists()), None)
+    if file is None:
+        raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
+    with readable(file, "", "fetch the scenario again"):
+        if file.suffix == ".npy":
+            values = np.load(file, allow_pickle=False)
+        else:
+            values = (loadmat(file) if file.suffix == ".mat" else stored_arrays(file)).get(key)
+    if values is None or values.dtype.kind not in "fiu":
+        found = f"no array {key}" if values is None else f"{key} holds {values.dtype}"
+        raise InputError(f"{file}: {found}; give real numbers by the name {key}")
+    return np.asarray(values)
+
+
+def _channels(
+    scenario: _Scenario, pair: str, paths: Mapping[str, NDArray[Any]], chosen: ChannelParams
+) -> NDArray[np.complex64]:
+    """Channels [n, m, k], NaN for users without a path."""
+    elements, offsets_hz = chosen.elements, chosen.offsets_hz
+    if chosen.add_carrier_phase:
+        offsets_hz = offsets_hz + scenario.carrier_hz
+    n, most = paths["power"].shape
+    channel = np.empty((n, len(elements), len(offsets_hz)), np.complex64)
+    step = max(1, VALUES_PER_CHUNK // max(1, most * max(len(elements), len(offsets_hz))))
+    for start in range(0, n, step):
+        rows = slice(start, start + step)
+        exist = ~np.isnan(paths["power"][rows])
+        power, phase, delay, *angles = (np.where(exist, paths[k][rows], 0.0).astype(float) for k in PATH_MATRICES)
+        _check_delays(scenario, pair, delay, chosen)
+        departure, arrival = (
+            unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
+            for azimuth, zenith in (angles[:2], angles[2:])
+        )
+        departure = departure @ chosen.rotation
+        with np.errstate(over="ignore", invalid="ignore"):
+            gain = exist * 10 ** (power / 20) * np.exp(1j * np.radians(phase))
+            for antenna, directions in ((chosen.bs_antenna, departure), (chosen.ue_antenna, arrival)):
+                gain = gain * np.linalg.norm(antenna.field(directions), axis=-1)
+            at_elements = gain[..., None] * np.exp(2j * np.pi * (departure @ elements.T))
+            waves = np.exp(-2j * np.pi * delay[..., None] * offsets_hz)
+            channel[rows] = np.matmul(at_elements.transpose(0, 2, 1), waves)
+        bad = np.flatnonzero(~np.isfinite(channel[rows]).all(axis=(1, 2)))
+        if len(bad):
+            text = f"user {start + bad[0]} (from 0) of {pair}: power, phase, delay or angle of a path is not finite"
+            raise InputError(f"{scenario.folder}: {text}; correct or remove the path")
+        channel[rows][~exist.any(axis=1)] = np.nan
+    return channel
+
+
+def _check_delays(scenario: _Scenario, pair: str, delay: FloatArray, chosen: ChannelParams) -> None:
+    symbol = chosen.subcarriers / chosen.bandwidth_hz
+    if delay.size and delay.max() >= symbol:
+        # The package would leave such a path out.
+        text = (
+            f"{pair} has a delay of {delay.max():.3g} s, and a symbol of subcarriers / bandwidth lasts {symbol:.3g} s"
+        )
+        raise InputError(f"{scenario.folder}: {text}; give more subcarriers in {CHANNEL_PARAMS}")
