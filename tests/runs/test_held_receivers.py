@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from wrf_mi.core import InputError, Receiver, Record, Split
-from wrf_mi.datasets import write_ble_folder
+from wrf_mi.datasets import make_splits, write_ble_folder
 from wrf_mi.models import MODELS
-from wrf_mi.runs.api import evaluate_run, resume, train
+from wrf_mi.models.held_out import hold_out_folds
+from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.offsets import fit_offsets
@@ -51,18 +52,52 @@ def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: 
     assert pooled["n_test"] == 80
 
 
-def test_what_held_out_receivers_observed_changes_no_fit(law: Record, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["mri", "physics"])
+def test_what_held_out_receivers_observed_changes_no_fit(name: str, law: Record, tmp_path: Path) -> None:
     broken = law.observation.copy()
     broken[3, :40] = 1e6 * np.arange(40)
     runs = [
-        train(record, tmp_path / name, "mri", split="receiver:3")
-        for name, record in (("as-is", law), ("broken", replace(law, observation=broken)))
+        train(record, tmp_path / data, name, split="receiver:3")
+        for data, record in (("as-is", law), ("broken", replace(law, observation=broken)))
     ]
     first, second = (np.load(run.folder / "model.npz") for run in runs)
     for key in first.files:
         if not key.startswith("run/"):
             np.testing.assert_array_equal(first[key], second[key])
     assert runs[0].metrics["reference"] == runs[1].metrics["reference"]
+
+
+def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, tmp_path: Path) -> None:
+    """The model's receivers share a law, and each has an offset of 4 dB a priori: 9 dB lie inside 90 % hardly."""
+    run = train(law, tmp_path / "run", "physics", split="receiver:3")
+    inner, outer = (read_run(r.folder) for r in (train(law, tmp_path / "in", "physics"), run))
+    stds = [np.load(one.path / "predictions.npz")["std"][3] for one in (inner, outer)]
+    assert stds[1].mean() > stds[0].mean() + 1
+    near = train(law, tmp_path / "near", "physics", split="receiver:1").metrics
+    assert near["inside_90"] == 1
+    assert near["abs_error_db"]["median"] < run.metrics["abs_error_db"]["median"]
+
+
+def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path: Path) -> None:
+    """Offsets of the receivers are unlike: a law with an offset of each is as good as one law at a new receiver."""
+    run = train(law, tmp_path / "run", "hybrid", split="receiver:1")
+    assert set(run.metrics["held_out"]) == {"physics-no-mesh", "mri", "hybrid"}
+    assert run.metrics["held_out"]["hybrid"] < 7
+    assert run.metrics["inside_90"] == 1
+    found = read_run(run.folder)
+    again = open_run(run.folder, law).predict(law.tx_pos_m[found.row], "anchor1")
+    np.testing.assert_allclose(again.mean, found.prediction[1], atol=ROUNDING_DB)
+    folds = hold_out_folds(law, make_splits(law, "receiver:1")[0])
+    assert sorted(fold.held_receivers for fold in folds) == [(1, 0), (1, 2), (1, 3)]
+
+
+def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:
+    run = train(law, tmp_path / "run", "mri", split="receiver", intervals=True)
+    # Held-out offsets of -3, 1, 2 and 9 dB: the intervals of three receivers know the fourth's but for 9 dB.
+    assert run.metrics["inside_90"] == pytest.approx(0.75, abs=0.15)
+    two = Split("two", 0, np.arange(40), np.zeros(0, np.int64), np.arange(40, 60), (0, 1, 2))
+    with pytest.raises(InputError, match="one receiver trains; intervals at others need two at least"):
+        train(law, tmp_path / "two", "mri", split=two, intervals=True)
 
 
 def test_a_stopped_run_goes_on_without_the_held_out_receivers(law: Record, tmp_path: Path) -> None:

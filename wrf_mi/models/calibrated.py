@@ -102,6 +102,8 @@ def _folds(entry: Model, problem: Problem, split: Split) -> list[Split]:
     if record.carriers_hz is not None:
         raise InputError(f"{record.name}: rows of several carriers; intervals serve one, so omit --intervals")
     folds = hold_out_folds(record, split) if len(rows) else []
+    if split.held_receivers and not folds:
+        raise InputError(f"{record.name}: one receiver trains; intervals at others need two at least")
     if not folds or not np.isfinite(record.observation[:, rows]).any():
         raise InputError(f"{record.name}: {len(rows)} training rows; intervals need three at least, at two positions")
     return folds

@@ -37,14 +37,18 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
     parts. A fold holds out a cluster, whose rows lie as far from the remaining ones as those of a blocked split, and a
     part, whose rows lie as near as those of a random split. Up to `FEW_ROWS` rows are held out one by one.
 
+    Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds.
+
     Args:
         record: data with known positions.
         split: split whose training and validation rows are divided; the others keep their part. Its seed is that of
             clusters and parts.
 
     Returns:
-        Splits; none for fewer than three rows or fewer than two positions.
+        Splits; none for fewer than three rows, fewer than two positions, or a single trained receiver.
     """
+    if split.held_receivers:
+        return _hold_out_receivers(record, split)
     rows = split.all_train
     n, positions = len(rows), record.tx_pos_m[rows]
     places = len(np.unique(positions, axis=0))
@@ -66,6 +70,24 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
         if out.any() and len(train) + len(validation) >= 2:
             folds.append(Split(f"fold {number}", split.seed, train, validation, rows[out]))
     return folds
+
+
+def _hold_out_receivers(record: Record, split: Split) -> list[Split]:
+    trained = np.setdiff1d(np.arange(len(record.receivers)), split.held_receivers)
+    if len(trained) < 2:
+        return []
+    order = np.random.default_rng([split.seed, 4]).permutation(trained)
+    return [
+        Split(
+            f"fold {number}",
+            split.seed,
+            split.train,
+            split.validation,
+            split.all_train,
+            (*split.held_receivers, *group.tolist()),
+        )
+        for number, group in enumerate(np.array_split(order, min(FOLDS, len(trained))))
+    ]
 
 
 def distance_to_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
@@ -97,10 +119,11 @@ class HeldOut:
         """Held-out rows of folds, or as many of them, drawn with a seed, as `MOST_HELD_OUT` allows."""
         parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
         for number, fold in enumerate(folds):
-            for receiver, seen in enumerate(record.observation):
+            known = record.without(fold.held_receivers)
+            for receiver in fold.held_receivers or range(len(record.receivers)):
                 rows = fold.test
-                rows = rows[np.isfinite(seen[rows]).reshape(len(rows), -1).all(axis=1)]
-                away = distance_to_rows(record, fold.all_train, record.tx_pos_m[rows], receiver)
+                rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
+                away = distance_to_rows(known, fold.all_train, record.tx_pos_m[rows], receiver)
                 parts.append((np.full(len(rows), number), np.full(len(rows), receiver), rows, away))
         every = cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
         most = int(np.clip(MOST_VALUES // int(np.prod(record.observation.shape[2:])), *MOST_HELD_OUT))
@@ -178,7 +201,7 @@ def held_out_predictions(
         if not kept.exists():
             folder.mkdir(parents=True, exist_ok=True)
             inner = labelled(replace(session, folder=folder), f"{name}, fold {number + 1} of {len(folds)}")
-            fitted, _ = fit_model(entry, problem, fold, inner)
+            fitted, _ = fit_model(entry, problem.seen(fold), fold, inner)
             found = [
                 predicted_rows(fitted, record, wanted.row[wanted.receiver == receiver], receiver)
                 for receiver in range(len(record.receivers))

@@ -16,6 +16,7 @@ from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY, carriers_text
 from ..core.files import readable
 from ..core.receivers import receiver_index
+from ..datasets import load_split
 from ..models import Fitted, Inputs, Model, Problem
 from ..models.checks import check_inputs
 from ..models.gaussian.model import FittedField
@@ -185,8 +186,9 @@ class Run:
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
     """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part)
+    seen = problem.seen(load_split(part / SPLIT))
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
-        return config.entry.load(arrays, problem, part), seconds
+        return config.entry.load(arrays, seen, part), seconds
 
 
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:

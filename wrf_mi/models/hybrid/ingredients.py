@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from ...core import InputError, Split
 from .. import MODELS
-from ..checks import check_record
+from ..checks import check_held_receivers, check_record
 from ..model import Model, Problem, default_settings
 
 logger = logging.getLogger(__name__)
@@ -102,6 +102,7 @@ def serving(found: dict[str, tuple[Model, Problem]], split: Split, required: boo
     kept, refusal = {}, None
     for name, (entry, problem) in found.items():
         try:
+            check_held_receivers(problem.record, split, entry, MODELS.values())
             if entry.check is not None:
                 entry.check(problem, [split])
         except InputError as error:

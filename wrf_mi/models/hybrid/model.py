@@ -256,5 +256,6 @@ MODEL = Model(
     scene="optional",
     uplink="optional",
     headings=True,
+    new_receivers=True,
     check=check,
 )

@@ -159,5 +159,6 @@ def physics_model(
         uses_antennas=uses_antennas,
         scene_alone=True,
         headings=True,
+        new_receivers=task == "rssi",
         check=check,
     )
