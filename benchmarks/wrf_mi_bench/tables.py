@@ -59,7 +59,7 @@ def scene_of(part: Part, folder: Path) -> list[str]:
     """Arguments with the scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
         return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
-    if part.scene == "scan":
+    if part.scene == "lidar":
         return ["--scene", str(meshed_scan(part.dataset, folder))]
     if part.scene == "floor":
         load_record(part.dataset)  # made where needed
