@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .checking import check_data
     from .core import BackendError, InputError, Receiver, Record, Split
     from .core.settings import with_settings
     from .datasets import fetch, make_splits
@@ -35,6 +36,7 @@ _HOME = {
     "TraceOptions": "tracing",
     "TrainConfig": "training.config",
     "Trainer": "training.trainer",
+    "check_data": "checking",
     "compare": "runs.compare",
     "evaluate_run": "runs.api",
     "fetch": "datasets",
@@ -60,6 +62,7 @@ __all__ = [
     "TraceOptions",
     "TrainConfig",
     "Trainer",
+    "check_data",
     "compare",
     "evaluate_run",
     "fetch",

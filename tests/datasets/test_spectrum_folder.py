@@ -131,7 +131,11 @@ WRONG = {
     "no poses": (remove("gateway_info.yml"), "gateway_info.yml", "missing"),
     "no positions file": (remove("tx_pos.csv"), "tx_pos.csv", "missing"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
-    "image missing": (remove("spectrum/00007.png"), "00007.png", "11 images for 12 rows of tx_pos.csv, row 7"),
+    "image missing": (
+        remove("spectrum/00007.png"),
+        "00007.png",
+        r"row 7: missing \(11 images for 12 rows",
+    ),
     "image too many": (image("spectrum/00013.png", GREY), "00013.png", "13 images for 12 rows"),
     "image of another size": (image("spectrum/00003.png", GREY[:, :7]), "00003.png", "row 3: 7 x 5 pixels"),
     "image cut short": (cut("spectrum/00004.png"), "00004.png", "row 4: unreadable"),

@@ -8,7 +8,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["wrf_mi.core.receivers", "wrf_mi.runs.api"])
+@pytest.mark.parametrize("name", ["wrf_mi.checking.check", "wrf_mi.core.receivers", "wrf_mi.runs.api"])
 def test_examples_of_docstrings_run(name: str) -> None:
     results = doctest.testmod(importlib.import_module(name))
     assert results.attempted > 0

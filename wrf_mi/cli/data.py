@@ -18,7 +18,7 @@ SHOWN_CARRIERS = 8
 
 def add_parser(commands: Any) -> None:
     """Add ``data`` and its subcommands to the commands."""
-    data = commands.add_parser("data", help="data sets: list, fetch, info").add_subparsers(
+    data = commands.add_parser("data", help="data sets: list, fetch, info, check").add_subparsers(
         required=True, metavar="COMMAND"
     )
     add_command(data, "list", list_command, "list known data sets and their folders")
@@ -26,6 +26,12 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("name", metavar="NAME", help="name of a data set")
     parser = add_command(data, "info", info_command, "read and check a data set, and summarise its content")
     parser.add_argument("dataset", metavar="DATASET", help=DATASET)
+    text = "find every fault of a data set, and data that are likely wrong (docs/data.md)"
+    parser = add_command(data, "check", check_command, text)
+    parser.add_argument("dataset", metavar="DATASET", help=DATASET)
+    parser.add_argument("--strict", action="store_true", help="exit status 1 if there is a suspicion")
+    text = "suspicion that is not reported, see docs/data.md; repeatable"
+    parser.add_argument("--ignore", action="append", default=[], metavar="NAME", help=text)
 
 
 def list_command(a: Arguments) -> int:
@@ -70,6 +76,20 @@ def info_command(a: Arguments) -> int:
     else:
         print(render(found))
     return 0
+
+
+def check_command(a: Arguments) -> int:
+    """Report faults (exit status 2) and suspicions (0, or 1 if asked) of a data set."""
+    from ..checking import check_data
+
+    found = check_data(a.dataset, a.ignore, progress=True)
+    if a.json:
+        print_json(found.as_dict())
+    else:
+        print("\n".join(found.lines()))
+    if not found.ok:
+        return 2
+    return 1 if a.strict and found.suspicions else 0
 
 
 def summary(record: Record) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from .angles import azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
 from .antenna import Antenna, AntennaOptions
-from .errors import BackendError, InputError
+from .errors import BackendError, DataFault, InputError
 from .paths import Paths, load_paths, save_paths
 from .prediction import Prediction
 from .receivers import receiver_arrays, stored_receivers
@@ -12,6 +12,7 @@ __all__ = [
     "Antenna",
     "AntennaOptions",
     "BackendError",
+    "DataFault",
     "InputError",
     "Paths",
     "Prediction",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import DataFault, InputError
 
 
 def one_line(error: object) -> str:
@@ -74,21 +74,21 @@ def text_lines(path: Path) -> list[str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{path}: missing; give a file that exists, or complete its folder") from None
+        raise DataFault(path, "missing; give a file that exists, or complete its folder") from None
     except OSError as error:
-        raise InputError(os_failure(error, path, "cannot be read")) from None
+        raise DataFault(path, os_failure(error, path, "cannot be read").removeprefix(f"{path}: ")) from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read ({one_line(error)}); give a UTF-8 text file") from None
+        raise DataFault(path, f"cannot be read ({one_line(error)}); give a UTF-8 text file") from None
     return text.rstrip().splitlines()
 
 
 @contextmanager
-def readable(path: Path, missing: str, remedy: str) -> Iterator[None]:
+def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[None]:
     """Turn any error of a block that reads a file into one line.
 
     Args:
         path: the file.
-        missing: message for a missing file.
+        missing: error for a missing file, or its message.
         remedy: end of the message for a damaged file.
 
     Raises:
@@ -97,11 +97,11 @@ def readable(path: Path, missing: str, remedy: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise InputError(missing) from None
+        raise (InputError(missing) if isinstance(missing, str) else missing) from None
     except InputError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise InputError(f"{path}: not readable ({one_line(error)}); {remedy}") from None
+        raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
 
 
 def stored_arrays(path: Path) -> dict[str, NDArray[Any]]:

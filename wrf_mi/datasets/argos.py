@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import DataFault, InputError, Receiver, Record
 from ..core.antenna import UPRIGHT
 from ..core.files import one_line
+from .faults import attempt
 from .folder_files import shown, single_file
 
 SUFFIXES = (".hdf5", ".h5")
@@ -87,14 +88,14 @@ def read_argos(
             layout, samples = _open(file, pilots, attributes, frames, cell, start)
             channel = np.concatenate([_estimate(part, layout) for part in samples])
     except FileNotFoundError:
-        raise InputError(f"{file}: missing; give a capture in HDF5") from None
+        raise DataFault(file, "missing; give a capture in HDF5") from None
     except (OSError, RuntimeError) as error:  # what h5py raises on a damaged file
-        raise InputError(f"{file}: not readable as HDF5 ({one_line(error)}); fetch it again") from None
+        raise DataFault(file, f"not readable as HDF5 ({one_line(error)}); fetch it again") from None
     channel = channel.reshape(-1, layout.antennas, 2 * HALF)
     silent = (channel == 0).all(axis=(1, 2))
     if len(channel) - np.count_nonzero(silent) < 2:
         text = f"{len(channel) - np.count_nonzero(silent)} of {len(channel)} samples hold a signal"
-        raise InputError(f"{file}: {text}; two at least are needed, to train on and to score")
+        raise DataFault(file, f"{text}; two at least are needed, to train on and to score")
     channel[silent] = np.nan
     carrier_hz, rate_hz = _number(attributes, "FREQ"), _number(attributes, "RATE")
     frequencies = None
@@ -121,8 +122,8 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
                 return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
             except (KeyError, TypeError, ValueError) as error:  # types and texts that h5py cannot give
                 text = f"an attribute cannot be read ({one_line(error)})"
-                raise InputError(f"{file}: {text}; write it again as a number or as text") from None
-    raise InputError(f"{file}: neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
+                raise DataFault(file, f"{text}; write it again as a number or as text") from None
+    raise DataFault(file, f"neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
 
 
 def _open(
@@ -132,19 +133,19 @@ def _open(
     shape = tuple(int(size) for size in pilots.shape)
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
-        raise InputError(f"{file}: {PILOTS} holds {pilots.dtype} {list(shape)}; whole numbers {need} are read")
+        raise DataFault(file, f"{PILOTS} holds {pilots.dtype} {list(shape)}; whole numbers {need} are read")
     asked = range(shape[0])[frames or slice(None)]
     if not len(asked) or asked.step < 0:
-        raise InputError(f"{file}: frames {frames} select none of {shape[0]}; give a slice that ascends")
+        raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
     find = _sounder if len(shape) == 5 else _argos
     layout = find(file, shape, attributes, start)
     if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
         text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
-        raise InputError(f"{file}: {text}; give start")
+        raise DataFault(file, f"{text}; give start")
     if len(shape) == 5 and cell is None and shape[1] > 1:
-        raise InputError(f"{file}: {shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+        raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
     if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:
-        raise InputError(f"{file}: no cell {cell}; it has 0 to {shape[1] - 1}")
+        raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
 
     def parts() -> Iterator[NDArray[Any]]:
         step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
@@ -161,10 +162,11 @@ def _open(
 
 
 def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
-    users, slot = (_whole(file, attributes, key) for key in ("num_mob_ant", "samples_per_user"))
+    stated = [attempt(_whole, file, attributes, key) for key in ("num_mob_ant", "samples_per_user")]
+    users, slot = (number.value for number in stated)
     if shape[3] != 2 or shape[2] < users * slot:
         text = f"{PILOTS} has shape {list(shape)}, but {users} users have {slot} samples each"
-        raise InputError(f"{file}: {text}; correct num_mob_ant or samples_per_user")
+        raise DataFault(file, f"{text}; correct num_mob_ant or samples_per_user")
     first = ARGOS_START if start is None else start
     starts = tuple(first + k * FFT for k in range(ARGOS_SYMBOLS))
     return _Layout(users, shape[1], slot, starts)
@@ -172,23 +174,30 @@ def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start
 
 def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
     if shape[4] % 2:
-        raise InputError(f"{file}: {PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
+        raise DataFault(file, f"{PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
+    attempt(_check_sequence, file, attributes)
+    keys = ("CP_LEN", "PREFIX_LEN") if start is None else ("CP_LEN",)
+    stated = [attempt(_whole, file, attributes, key) for key in keys]
+    guard, *prefix = (number.value for number in stated)
+    first = guard + prefix[0] if start is None else start
+    room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
+    starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
+    return _Layout(shape[2], shape[3], slot, starts)
+
+
+def _check_sequence(file: Path, attributes: dict[str, Any]) -> None:
+    """Refuse pilots that are not the long training symbol."""
     found = np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))
     word = found[0] if len(found) else ""
     text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
     if not text or not isinstance(word, bytes | str):
         what = "empty" if not text else shown(word)
-        raise InputError(f"{file}: attribute PILOT_SEQ_TYPE is {what}; it must be lts")
+        raise DataFault(file, f"attribute PILOT_SEQ_TYPE is {what}; it must be lts")
     size = _number(attributes, "FFT_SIZE")
     if size not in (None, FFT) or text.lower() != "lts":
         other = f"pilots {text!r} of {size or FFT:g} samples"
-        raise InputError(f"{file}: {other}; the long training symbol (lts) of {FFT} is read")
-    guard = _whole(file, attributes, "CP_LEN")
-    first = _whole(file, attributes, "PREFIX_LEN") + guard if start is None else start
-    room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
-    starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
-    return _Layout(shape[2], shape[3], slot, starts)
+        raise DataFault(file, f"{other}; the long training symbol (lts) of {FFT} is read")
 
 
 def _number(attributes: dict[str, Any], key: str) -> float | None:
@@ -203,7 +212,7 @@ def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
     value = _number(attributes, key)
     if value is None or value < 0 or value != int(value):
         found = f"is {shown(attributes[key])}" if key in attributes else "is missing"
-        raise InputError(f"{file}: attribute {key} {found}; it must state the layout of {PILOTS}")
+        raise DataFault(file, f"attribute {key} {found}; it must state the layout of {PILOTS}")
     return int(value)
 
 

@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Antenna, InputError, Receiver, Record
+from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line
 from ..core.types import IntArray
+from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
+    ANTENNA_WORDS,
     TX_ANTENNA_WORDS,
     CsvTable,
     carriers_of,
@@ -68,51 +70,41 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
     folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
-    anchors = read_csv(folder / ANCHORS)
-    ids, anchors_m = _read_anchors(anchors)
-    tables = [read_csv(folder / file) for file in (TRAINING, TEST)]
-    n_train, n_test = (len(table.rows) for table in tables)
-    height = _in_both("z", tables)
+    anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
+    ids = attempt(_read_ids, anchors, whole=True)
+    anchors_m = attempt(_positions, anchors, "xyz")
+    rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
+    plane = [attempt(_positions, table, "xy") for table in tables]
+    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY)}
+    strengths = [attempt(_signal_strength, table, ids) for table in tables]
+    noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
+    attempt(_refuse_silent, folder / TRAINING, ids, strengths)
+    stop_at_faults()
+    n_train, n_test = (len(table.value.rows) for table in tables)
+    height = stated["z"].value
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(n_train + n_test, TAG_HEIGHT_M)
-    for table in tables:
-        if FREQUENCY in table.header:
-            carriers_of(table.path, table.numbers(FREQUENCY))
-    carriers = _in_both(FREQUENCY, tables)
-    x, y = (np.concatenate([table.numbers(axis) for table in tables]) for axis in "xy")
-    strengths = [_signal_strength(table, ids) for table in tables]
-    strength, counts, std = (
-        np.concatenate(strengths, axis=1),
-        *(_of_anchors(kind, tables, ids, strengths) for kind in (COUNT, STD)),
-    )
-    silent = np.flatnonzero(np.isnan(strength).all(axis=1))
-    if len(silent):
-        text = f"{RSSI}{ids[silent[0]]} is empty in every row, in {TEST} too"
-        raise InputError(f"{folder / TRAINING}: {text}; remove the anchor and its columns")
-    tx_antennas = _antennas(anchors, TX)
-    for row, antenna in enumerate(tx_antennas, start=1):
-        if antenna != tx_antennas[0]:
-            text = f"row {row}: {TX}pattern or {TX}polarization differs from row 1"
-            raise InputError(f"{anchors.path}: {text}; there is one transmitter: state the same in every row")
+    counts = noise[COUNT].value
     record = Record(
         name=name or folder.resolve().name,
         task="rssi",
-        tx_pos_m=np.stack([x, y, height], axis=-1),
+        tx_pos_m=np.column_stack([np.concatenate([part.value for part in plane]), height]),
         receivers=tuple(
             Receiver(_name(anchor), position, np.array(UPRIGHT), antenna)
-            for anchor, position, antenna in zip(ids, anchors_m, _antennas(anchors, ""), strict=True)
+            for anchor, position, antenna in zip(ids.value, anchors_m.value, rx_antennas.value, strict=True)
         ),
-        observation=strength,
+        observation=np.concatenate([part.value for part in strengths], axis=1),
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
-        tx_heading_rad=_in_both("heading", tables),
-        tx_antenna=tx_antennas[0],
+        tx_heading_rad=stated["heading"].value,
+        tx_antenna=tx_antenna.value,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
-        std=std,
+        std=noise[STD].value,
         source=str(folder),
     )
-    return record if carriers is None else record.at_carriers(carriers)
+    carriers_hz = stated[FREQUENCY].value
+    return record if carriers_hz is None else record.at_carriers(carriers_hz)
 
 
 def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
@@ -189,29 +181,60 @@ def _write_csv(path: Path, columns: dict[str, Any]) -> None:
             out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
 
 
-def _read_anchors(table: CsvTable) -> tuple[list[str], FloatArray]:
-    """Ids and positions [anchors, 3]."""
+def _read_ids(table: CsvTable) -> list[str]:
+    """Ids of the anchors in normal form."""
     if unused := [column for column in table.header if column not in COLUMNS]:
         known = ", ".join(COLUMNS)
         logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         found = _id(text)
-        if wrong := _wrong_id(found, ids):
+        wrong = None if row - 1 in table.damaged else _wrong_id(found, ids)
+        if wrong:
             remedy = "give each anchor a number or name that no other has"
-            raise InputError(f"{table.path}: row {row}: id {shown(text)} {wrong}; {remedy}")
+            refuse(DataFault(table.path, f"id {shown(text)} {wrong}; {remedy}", row=row))
         ids.append(found)
-    return ids, np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
+    if table.damaged:
+        stop_at_faults()  # an anchor without id
+    return ids
+
+
+def _positions(table: CsvTable, axes: str) -> FloatArray:
+    """Coordinates [rows, axes] in metres."""
+    columns = [attempt(table.numbers, axis) for axis in axes]
+    return np.stack([column.value for column in columns], axis=-1)
+
+
+def _tx_antenna(anchors: CsvTable) -> Antenna:
+    """The transmitter's antenna, which every row of the anchors states."""
+    first, *others = _antennas(anchors, TX)
+    for row, antenna in enumerate(others, start=2):
+        if antenna != first:
+            text = f"{TX}pattern or {TX}polarization differs from row 1"
+            remedy = "there is one transmitter: state the same in every row"
+            refuse(DataFault(anchors.path, f"{text}; {remedy}", row=row))
+    return first
+
+
+def _refuse_silent(path: Path, ids: list[str], strengths: list[NDArray[np.float32]]) -> None:
+    """Refuse anchors that received nothing."""
+    silent = np.isnan(np.concatenate(strengths, axis=1)).all(axis=1)
+    for anchor in np.flatnonzero(silent):
+        text = f"{RSSI}{ids[anchor]} is empty in every row, in {TEST} too; remove the anchor and its columns"
+        refuse(DataFault(path, text))
 
 
 def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
     """The antenna of each row; an empty field or a missing column is the default."""
     stated = {key: table.texts(prefix + key) for key in TX_ANTENNA_WORDS if prefix + key in table.header}
-    entries = [{key: texts[row].strip() for key, texts in stated.items()} for row in range(len(table.rows))]
-    return [
-        read_antenna(table.path, f"row {row}: {prefix}antenna", {key: text for key, text in entry.items() if text})
+    entries = [
+        {key: text for key, texts in stated.items() if (text := texts[row].strip())} for row in range(len(table.rows))
+    ]
+    found = [
+        attempt(read_antenna, table.path, f"{prefix}antenna", entry, ANTENNA_WORDS, row)
         for row, entry in enumerate(entries, start=1)
     ]
+    return [antenna.value for antenna in found]
 
 
 def _id(text: str) -> str:
@@ -248,9 +271,13 @@ def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
         return None
     for table in tables:
         if table not in having:
-            text = f"line 1: no column {column}, but {having[0].path.name} has one"
-            raise InputError(f"{table.path}: {text}; give it in both files or in neither")
-    return np.concatenate([table.numbers(column) for table in tables])
+            text = f"no column {column}, but {having[0].path.name} has one; give it in both files or in neither"
+            refuse(DataFault(table.path, text, line=1))
+    columns = [table.numbers(column) for table in having]
+    if column == FREQUENCY:
+        for table, values in zip(having, columns, strict=True):
+            carriers_of(table.path, values)
+    return np.concatenate(columns)
 
 
 def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
@@ -260,8 +287,8 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
         if column.startswith(prefix):
             first = found.setdefault(_id(column.removeprefix(prefix)), column)
             if first != column:
-                text = f"line 1: {first} and {column} name one anchor"
-                raise InputError(f"{table.path}: {text}; remove one of them")
+                text = f"{first} and {column} name one anchor; remove one of them"
+                refuse(DataFault(table.path, text, line=1))
     return found
 
 
@@ -274,27 +301,37 @@ def _of_anchors(
     found = [_by_anchor(prefix, table) for table in tables]
     if not any(anchor in columns for columns in found for anchor in ids):
         return None
-    counts, parts = prefix == COUNT, []
+    parts = []
     for table, columns, strength in zip(tables, found, strengths, strict=True):
         if lacking := [anchor for anchor in ids if anchor not in columns]:
-            text = f"line 1: no column {prefix}{lacking[0]}"
-            raise InputError(f"{table.path}: {text}; give one for every anchor in both files, or none")
-        values = np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids])
-        if counts:
-            values[values == 0] = np.nan
-        good = values > 0 if not counts else (values > 0) & (values == np.floor(values)) & (values <= MOST_READINGS)
-        wrong = np.argwhere(np.where(np.isnan(strength), ~np.isnan(values), ~good).T)
-        if len(wrong):
-            row, anchor = wrong[0]
-            what = f"{columns[ids[anchor]]} is {shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
-            if np.isnan(strength[anchor, row]):
-                remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
-            else:
-                remedy = "give the number of readings, 1 to a million" if counts else "give the noise in dB, above 0"
-                remedy = f"where {RSSI}{ids[anchor]} is known; {remedy}"
-            raise InputError(f"{table.path}: row {row + 1}: {what}, {remedy}")
-        parts.append(values)
+            text = f"no column {prefix}{lacking[0]}; give one for every anchor in both files, or none"
+            refuse(DataFault(table.path, text, line=1))
+        else:
+            parts.append(_noise(prefix, table, columns, ids, strength))
+    if len(parts) < len(tables):
+        stop_at_faults()
     return np.concatenate(parts, axis=1)
+
+
+def _noise(
+    prefix: str, table: CsvTable, columns: dict[str, str], ids: list[str], strength: NDArray[np.float32]
+) -> FloatArray:
+    """Numbers of readings or standard deviations [anchors, rows] of one table."""
+    counts = prefix == COUNT
+    values = np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids])
+    if counts:
+        values[values == 0] = np.nan
+    good = values > 0 if not counts else (values > 0) & (values == np.floor(values)) & (values <= MOST_READINGS)
+    read = ~(np.isinf(values) | np.isinf(strength))  # the others are refused already
+    for row, anchor in np.argwhere((np.where(np.isnan(strength), ~np.isnan(values), ~good) & read).T):
+        what = f"{columns[ids[anchor]]} is {shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
+        if np.isnan(strength[anchor, row]):
+            remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
+        else:
+            remedy = "give the number of readings, 1 to a million" if counts else "give the noise in dB, above 0"
+            remedy = f"where {RSSI}{ids[anchor]} is known; {remedy}"
+        refuse(DataFault(table.path, f"{what}, {remedy}", row=int(row) + 1))
+    return values
 
 
 def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
@@ -304,5 +341,5 @@ def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
     if unknown or lacking:
         text = f"{len(columns)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
-        raise InputError(f"{table.path}: {text} ({which}); give one column per anchor, named by its id")
+        raise DataFault(table.path, f"{text} ({which}); give one column per anchor, named by its id")
     return np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids]).astype(np.float32)

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..core import Antenna, InputError, Record
+from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines
 from ..core.types import IntArray
+from .faults import attempt, recoverable, refuse
 
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"
@@ -50,7 +51,7 @@ def data_folder(path: str | Path, content: str) -> Path:
     """The path of a folder; an `InputError` that ends with ``content`` if it is none."""
     folder = Path(path)
     if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give one that holds {content}")
+        raise DataFault(folder, f"not a folder; give one that holds {content}")
     return folder
 
 
@@ -61,7 +62,7 @@ def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
     found = sorted(file for file in path.iterdir() if file.suffix in suffixes)
     if len(found) != 1:
         names = ", ".join(file.name for file in found) or "none"
-        raise InputError(f"{path}: {what} is read at a time, found {names}; give the file itself")
+        raise DataFault(path, f"{what} is read at a time, found {names}; give the file itself")
     return found[0]
 
 
@@ -75,7 +76,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     try:
         content = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: not YAML ({one_line(error)}); correct it") from None
+        raise DataFault(path, f"not YAML ({one_line(error)}); correct it") from None
     return content if isinstance(content, dict) else {}
 
 
@@ -83,7 +84,7 @@ def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArr
     """A list of finite numbers from YAML, shape [count]; an `InputError` for anything else."""
     values = numbers_of(value)
     if values.shape != (count,) or not fits_single(values):
-        raise InputError(f"{path}: {one_line(what)} is {shown(value)}; give a list of {count} finite numbers")
+        raise DataFault(path, f"{one_line(what)} is {shown(value)}; give a list of {count} finite numbers")
     return values
 
 
@@ -112,21 +113,23 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
     norm = float(np.linalg.norm(orientation))
     if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
         text = f"{one_line(name)}: quaternion of norm {norm:.4g}"
-        raise InputError(f"{path}: {text}; orientation must be a unit x, y, z, w")
+        raise DataFault(path, f"{text}; orientation must be a unit x, y, z, w")
     return orientation
 
 
-def read_antenna(path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS) -> Antenna:
+def read_antenna(
+    path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS, row: int | None = None
+) -> Antenna:
     """An antenna from YAML: a mapping with some of ``words``, or None for the default; else an `InputError`."""
     if value is None:
         return ANTENNA
     if not isinstance(value, dict) or not set(value) <= set(words):
-        raise InputError(f"{path}: {one_line(name)} is {shown(value)}; give some of {', '.join(words)}")
+        raise DataFault(path, f"{one_line(name)} is {shown(value)}; give some of {', '.join(words)}", row=row)
     try:
         return Antenna(**value)
     except InputError as error:
         text = str(error).removeprefix("antenna: ")
-        raise InputError(f"{path}: {one_line(name)}: {text}") from None
+        raise DataFault(path, f"{one_line(name)}: {text}", row=row) from None
 
 
 def antenna_entry(antenna: Antenna) -> dict[str, str]:
@@ -136,16 +139,22 @@ def antenna_entry(antenna: Antenna) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file: names of the columns, and the text of each field, a list per row."""
+    """A CSV file: names of the columns, and the text of each field, a list per row.
+
+    Rows in ``damaged``, from 0, have more or fewer fields than the header. They are there only while faults are
+    collected (`wrf_mi.datasets.faults`).
+    """
 
     path: Path
     header: list[str]
     rows: list[list[str]]
+    damaged: frozenset[int] = frozenset()
 
     def numbers(self, column: str, may_be_empty: bool = False, index: int | None = None) -> FloatArray:
         """Numbers of a column, shape [rows]; an empty field or ``nan`` is NaN if it is allowed.
 
-        With an ``index`` the column is found by it, and ``column`` is its name in messages.
+        With an ``index`` the column is found by it, and ``column`` is its name in messages. While faults are collected,
+        damaged rows and fields that are not numbers are infinite.
 
         Raises:
             InputError: no such column, or a field that is not a finite number, in single precision too.
@@ -153,6 +162,9 @@ class CsvTable:
         index = self._index(column) if index is None else index
         values = np.full(len(self.rows), np.nan)
         for row, fields in enumerate(self.rows):
+            if row in self.damaged:
+                values[row] = np.inf
+                continue
             text = fields[index].strip()
             if may_be_empty and text.lower() in ("", "nan"):
                 continue
@@ -163,19 +175,20 @@ class CsvTable:
             if not abs(values[row]) <= SINGLE_MAX:
                 remedy = "give a finite number" + (" of single precision" if np.isfinite(values[row]) else "")
                 remedy += ", or leave it empty" if may_be_empty else ""
-                raise InputError(f"{self.path}: row {row + 1}: {one_line(column)} is {text[:40]!r}; {remedy}")
+                refuse(DataFault(self.path, f"{one_line(column)} is {text[:40]!r}; {remedy}", row=row + 1))
+                values[row] = np.inf
         return values
 
     def texts(self, column: str) -> list[str]:
-        """Fields of a column as text."""
+        """Fields of a column as text, empty in damaged rows."""
         index = self._index(column)
-        return [fields[index] for fields in self.rows]
+        return ["" if row in self.damaged else fields[index] for row, fields in enumerate(self.rows)]
 
     def _index(self, column: str) -> int:
         if self.header.count(column) != 1:
             what = "has no column" if column not in self.header else "has twice the column"
-            text = f"line 1: header {','.join(self.header)[:60]!r} {what} {column}"
-            raise InputError(f"{self.path}: {text}; the first line must name each column once")
+            text = f"header {','.join(self.header)[:60]!r} {what} {column}; the first line must name each column once"
+            raise DataFault(self.path, text, line=1)
         return self.header.index(column)
 
 
@@ -189,18 +202,20 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     """
     lines = [line for line in text_lines(path) if line.strip() or not skip_blank]
     if not lines:
-        raise InputError(f"{path}: empty; give a header and one row per measurement")
+        raise DataFault(path, "empty; give a header and one row per measurement")
     try:
         header, *rows = csv.reader(lines, strict=True)
     except csv.Error as error:
-        raise InputError(f"{path}: not a CSV file ({one_line(error)}); correct it") from None
+        raise DataFault(path, f"not a CSV file ({one_line(error)}); correct it") from None
     if not rows:
-        raise InputError(f"{path}: no rows below the header; give one per measurement")
+        raise DataFault(path, "no rows below the header; give one per measurement")
+    damaged = set()
     for row, fields in enumerate(rows, start=1):
         if len(fields) != len(header):
             text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
-            raise InputError(f"{path}: row {row}: {text}; correct or remove the row")
-    return CsvTable(path, [name.strip() for name in header], rows)
+            refuse(DataFault(path, f"{text}; correct or remove the row", row=row))
+            damaged.add(row - 1)
+    return CsvTable(path, [name.strip() for name in header], rows, frozenset(damaged))
 
 
 def read_columns(path: Path, *headers: str) -> FloatArray:
@@ -212,7 +227,7 @@ def read_columns(path: Path, *headers: str) -> FloatArray:
     table = read_csv(path)
     found = ",".join(table.header)
     if found.lower() not in headers:
-        raise InputError(f"{path}: line 1: header is {found[:40]!r}; it must be {' or '.join(headers)}")
+        raise DataFault(path, f"header is {found[:40]!r}; it must be {' or '.join(headers)}", line=1)
     return np.stack([table.numbers(name, index=index) for index, name in enumerate(table.header)], axis=-1)
 
 
@@ -224,9 +239,9 @@ def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
     """Carriers [n] of a file's column `FREQUENCY`; an `InputError` if one is not positive."""
-    if len(bad := np.flatnonzero(~(carriers_hz > 0))):
-        text = f"row {bad[0] + 1}: {FREQUENCY} is {carriers_hz[bad[0]]:g}"
-        raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
+    for row in np.flatnonzero(carriers_hz <= 0):
+        text = f"{FREQUENCY} is {carriers_hz[row]:g}; give the carrier in Hz, such as 920e6"
+        refuse(DataFault(path, text, row=int(row) + 1))
     return carriers_hz
 
 
@@ -234,9 +249,9 @@ def whole_number(path: Path, line: int, text: str) -> int:
     """The whole number from 0 on a line; an `InputError` for anything else."""
     digits = text.strip()
     if not (digits.isascii() and digits.isdecimal()):
-        raise InputError(f"{path}: line {line}: {text.strip()[:40]!r} is not a whole number; correct it")
+        raise DataFault(path, f"{text.strip()[:40]!r} is not a whole number; correct it", line=line)
     if len(digits) > DIGITS:
-        raise InputError(f"{path}: line {line}: {digits[:40]!r} has more than {DIGITS} digits; correct it")
+        raise DataFault(path, f"{digits[:40]!r} has more than {DIGITS} digits; correct it", line=line)
     return int(digits)
 
 
@@ -249,26 +264,28 @@ def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) 
     files = [folder / name for name in INDEX_FILES]
     if not any(file.exists() for file in files):
         return None
-    train, test = (_read_index(path, rows, first, source) for path in files)
-    both = np.intersect1d(train, test)
-    if len(both):
-        text = f"row {both[0] + first} is in {files[0].name} as well"
-        raise InputError(f"{files[1]}: {text}; remove it from one of them")
-    return train, test
+    train, test = (attempt(_read_index, path, rows, first, source) for path in files)
+    for row in np.intersect1d(train.value, test.value):
+        text = f"row {row + first} is in {files[0].name} as well; remove it from one of them"
+        refuse(DataFault(files[1], text))
+    return train.value, test.value
 
 
 def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
     seen: dict[int, int] = {}
-    for line, text in enumerate(text_lines(path), start=1):
-        row = whole_number(path, line, text)
-        if not first <= row < rows + first:
-            known = f"{source} has rows {first} to {rows + first - 1}"
-            raise InputError(f"{path}: line {line}: row {row} is out of range; {known}")
-        if row in seen:
-            raise InputError(f"{path}: line {line}: row {row} stands in line {seen[row]} already; remove one of them")
-        seen[row] = line
-    if not seen:
-        raise InputError(f"{path}: no rows in it; give one row number per line")
+    lines = text_lines(path)
+    for line, text in enumerate(lines, start=1):
+        with recoverable():
+            row = whole_number(path, line, text)
+            if not first <= row < rows + first:
+                known = f"{source} has rows {first} to {rows + first - 1}"
+                raise DataFault(path, f"row {row} is out of range; {known}", line=line)
+            if row in seen:
+                text = f"row {row} stands in line {seen[row]} already; remove one of them"
+                raise DataFault(path, text, line=line)
+            seen[row] = line
+    if not lines:
+        raise DataFault(path, "no rows in it; give one row number per line")
     return np.array(list(seen), np.int64) - first
 
 

@@ -9,12 +9,15 @@ gateways' antennas are not stated: their orientation is the identity.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import DataFault, Receiver, Record
+from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
     CsvTable,
@@ -49,62 +52,84 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
             transmission; one line with the file and the row.
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
-    found = read_yaml(folder / GATEWAYS)
-    if not found:
-        raise InputError(f"{folder / GATEWAYS}: no gateway in it; give one line NAME: [x, y, z] for each, metres")
-    for key in found:
-        if not str(key).isprintable():
-            text = f"gateway {shown(key)} does not go into one line"
-            raise InputError(f"{folder / GATEWAYS}: {text}; call it gateway1, gateway2, ...")
-    gateways = {str(key): finite_numbers(folder / GATEWAYS, f"{key}: position", at, 3) for key, at in found.items()}
-    table = _headed(folder / POSITIONS)
-    if len(table.header) != 3:
-        text = f"header {','.join(table.header)[:40]!r} has {len(table.header)} columns"
-        raise InputError(f"{table.path}: line 1: {text}; give x,y,z in metres")
-    lower = [column.lower() for column in table.header]
-    axes = [lower.index(axis) for axis in "xyz"] if sorted(lower) == ["x", "y", "z"] else [0, 1, 2]
-    positions = np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
-    power = _read_powers(folder / POWERS, list(gateways))
-    rows = len(positions)
-    if power.shape[1] != rows:
-        text = f"{power.shape[1]} rows, but {POSITIONS} has {rows}"
-        raise InputError(f"{folder / POWERS}: {text}; give one row of each per transmission")
-    if rows < FEWEST:
-        raise InputError(f"{folder / POSITIONS}: {rows} row; give {FEWEST} at least, to train on and to score")
+    found = attempt(read_yaml, folder / GATEWAYS)
+    gateways = attempt(_read_gateways, folder / GATEWAYS, found)
+    table = attempt(_headed, folder / POSITIONS)
+    positions = attempt(_read_positions, table)
+    power = attempt(_read_powers, folder / POWERS, found)
+    rows = attempt(_count_rows, table)
+    attempt(_check_rows, folder / POWERS, power, rows)
+    official = attempt(read_official, folder, rows, 0)
+    stop_at_faults()
     return Record(
         name=name or folder.resolve().name,
         task="rssi",
-        tx_pos_m=positions,
-        receivers=tuple(Receiver(gateway, at, np.array(UPRIGHT)) for gateway, at in gateways.items()),
-        observation=power,
-        official=read_official(folder, rows, first=0),
+        tx_pos_m=positions.value,
+        receivers=tuple(Receiver(gateway, at, np.array(UPRIGHT)) for gateway, at in gateways.value.items()),
+        observation=power.value,
+        official=official.value,
         frequencies_hz=np.array([CARRIER_HZ]),
         source=str(folder),
     )
 
 
-def _read_powers(path: Path, gateways: list[str]) -> NDArray[np.float32]:
-    table = _headed(path)
+def _read_gateways(path: Path, found: dict[Any, Any]) -> dict[str, FloatArray]:
+    """Positions [3] of the gateways by their names."""
+    if not found:
+        raise DataFault(path, "no gateway in it; give one line NAME: [x, y, z] for each, metres")
+    for key in found:
+        if not str(key).isprintable():
+            text = f"gateway {shown(key)} does not go into one line; call it gateway1, gateway2, ..."
+            refuse(DataFault(path, text))
+    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in found.items()}
+    return {key: place.value for key, place in places.items()}
+
+
+def _read_positions(table: CsvTable) -> FloatArray:
+    if len(table.header) != 3:
+        text = f"header {','.join(table.header)[:40]!r} has {len(table.header)} columns; give x,y,z in metres"
+        raise DataFault(table.path, text, line=1)
+    lower = [column.lower() for column in table.header]
+    axes = [lower.index(axis) for axis in "xyz"] if sorted(lower) == ["x", "y", "z"] else [0, 1, 2]
+    return np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
+
+
+def _count_rows(table: CsvTable) -> int:
+    rows = len(table.rows)
+    if rows < FEWEST:
+        refuse(DataFault(table.path, f"{rows} row; give {FEWEST} at least, to train on and to score"))
+    return rows
+
+
+def _check_rows(path: Path, power: NDArray[np.float32], rows: int) -> None:
+    """Refuse another number of powers than of positions."""
+    if power.shape[1] != rows:
+        text = f"{power.shape[1]} rows, but {POSITIONS} has {rows}; give one row of each per transmission"
+        raise DataFault(path, text)
+
+
+def _read_powers(path: Path, found: dict[Any, Any]) -> NDArray[np.float32]:
+    """Powers [gateways, rows] in dBm, NaN where nothing was received."""
+    table, gateways = _headed(path), [str(key) for key in found]
     if len(table.header) != len(gateways):
-        text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways"
-        raise InputError(f"{path}: line 1: {text}; give one column per gateway")
+        text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways; give one column per gateway"
+        raise DataFault(path, text, line=1)
     named = set(table.header) & set(gateways)
     if named != set(gateways) and _numbered(table):
         named = set()  # pandas' numbers, though a gateway may have such a name
     if named and named != set(gateways):
         lacking = next(gateway for gateway in gateways if gateway not in named)
-        raise InputError(f"{path}: line 1: no column {lacking}; name all columns as {GATEWAYS} does, or none")
+        text = f"no column {lacking}; name all columns as {GATEWAYS} does, or none"
+        raise DataFault(path, text, line=1)
     if named:
         columns, power = gateways, np.stack([table.numbers(gateway) for gateway in gateways])
     else:
         columns = [f"{column} ({gateway})" for column, gateway in zip(table.header, gateways, strict=True)]
         power = np.stack([table.numbers(f"column {what}", index=index) for index, what in enumerate(columns)])
     power[power == NOT_RECEIVED_DBM] = np.nan
-    silent = np.flatnonzero(np.isnan(power).all(axis=1))
-    if len(silent):
-        what = f"every row is {NOT_RECEIVED_DBM:g}, so gateway {gateways[silent[0]]} received nothing"
-        text = f"column {columns[silent[0]]}: {what}"
-        raise InputError(f"{path}: {text}; remove it here and from {GATEWAYS}")
+    for silent in np.flatnonzero(np.isnan(power).all(axis=1)):
+        what = f"every row is {NOT_RECEIVED_DBM:g}, so gateway {gateways[silent]} received nothing"
+        refuse(DataFault(path, f"column {columns[silent]}: {what}; remove it here and from {GATEWAYS}"))
     return power.astype(np.float32)
 
 
@@ -117,7 +142,8 @@ def _headed(path: Path) -> CsvTable:
         return table
     if _numbered(table):
         return table
-    raise InputError(f"{path}: line 1: {','.join(table.header)[:40]!r} is a row of numbers; put a header above it")
+    text = f"{','.join(table.header)[:40]!r} is a row of numbers; put a header above it"
+    raise DataFault(path, text, line=1)
 
 
 def _numbered(table: CsvTable) -> bool:

@@ -16,10 +16,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.files import atomic_folder, readable
+from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     AXES,
     POSITIONS,
@@ -62,49 +63,32 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         InputError: anything missing, unreadable or inconsistent; one line with the file and the sample.
     """
     folder = data_folder(path, f"{CHANNELS} and {STATION}")
-    channel = _read_channels(folder / CHANNELS)
-    n, antennas, subcarriers = channel.shape
-    if n < FEWEST:
-        raise InputError(f"{folder / CHANNELS}: {n} sample; give {FEWEST} at least, to train on and to score")
-    if subcarriers % 2:
-        text = f"{subcarriers} subcarriers do not halve into uplink and downlink"
-        raise InputError(f"{folder / CHANNELS}: {text}; give as many of each")
-    half = subcarriers // 2
     station = folder / STATION
-    info = read_yaml(station)
-    receiver = _read_station(station, info, antennas)
-    stated = info.get("frequencies_hz") if frequencies_hz is None else frequencies_hz
-    frequencies = None if stated is None else numbers_of(stated)
-    if frequencies is not None:
-        if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
-            raise InputError(f"{station}: frequencies_hz is {shown(stated)}; give a list of frequencies in Hz")
-        if len(frequencies) != subcarriers:
-            text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
-            raise InputError(f"{station}: {text}; give one for each, the uplink's first")
-    positions = np.full((n, 3), np.nan)
-    if (folder / POSITIONS).exists():
-        positions = read_columns(folder / POSITIONS, AXES)
-        if len(positions) != n:
-            text = f"{len(positions)} rows, but {CHANNELS} has {n} samples"
-            raise InputError(f"{folder / POSITIONS}: {text}; give one for each")
-    truth = None
-    if (folder / TRUTH).exists():
-        truth = _read_channels(folder / TRUTH)[None]
-        if truth.shape[1:] != (n, antennas, half):
-            text = f"shape {list(truth.shape[1:])}, expected {[n, antennas, half]}"
-            raise InputError(f"{folder / TRUTH}: {text}, as the downlink of {CHANNELS}; correct it")
+    channel = attempt(_read_channels, folder / CHANNELS)
+    n = attempt(_count_samples, folder / CHANNELS, channel)
+    info = attempt(read_yaml, station)
+    receiver = attempt(_read_station, station, info)
+    attempt(_check_antennas, station, receiver, channel)
+    frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
+    stated = attempt(_read_positions, folder / POSITIONS)
+    positions = attempt(_positions, folder / POSITIONS, stated, n)
+    truth = attempt(_read_truth, folder / TRUTH, channel)
+    official = attempt(read_official, folder, n, 0, CHANNELS)
+    tx_antenna = attempt(_tx_antenna, station, info)
+    stop_at_faults()
+    half, hz = channel.value.shape[2] // 2, frequencies.value
     return Record(
         name=name or folder.resolve().name,
         task="csi",
-        tx_pos_m=positions,
-        receivers=(receiver,),
-        observation=channel[None, :, :, half:],
-        official=read_official(folder, n, first=0, source=CHANNELS),
-        frequencies_hz=None if frequencies is None else frequencies[half:],
-        uplink=channel[:, :, :half],
-        uplink_hz=None if frequencies is None else frequencies[:half],
-        truth=truth,
-        tx_antenna=read_antenna(station, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS),
+        tx_pos_m=positions.value,
+        receivers=(receiver.value,),
+        observation=channel.value[None, :, :, half:],
+        official=official.value,
+        frequencies_hz=None if hz is None else hz[half:],
+        uplink=channel.value[:, :, :half],
+        uplink_hz=None if hz is None else hz[:half],
+        truth=truth.value,
+        tx_antenna=tx_antenna.value,
         source=str(folder),
     )
 
@@ -154,35 +138,97 @@ def write_nerf2_csi(
 
 def _read_channels(path: Path) -> NDArray[np.complex64]:
     """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file, finite in single precision."""
-    missing = f"{path}: missing; give a file that exists, or complete its folder"
+    missing = DataFault(path, "missing; give a file that exists, or complete its folder")
     with readable(path, missing, "write it again with numpy.save"):
         values = np.load(path, allow_pickle=False)
     wanted = "give complex numbers [samples, antennas, subcarriers]"
     if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:
-        raise InputError(f"{path}: shape {list(getattr(values, 'shape', ()))}; {wanted}")
+        raise DataFault(path, f"shape {list(getattr(values, 'shape', ()))}; {wanted}")
     if values.dtype.kind != "c":
-        raise InputError(f"{path}: holds {values.dtype}; {wanted}")
+        raise DataFault(path, f"holds {values.dtype}; {wanted}")
     with np.errstate(over="ignore"):
         single = values.astype(np.complex64)
     bad = ~np.isfinite(single)
-    if bad.any():
-        sample, antenna, subcarrier = (int(k) for k in np.argwhere(bad)[0])
-        where = f"sample {sample}, antenna {antenna}, subcarrier {subcarrier} (from 0)"
+    for sample in np.flatnonzero(bad.any(axis=(1, 2))):
+        antenna, subcarrier = (int(k) for k in np.argwhere(bad[sample])[0])
         value = values[sample, antenna, subcarrier]
-        text = f"{value} is {'too large for single precision' if np.isfinite(value) else 'not finite'}"
-        raise InputError(f"{path}: {where}: {text}; correct or remove the sample")
+        what = "too large for single precision" if np.isfinite(value) else "not finite"
+        place = f"sample {sample}, antenna {antenna}, subcarrier {subcarrier} (from 0)"
+        refuse(DataFault(path, f"{value} is {what}; correct or remove the sample", row=int(sample), place=place))
     return single
 
 
-def _read_station(path: Path, info: dict[Any, Any], antennas: int) -> Receiver:
+def _count_samples(path: Path, channel: NDArray[np.complex64]) -> int:
+    """Number of samples, checked together with the number of subcarriers."""
+    n, _, subcarriers = channel.shape
+    if n < FEWEST:
+        refuse(DataFault(path, f"{n} sample; give {FEWEST} at least, to train on and to score"))
+    if subcarriers % 2:
+        text = f"{subcarriers} subcarriers do not halve into uplink and downlink; give as many of each"
+        refuse(DataFault(path, text))
+    return n
+
+
+def _frequencies(
+    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], given: FloatArray | None
+) -> FloatArray | None:
+    """Frequencies of all subcarriers: those given, or else those of ``base-station.yml``, if any."""
+    stated = info.get("frequencies_hz") if given is None else given
+    if stated is None:
+        return None
+    frequencies, subcarriers = numbers_of(stated), channel.shape[2]
+    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
+        raise DataFault(path, f"frequencies_hz is {shown(stated)}; give a list of frequencies in Hz")
+    if len(frequencies) != subcarriers:
+        text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
+        raise DataFault(path, f"{text}; give one for each, the uplink's first")
+    return frequencies
+
+
+def _read_positions(path: Path) -> FloatArray | None:
+    """Positions [rows, 3], None where there is no file."""
+    return read_columns(path, AXES) if path.exists() else None
+
+
+def _positions(path: Path, stated: FloatArray | None, n: int) -> FloatArray:
+    """Positions [n, 3] of all samples, NaN where they are not stated."""
+    if stated is None:
+        return np.full((n, 3), np.nan)
+    if len(stated) != n:
+        raise DataFault(path, f"{len(stated)} rows, but {CHANNELS} has {n} samples; give one for each")
+    return stated
+
+
+def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.complex64] | None:
+    """The downlink without noise [1, n, antennas, subcarriers / 2], None where there is no file."""
+    if not path.exists():
+        return None
+    truth, shape = _read_channels(path), [*channel.shape[:2], channel.shape[2] // 2]
+    if list(truth.shape) != shape:
+        text = f"shape {list(truth.shape)}, expected {shape}, as the downlink of {CHANNELS}; correct it"
+        raise DataFault(path, text)
+    return truth[None]
+
+
+def _tx_antenna(path: Path, info: dict[Any, Any]) -> Antenna:
+    return read_antenna(path, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS)
+
+
+def _read_station(path: Path, info: dict[Any, Any]) -> Receiver:
     places = info.get("base_station")
     elements = numbers_of(places)
+    orientation = attempt(unit_quaternion, path, "base_station", info.get("orientation", list(UPRIGHT)))
+    antenna = attempt(read_antenna, path, "antenna", info.get("antenna"))
     if elements.ndim != 2 or elements.shape[1] != 3 or not fits_single(elements):
-        raise InputError(f"{path}: base_station is {shown(places)}; give x, y, z in metres of each antenna")
-    if len(elements) != antennas:
-        text = f"{len(elements)} positions in base_station, but {CHANNELS} has {antennas} antennas"
-        raise InputError(f"{path}: {text}; give one for each")
-    orientation = unit_quaternion(path, "base_station", info.get("orientation", list(UPRIGHT)))
-    antenna = read_antenna(path, "antenna", info.get("antenna"))
-    receiver = Receiver("base-station", elements.mean(axis=0), orientation, antenna)
+        raise DataFault(path, f"base_station is {shown(places)}; give x, y, z in metres of each antenna")
+    receiver = Receiver("base-station", elements.mean(axis=0), orientation.value, antenna.value)
     return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
+
+
+def _check_antennas(path: Path, receiver: Receiver, channel: NDArray[np.complex64]) -> None:
+    """Refuse another number of antennas than the channels have."""
+    assert receiver.array_m is not None
+    count, antennas = len(receiver.array_m), channel.shape[1]
+    if count != antennas:
+        text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
+        raise DataFault(path, f"{text}; give one for each")

@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import DataFault, InputError, Receiver, Record
 from ..core.antenna import UPRIGHT
 from ..core.files import one_line, readable, stored_arrays
+from .faults import refuse, stop_at_faults
 from .folder_files import single_file
 
 KEYS = ("tx_pos", "rx_pos", "frequency_hz", "csi", "line_of_sight", "path_offsets", "path_gain", "path_last_point")
@@ -62,7 +63,8 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     n = len(arrays["rx_pos"])
     n_test = int(TEST_FRACTION * n)
     if n_test == 0:
-        raise InputError(f"{file}: rx_pos has {n} rows; the official split holds out every fifth, so give 5 at least")
+        refuse(DataFault(file, f"rx_pos has {n} rows; the official split holds out every fifth, so give 5 at least"))
+    stop_at_faults()
     return Record(
         name=name or file.stem,
         task="csi",
@@ -88,10 +90,10 @@ def arrays_sha256(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 def read_arrays(file: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Some arrays of a room's file; an `InputError` if the file or an array is missing."""
-    with readable(file, f"{file}: missing; give a room's .npz file", "convert or fetch it again"):
+    with readable(file, DataFault(file, "missing; give a room's .npz file"), "convert or fetch it again"):
         arrays = stored_arrays(file)
     if lacking := [key for key in keys if key not in arrays]:
-        raise InputError(f"{file}: no array {lacking[0]}; a room needs {', '.join(keys)}")
+        raise DataFault(file, f"no array {lacking[0]}; a room needs {', '.join(keys)}")
     return {key: arrays[key] for key in keys}
 
 
@@ -101,14 +103,17 @@ def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     for key, values in arrays.items():
         kinds, expected = ("c", "complex numbers") if key == "csi" else ("fiu", "numbers")
         if values.dtype.kind not in kinds:
-            raise InputError(f"{file}: {key} holds {values.dtype}; give {expected}")
-        if values.shape != shapes[key]:
-            raise InputError(f"{file}: {key} has shape {list(values.shape)}, expected {list(shapes[key])}; correct it")
-        bad = np.flatnonzero(~np.isfinite(values).reshape(max(len(np.atleast_1d(values)), 1), -1).all(axis=1))
-        if len(bad):
-            raise InputError(f"{file}: {key}, row {bad[0] + 1}: not finite; correct or remove the row")
-    if not arrays["frequency_hz"] > 0:
-        raise InputError(f"{file}: frequency_hz is {arrays['frequency_hz']}; give the carrier in Hz")
+            refuse(DataFault(file, f"{key} holds {values.dtype}; give {expected}"))
+        elif values.shape != shapes[key]:
+            text = f"{key} has shape {list(values.shape)}, expected {list(shapes[key])}; correct it"
+            refuse(DataFault(file, text))
+        else:
+            finite = np.isfinite(np.atleast_1d(values))
+            for row in 1 + np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim)))):
+                place = f"{key}, row {row}"
+                refuse(DataFault(file, "not finite; correct or remove the row", row=int(row), place=place))
+            if key == "frequency_hz" and values <= 0:
+                refuse(DataFault(file, f"frequency_hz is {values}; give the carrier in Hz"))
 
 
 def convert_newrf(path: Path) -> dict[str, NDArray[Any]]:

@@ -144,19 +144,9 @@ def load(name_or_folder: str | Path) -> Record:
     Raises:
         InputError: the data set is missing (the message says how to get it), or its reader finds an error.
     """
-    path = Path(name_or_folder)
-    if is_data(path):
+    path, dataset = find(name_or_folder)
+    if dataset is None:
         return layout_of(path).read(path, None)
-    if isinstance(name_or_folder, Path) or path.name != name_or_folder:
-        raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
-    dataset = known(name_or_folder)
-    folder = locate(dataset.name)
-    if folder is None:
-        how = f"run `wrf-mi data fetch {dataset.name}`, or set {DATA_VARIABLE} to a folder that holds {dataset.name}/"
-        if dataset.manifest is None:
-            how = f"wrf_mi.synthetic.load_record({dataset.name!r}) traces it"
-        raise InputError(f"data set {dataset.name}: not on this machine; {how}")
-    path = folder / (dataset.file or "")
     record = layout_of(path).read(path, dataset.name)
     if record.folds is None and dataset.folds is not None:
         with as_file(FOLDER / dataset.folds) as folds:
@@ -168,6 +158,27 @@ def load(name_or_folder: str | Path) -> Record:
         receivers = tuple(rx if rx.array_m is not None else replace(rx, array_m=array_m) for rx in record.receivers)
         record = replace(record, receivers=receivers)
     return record
+
+
+def find(name_or_folder: str | Path) -> tuple[Path, DataSet | None]:
+    """The folder or file of a data set, and the known data set that a name means.
+
+    Raises:
+        InputError: it is missing; the message says how to get it.
+    """
+    path = Path(name_or_folder)
+    if is_data(path):
+        return path, None
+    if isinstance(name_or_folder, Path) or path.name != name_or_folder:
+        raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
+    dataset = known(name_or_folder)
+    folder = locate(dataset.name)
+    if folder is None:
+        how = f"run `wrf-mi data fetch {dataset.name}`, or set {DATA_VARIABLE} to a folder that holds {dataset.name}/"
+        if dataset.manifest is None:
+            how = f"wrf_mi.synthetic.load_record({dataset.name!r}) traces it"
+        raise InputError(f"data set {dataset.name}: not on this machine; {how}")
+    return folder / (dataset.file or ""), dataset
 
 
 def stated_task(name_or_folder: str | Path) -> str | None:

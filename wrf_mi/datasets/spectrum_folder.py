@@ -16,11 +16,12 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
 from ..core.types import IntArray
+from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
     TX_ANTENNA_WORDS,
@@ -65,25 +66,30 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """
     folder = data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
-    info = read_yaml(gateways)
-    receivers = _receivers(gateways, info, _array(gateways, info, "array"))
-    positions, carriers = read_positions(folder / POSITIONS)
-    stated = _frequency(gateways, info)
-    if stated is not None and carriers is not None:
-        text = f"line 1: column frequency_hz, but {GATEWAYS} states a carrier too"
-        raise InputError(f"{folder / POSITIONS}: {text}; remove one of them")
-    images, folds = folder / "spectrum", folder / FOLDS
-    image_folders = [images] if len(receivers) == 1 else [images / receiver.name for receiver in receivers]
+    info = attempt(read_yaml, gateways)
+    poses = attempt(_poses, gateways, info, whole=True)
+    array = attempt(_array, gateways, info, "array")
+    receivers = attempt(_receivers, gateways, poses, array)
+    table = attempt(read_positions, folder / POSITIONS)
+    stated = attempt(_frequency, gateways, info)
+    attempt(_one_carrier, folder / POSITIONS, table, stated)
+    rows = attempt(lambda read: len(read[0]), table)
+    observation = attempt(_read_images, folder / "spectrum", poses, rows)
+    official = attempt(read_official, folder, rows, 1)
+    folds = attempt(_folds, folder / FOLDS, rows)
+    tx_antenna = attempt(_tx_antenna, gateways, info)
+    stop_at_faults()
+    positions, carriers = table.value
     record = Record(
         name=name or folder.resolve().name,
         task="spectrum",
         tx_pos_m=positions,
-        receivers=receivers,
-        observation=_read_images(image_folders, len(positions)),
-        official=read_official(folder, len(positions), first=1),
-        folds=parse_folds(folds, len(positions)) if folds.exists() else None,
-        frequencies_hz=stated,
-        tx_antenna=read_antenna(gateways, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS),
+        receivers=receivers.value,
+        observation=observation.value,
+        official=official.value,
+        folds=folds.value,
+        frequencies_hz=stated.value,
+        tx_antenna=tx_antenna.value,
         source=str(folder),
     )
     return record if carriers is None else record.at_carriers(carriers)
@@ -161,15 +167,35 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     Raises:
         InputError: a line that is no number, a wrong number of lines, or folds that are not 0, 1, ... without gaps.
     """
-    folds = np.array([whole_number(path, line, text) for line, text in enumerate(text_lines(path), start=1)], np.int64)
+    lines = text_lines(path)
+    folds = np.full(len(lines), -1)
+    for line, text in enumerate(lines, start=1):
+        with recoverable():
+            folds[line - 1] = whole_number(path, line, text)
     if len(folds) != rows:
-        raise InputError(f"{path}: {len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv")
-    present = np.unique(folds)
+        refuse(DataFault(path, f"{len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv"))
+    present = np.unique(folds[folds >= 0])
     missing = np.flatnonzero(present != np.arange(len(present)))
     if len(missing) or len(present) < 2:
         what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
-        raise InputError(f"{path}: {what}; number the folds 0, 1, ... without gaps, two at least")
+        raise DataFault(path, f"{what}; number the folds 0, 1, ... without gaps, two at least")
     return folds
+
+
+def _folds(path: Path, rows: int) -> IntArray | None:
+    """Folds of the file, None where there is none."""
+    return parse_folds(path, rows) if path.exists() else None
+
+
+def _tx_antenna(path: Path, info: dict[Any, Any]) -> Antenna:
+    return read_antenna(path, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS)
+
+
+def _one_carrier(path: Path, table: tuple[FloatArray, FloatArray | None], stated: FloatArray | None) -> None:
+    """Refuse a carrier for all rows beside one for each row."""
+    if stated is not None and table[1] is not None:
+        text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
+        raise DataFault(path, text, line=1)
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
@@ -185,15 +211,17 @@ def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
                 frequency_hz = float(number)  # YAML reads 920e6 as text
             except (TypeError, ValueError):
                 frequency_hz = np.nan
-            if not 0 < frequency_hz < np.inf:
-                text = f"{one_line(where)} is {shown(value)}"
-                raise InputError(f"{path}: {text}; give the carrier in Hz, such as 920e6")
-            carriers[frequency_hz] = where
+            if 0 < frequency_hz < np.inf:
+                carriers[frequency_hz] = where
+            else:
+                text = f"{one_line(where)} is {shown(value)}; give the carrier in Hz, such as 920e6"
+                refuse(DataFault(path, text))
+                break
     if len(carriers) > 1:
         (a, first), (b, second) = list(carriers.items())[:2]
         text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
         remedy = f"give those of rows in {POSITIONS}, column frequency_hz, or make a folder for each"
-        raise InputError(f"{path}: {text}; {remedy}")
+        raise DataFault(path, f"{text}; {remedy}")
     return np.array(list(carriers)) if carriers else None
 
 
@@ -212,51 +240,68 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        raise InputError(f"{path}: {one_line(name)} is {str(array)[:60]!r}; {remedy}")
+        raise DataFault(path, f"{one_line(name)} is {str(array)[:60]!r}; {remedy}")
     return elements
 
 
-def _receivers(path: Path, info: dict[Any, Any], array_m: FloatArray | None) -> tuple[Receiver, ...]:
-    """Receivers of the file; ``array_m`` is the array of those that state none."""
+def _poses(path: Path, info: dict[Any, Any]) -> dict[str, dict[Any, Any]]:
+    """Entries of the receivers by their names."""
     poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in RESERVED}
     if not poses:
-        raise InputError(f"{path}: no receiver in it; give gateway1 with position and orientation")
-    receivers = []
-    for name, pose in poses.items():
+        raise DataFault(path, "no receiver in it; give gateway1 with position and orientation")
+    for name in poses:
         if not isinstance(name, str) or Path(name).name != name:
-            raise InputError(f"{path}: {name!r} cannot name a folder; call receivers gateway1, gateway2, ...")
-        position = finite_numbers(path, f"{name}: position", pose.get("position"), 3)
-        orientation = unit_quaternion(path, name, pose.get("orientation"))
-        antenna = read_antenna(path, f"{name}: antenna", pose.get("antenna"))
-        elements_m = _array(path, pose, f"{name}: array") if "array" in pose else array_m
-        receivers.append(Receiver(name, position, orientation, antenna, elements_m))
-    return tuple(receivers)
+            refuse(DataFault(path, f"{name!r} cannot name a folder; call receivers gateway1, gateway2, ..."))
+    return poses
 
 
-def _read_images(folders: list[Path], rows: int) -> NDArray[np.float32]:
+def _receivers(path: Path, poses: dict[str, dict[Any, Any]], array_m: FloatArray | None) -> tuple[Receiver, ...]:
+    """Receivers of the entries; ``array_m`` is the array of those that state none."""
+    found = []
+    for name, pose in poses.items():
+        position = attempt(finite_numbers, path, f"{name}: position", pose.get("position"), 3)
+        orientation = attempt(unit_quaternion, path, name, pose.get("orientation"))
+        antenna = attempt(read_antenna, path, f"{name}: antenna", pose.get("antenna"))
+        array = attempt(_array, path, pose, f"{name}: array")
+        with recoverable():
+            own = array.value if "array" in pose else array_m
+            found.append(Receiver(name, position.value, orientation.value, antenna.value, own))
+    return tuple(found)
+
+
+def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> NDArray[np.float32]:
+    """Spectra [receivers, rows, height, width]."""
     names = [f"{row:05d}.png" for row in range(1, rows + 1)]
-    for folder in folders:
-        if not folder.is_dir():
-            text = "images lie in spectrum/, or in spectrum/NAME/ for several receivers"
-            raise InputError(f"{folder}: missing folder; {text}")
-        present = {entry.name for entry in folder.iterdir() if entry.suffix.lower() == ".png"}
-        text = f"{len(present)} images for {rows} rows of tx_pos.csv"
-        if lacking := sorted(set(names) - present):
-            text += f", row {names.index(lacking[0]) + 1} has none"
-            raise InputError(f"{folder / lacking[0]}: missing ({text}); add the image or remove the row")
-        if extra := sorted(present - set(names)):
-            raise InputError(
-                f"{folder / extra[0]}: no row belongs to it ({text}); add its position or remove the image"
-            )
-    height, width = _read_grey(folders[0] / names[0], 1).shape
-    observation = np.empty((len(folders), rows, height, width), np.float32)
-    for receiver, folder in enumerate(folders):
-        for row, name in enumerate(names):
-            grey = _read_grey(folder / name, row + 1)
-            if grey.shape != (height, width):
-                text = f"{grey.shape[1]} x {grey.shape[0]} pixels, but the first image has {width} x {height}"
-                raise InputError(f"{folder / name}: row {row + 1}: {text}; give all images one size")
-            observation[receiver, row] = grey
+    observation: NDArray[np.float32] | None = None
+    for receiver, place in enumerate([folder] if len(poses) == 1 else [folder / name for name in poses]):
+        if not place.is_dir():
+            text = "missing folder; images lie in spectrum/, or in spectrum/NAME/ for several receivers"
+            refuse(DataFault(place, text))
+            continue
+        present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
+        count = f"{len(present)} images for {rows} rows of {POSITIONS}"
+        for row, image in enumerate(names, start=1):
+            if image not in present:
+                text = f"missing ({count}); add the image or remove the row"
+                refuse(DataFault(place / image, text, row=row, file_per_row=True))
+        for image in sorted(present - set(names)):
+            text = f"no row belongs to it ({count}); add its position or remove the image"
+            refuse(DataFault(place / image, text, file_per_row=True))
+        for row, image in enumerate(names, start=1):
+            if image not in present:
+                continue
+            with recoverable():
+                grey = _read_grey(place / image, row)
+                if observation is None:
+                    observation = np.zeros((len(poses), rows, *grey.shape), np.float32)
+                (height, width), first = grey.shape, observation.shape[2:]
+                if grey.shape != first:
+                    text = f"{width} x {height} pixels, but the first image has {first[1]} x {first[0]}"
+                    fault = f"{text}; give all images one size"
+                    raise DataFault(place / image, fault, row=row, file_per_row=True)
+                observation[receiver, row - 1] = grey
+    stop_at_faults()
+    assert observation is not None
     return observation
 
 
@@ -266,7 +311,9 @@ def _read_grey(path: Path, row: int) -> NDArray[np.float32]:
             mode = image.mode
             values = np.asarray(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: row {row}: unreadable ({one_line(error)}); replace the image") from None
+        text = f"unreadable ({one_line(error)}); replace the image"
+        raise DataFault(path, text, row=row, file_per_row=True) from None
     if mode not in GREY_LEVELS:
-        raise InputError(f"{path}: row {row}: image mode {mode}; give a grey PNG of 8 or 16 bits")
+        text = f"image mode {mode}; give a grey PNG of 8 or 16 bits"
+        raise DataFault(path, text, row=row, file_per_row=True)
     return values.astype(np.float32) / np.float32(GREY_LEVELS[mode])

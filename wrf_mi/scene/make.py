@@ -135,7 +135,7 @@ def _surfaces(
         return walls, None, plan if isinstance(plan, PlanGrid) else None
     if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
-    if _has_faces(file):
+    if has_faces(file):
         return planes_of_mesh(read_mesh(file, units)), None, None
     points = read_points(file, units)
     check_extent(points, file)
@@ -161,7 +161,7 @@ def is_plan(path: str | Path) -> bool:
     return False
 
 
-def _has_faces(file: Path) -> bool:
+def has_faces(file: Path) -> bool:
     """Whether a file is a mesh and not a cloud; PLY may be either."""
     from .mesh import SUFFIXES
 

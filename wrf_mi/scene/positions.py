@@ -78,7 +78,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
     walls = [surface for surface in surfaces if surface.kind == "wall"]
     if not walls:
         raise InputError("the scene has no wall that positions could cross; leave out --positions")
-    places = _distinct(positions_m)
+    places = distinct(positions_m)
     lines = shapely.linestrings(_tree(places))
     heights, z_m = np.concatenate([wall.vertices_m[:, 2] for wall in walls]), positions_m[:, 2]
     cut_m = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
@@ -109,7 +109,7 @@ def check_positions(
     Raises:
         InputError: a reflection (`reflections`) fits the positions clearly better, or the positions fit neither.
     """
-    count = len(_distinct(positions_m))
+    count = len(distinct(positions_m))
     crossings, outside = conflicts(positions_m, surfaces)
     others = [(remedy, conflicts(positions_m, those)) for remedy, those in mirrored]
     remedy, best = min(others, key=lambda pair: sum(pair[1]))
@@ -167,7 +167,7 @@ def reflections(
     return found
 
 
-def _distinct(positions_m: FloatArray) -> FloatArray:
+def distinct(positions_m: FloatArray) -> FloatArray:
     """Positions [k, 2] seen from above, the first of each cell."""
     xy = positions_m[:, :2]
     _, first = np.unique(np.floor(xy / CELL_M).astype(np.int64), axis=0, return_index=True)

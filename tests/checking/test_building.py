@@ -1,0 +1,199 @@
+"""Positions against the plan or the mesh beside the data."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from checked_records import channels, strengths
+from made_flat import write_flat
+
+from wrf_mi.checking import building as module
+from wrf_mi.checking import check_data
+from wrf_mi.checking.building import building_file, in_solid, in_wall, inside_solids, read_building
+from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import load, write_ble_folder
+
+HALL_M = [[0, 0], [12, 0], [12, 8], [7, 8], [7, 4.2], [6.8, 4.2], [6.8, 8], [0, 8], [0, 0]]
+"""A hall of 12 x 8 m, and a wall 0.2 m thick that enters it from y = 8 to y = 4.2."""
+
+
+def write_layout(folder: Path, vertices: list[list[float]]) -> None:
+    (folder / "layout.csv").write_text("\n".join(["x,y", *(f"{x},{y}" for x, y in vertices)]))
+
+
+def walked(rows: int = 200) -> np.ndarray:
+    """A walk around the end of the wall."""
+    ways = [[1, 7], [1, 1], [6.5, 1], [10.5, 1], [10.5, 7], [8, 7], [8, 3], [4, 3]]
+    corners = np.array([*ways, [4, 7], [6.5, 7], [6.5, 6], [4, 6], [4, 5], [6.5, 5]], float)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at = np.linspace(0, along[-1], rows)
+    xy = [np.interp(at, along, corners[:, axis]) for axis in (0, 1)]
+    return np.stack([*xy, np.full(rows, 1.3)], axis=-1)
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Record:
+    """A data set in the hall, with `HALL_M` as its layout."""
+    record = strengths(rows=200)
+    record = replace(record, tx_pos_m=walked(), tx_heading_rad=None)
+    folder = write_ble_folder(tmp_path / "hall", record)
+    write_layout(folder, HALL_M)
+    return load(folder)
+
+
+def names(record: Record) -> list[str]:
+    return [one.name for one in check_data(record).suspicions if one.name in ("walls", "inside-solids", "building")]
+
+
+def test_positions_within_the_hall_are_not_suspected(hall: Record) -> None:
+    assert building_file(hall.source) == Path(hall.source, "layout.csv")
+    assert names(hall) == []
+    report = check_data(Path(hall.source))
+    assert report.skipped == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda xyz: [12, 0, 0] + [-1, 1, 1] * xyz, r" if x is mirrored; use x = 12.00 - x, y = y"),
+        (lambda xyz: [0, 8, 0] + [1, -1, 1] * xyz, r" if y is mirrored; use x = x, y = 8.00 - y"),
+        (lambda xyz: [1, -1, 1] * xyz, " if y is mirrored; use x = x, y = -y"),
+        (lambda xyz: xyz[:, [1, 0, 2]], " if x and y are swapped; use x = y, y = x"),
+        (lambda xyz: xyz + np.array([7, 0, 0]), "; give positions and building in one frame"),
+    ],
+)
+def test_positions_in_another_frame_are_suspected(hall: Record, change, what: str) -> None:
+    moved = check_data(replace(hall, tx_pos_m=change(hall.tx_pos_m)), ignore=["plan", "headings"])
+    assert [one.name for one in moved.suspicions] == ["walls"]
+    assert moved.suspicions[0].text.endswith(what)
+    assert "cross walls of layout.csv and " in moved.suspicions[0].text
+
+
+def test_receivers_inside_walls_are_named(hall: Record) -> None:
+    for place, inside in (
+        ([6.9, 6.0, 2.0], True),  # in the middle of the wall
+        ([6.81, 6.0, 2.0], False),  # at its surface
+        ([6.7, 6.0, 2.0], False),
+        ([0.1, 0.1, 2.0], False),  # in a corner
+        ([6.9, 4.1, 2.0], False),  # before the end of the wall
+    ):
+        first = replace(hall.receivers[0], position_m=np.array(place))
+        moved = replace(hall, receivers=(first, *hall.receivers[1:]))
+        found = [one.text for one in check_data(moved).suspicions if one.name == "inside-solids"]
+        assert bool(found) == inside, place
+        for text in found:
+            assert text.startswith("1 of 4 receivers lie inside walls or solids of layout.csv: anchor1;")
+
+
+def test_a_few_transmitters_inside_walls_are_errors_of_position(hall: Record) -> None:
+    rows = replace(hall, tx_pos_m=hall.tx_pos_m.copy())
+    building = read_building(Path(hall.source, "layout.csv"))
+    rows.tx_pos_m[5:8] = [6.9, 5.0, 1.3]
+    ((_, text),) = inside_solids(rows, building)
+    assert text.startswith("3 of 200 transmitters lie inside walls or solids of layout.csv: rows 6, 7, 8;")
+    many = replace(rows, tx_pos_m=np.concatenate([rows.tx_pos_m] + 5 * [hall.tx_pos_m]))
+    assert list(inside_solids(many, building)) == []
+
+
+def test_walls_are_pairs_of_parallel_lines() -> None:
+    """Lines in any direction, as near as a wall is thick."""
+    ends = np.array([[0, 0], [4, 0]], float)
+    for angle in (0.0, 0.7, 2.0):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        for width, expected in ((0.3, True), (0.6, False)):
+            for back in (False, True):
+                other = ends + np.array([0, width])
+                other = other[::-1] if back else other
+                walls = np.stack([ends, other]) @ turn.T
+                places = np.array([[2, width / 2], [2, -width / 2], [-1, width / 2], [2, 0.01]]) @ turn.T
+                assert in_wall(places, walls).tolist() == [expected, False, False, False]
+    assert in_wall(np.zeros((2, 2)), np.empty((0, 2, 2))).tolist() == [False, False]
+
+
+def test_solids_are_those_of_the_solid_angle() -> None:
+    """A box, and a ring whose middle is air."""
+    places = np.random.default_rng(0).uniform(-1, 2, (400, 3))
+    box = np.asarray(trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.4, 2]]).triangles)
+    deep = module.DEEP_M
+    true = ((places >= deep) & (places <= np.array([1, 0.4, 2]) - deep)).all(axis=1)
+    assert true.any()
+    np.testing.assert_array_equal(in_solid(places, box), true)
+    ring = np.asarray(trimesh.creation.annulus(r_min=0.5, r_max=0.8, height=2.0).triangles)
+    radius, height = np.hypot(places[:, 0], places[:, 1]), np.abs(places[:, 2])
+    edge = deep + 0.02  # sides are flat
+    found = in_solid(places, ring)
+    within = (radius > 0.5 + edge) & (radius < 0.8 - edge) & (height < 1 - edge)
+    assert within.any()
+    assert found[within].all()
+    assert not found[(radius < 0.5 - edge) | (radius > 0.8) | (height > 1)].any()
+
+
+def write_room(file: Path) -> None:
+    """A room of 9 x 7 x 3 m with a cupboard."""
+    room = trimesh.creation.box(bounds=[[0, 0, 0], [9, 7, 3]])
+    room.invert()
+    cupboard = trimesh.creation.box(bounds=[[4, 0.1, 0], [5, 0.6, 2]])
+    trimesh.util.concatenate([room, cupboard]).export(file)
+
+
+def test_solids_of_a_mesh(tmp_path: Path) -> None:
+    record = channels()
+    arrays = {"tx_pos": record.receivers[0].position_m, "rx_pos": record.tx_pos_m, "frequency_hz": np.float64(2.4e9)}
+    file = tmp_path / "hall.npz"
+    np.savez(file, csi=record.observation[0, :, 0], **arrays)
+    assert building_file(file) is None
+    write_room(tmp_path / "hall.stl")
+    assert building_file(file) == tmp_path / "hall.stl"
+    assert names(load(file)) == []
+    np.savez(file, csi=record.observation[0, :, 0], **(arrays | {"tx_pos": np.array([4.5, 0.35, 1.0])}))
+    (text,) = [one.text for one in check_data(file).suspicions]
+    assert text.startswith("1 of 1 receivers lie inside walls or solids of hall.stl: access-point; correct")
+
+
+def test_scene_folders_and_single_meshes_are_found(tmp_path: Path) -> None:
+    folder = write_flat(tmp_path / "flat")
+    assert building_file(folder) == folder / "layout.csv"
+    (folder / "layout.csv").unlink()
+    assert building_file(folder) is None
+    trimesh.PointCloud(np.random.default_rng(0).uniform(size=(50, 3))).export(folder / "scan.ply")
+    assert building_file(folder) is None  # a cloud has no surfaces
+    write_room(folder / "room.ply")
+    assert building_file(folder) == folder / "room.ply"
+    write_room(folder / "other.stl")
+    assert building_file(folder) is None  # which one is not known
+    (folder / "room").mkdir()
+    (folder / "room" / "scene.yml").write_text("xml: scene.xml")
+    assert building_file(folder) is None
+    (folder / "room" / "scene.xml").write_text("<scene/>")
+    (folder / "room" / "meshes").mkdir()
+    shutil.move(folder / "room.ply", folder / "room" / "meshes")
+    assert building_file(folder) == folder / "room"
+    assert names(load(folder)) == []
+
+
+def test_a_plan_that_cannot_be_read_is_suspected(tmp_path: Path) -> None:
+    folder = write_flat(tmp_path / "flat")
+    for text, message in (("x,y\n0,0\nfar,1\n", "row 2: x is 'far'"), ("x,y\n0,0\n1,0\n", "enclose no floor")):
+        (folder / "layout.csv").write_text(text)
+        report = check_data(folder)
+        assert report.ok
+        (one,) = report.suspicions
+        assert one.name == "building"
+        assert message in one.text
+
+
+def test_checks_without_the_packages_for_plans_are_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise InputError(f"scenes from scans need {name}: pip install 'wrf-mi[lidar]'")
+
+    monkeypatch.setattr(module, "lidar_package", missing)
+    report = check_data(write_flat(tmp_path / "flat"))
+    assert report.skipped == (
+        "positions against layout.csv: scenes from scans need shapely: pip install 'wrf-mi[lidar]'",
+    )
+    assert any(line.startswith("not checked: positions against layout.csv") for line in report.lines())

@@ -1,0 +1,162 @@
+"""Headings, positions, strengths and channels in another unit or scale are suspected, and correct ones are not."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checked_records import channels, strengths
+
+from wrf_mi.checking.units import channel_phase, heading_unit, position_unit, strength_scale
+from wrf_mi.core import Record
+
+
+def walk(seed: int = 0) -> tuple[Record, np.ndarray]:
+    record = strengths(rows=300, seed=seed)
+    heading = record.tx_heading_rad
+    assert heading is not None
+    return record, heading + 0.3 * np.random.default_rng(seed).normal(size=len(heading))
+
+
+def texts(record: Record, heading: np.ndarray) -> list[str]:
+    return [text for _, text in heading_unit(replace(record, tx_heading_rad=heading))]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "remedy"),
+    [
+        ("degrees", lambda h: np.degrees(np.angle(np.exp(1j * h))), "if they are degrees; multiply them by pi / 180$"),
+        ("degrees from 0", lambda h: np.degrees(h) % 360, "if they are degrees; multiply"),
+        ("whole degrees", lambda h: np.round(np.degrees(h)) % 360, "if they are degrees; multiply"),
+        ("turns in degrees", lambda h: np.degrees(np.unwrap(h)), "if they are degrees; multiply"),
+        ("clockwise", lambda h: np.pi / 2 - h, r"clockwise, as of a compass, or the plan is mirrored; use pi / 2"),
+        ("compass", lambda h: (90 - np.degrees(h)) % 360, "degrees and run clockwise, as of a compass; use"),
+    ],
+)
+def test_headings_in_another_unit_are_suspected_by_the_path(name, wrong, remedy) -> None:
+    record, heading = walk()
+    (text,) = texts(record, wrong(heading))
+    assert text.startswith("headings range from ")
+    assert re.search(remedy, text), text
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        lambda h: h,
+        lambda h: h % (2 * np.pi),
+        lambda h: np.unwrap(h),
+        lambda h: np.unwrap(h) + 200,
+        lambda h: h + np.pi,  # the body looks backwards
+        lambda h: np.random.default_rng(0).uniform(-np.pi, np.pi, len(h)),
+    ],
+)
+def test_headings_in_radians_are_not_suspected(right) -> None:
+    record, heading = walk()
+    assert texts(record, right(heading)) == []
+    order = np.random.default_rng(1).permutation(len(record))
+    mixed = replace(record, tx_pos_m=record.tx_pos_m[order], observation=record.observation[:, order])
+    assert texts(mixed, right(heading)[order]) == []
+
+
+def test_headings_in_degrees_are_suspected_without_a_path() -> None:
+    record, heading = walk()
+    order = np.random.default_rng(1).permutation(len(record))
+    still = replace(record, tx_pos_m=np.repeat(record.tx_pos_m[:1], len(record), axis=0))
+    for one in (still, replace(record, tx_pos_m=record.tx_pos_m[order])):
+        (text,) = texts(one, (np.degrees(heading) % 360)[order])
+        assert text.endswith("of the steps between rows are above pi: they are degrees; multiply them by pi / 180")
+    assert texts(still, np.linspace(0, 200, len(record))) == []  # thirty turns, row by row
+    assert list(heading_unit(replace(record, tx_heading_rad=None))) == []
+
+
+@pytest.mark.parametrize("make", [strengths, channels])
+@pytest.mark.parametrize(("factor", "unit"), [(100, "centimetres"), (1000, "millimetres")])
+@pytest.mark.parametrize("which", ["both", "transmitters", "receivers"])
+def test_positions_in_another_unit_are_suspected(make, factor: int, unit: str, which: str) -> None:
+    record = make()
+    assert list(position_unit(record)) == []
+    if which != "receivers":
+        record = replace(record, tx_pos_m=factor * record.tx_pos_m)
+    if which != "transmitters":
+        receivers = tuple(replace(one, position_m=factor * one.position_m) for one in record.receivers)
+        record = replace(record, receivers=receivers)
+    ((name, text),) = position_unit(record)
+    assert name == "positions"
+    assert unit in text
+    assert text.endswith("give metres, of receivers and transmitters")
+
+
+def test_distances_that_signals_cover_are_not_suspected() -> None:
+    """A network outdoors: 14 dBm over kilometres, with carriers for each row."""
+    record = strengths()
+    far = replace(
+        record,
+        tx_pos_m=300 * record.tx_pos_m,
+        receivers=tuple(replace(one, position_m=300 * one.position_m) for one in record.receivers),
+        observation=record.observation - np.float32(50),
+    )
+    assert list(position_unit(far)) == []
+    carriers = np.where(np.arange(len(far)) % 2, 868e6, 915e6)
+    assert list(position_unit(far.at_carriers(carriers))) == []
+    ((_, text),) = position_unit(replace(far, observation=record.observation + np.float32(40)).at_carriers(carriers))
+    assert "dBm of radiated power" in text
+    unknown = replace(far, tx_pos_m=np.full_like(far.tx_pos_m, np.nan))
+    assert list(position_unit(unknown)) == []
+
+
+LINEAR = "are powers on a linear scale; give dBm, 10 log10 of the milliwatts"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        (lambda dbm: 10 ** (dbm / 10), LINEAR),
+        (lambda dbm: 10 ** (dbm / 10 - 3), LINEAR),
+        (lambda dbm: 1e9 * 10 ** (dbm / 10), LINEAR),
+        (lambda dbm: np.where(dbm < -58, 0, 10 ** (dbm / 10)), LINEAR),
+        (lambda dbm: -dbm, "are above 0 dBm everywhere: the minus sign is missing"),
+        (lambda dbm: dbm + 107, "or they are dB above a microvolt; give dBm"),
+    ],
+)
+def test_powers_on_another_scale_are_suspected(wrong, text: str) -> None:
+    record = strengths()
+    assert list(strength_scale(record)) == []
+    ((name, found),) = strength_scale(replace(record, observation=wrong(record.observation).astype(np.float32)))
+    assert name == "strengths"
+    assert found.startswith("signal strengths in training rows and test rows of anchor1, anchor2, anchor3, anchor4 are")
+    assert text in found
+
+
+def test_receivers_and_parts_on_another_scale_are_named() -> None:
+    record = strengths()
+    observation = record.observation.copy()
+    observation[1] = 10 ** (observation[1] / 10)
+    observation[2:, -20:] *= -1
+    observation[3, :20] = np.nan
+    found = sorted(text for _, text in strength_scale(replace(record, observation=observation)))
+    assert [text.partition(" are ")[0] for text in found] == [
+        "signal strengths in test rows of anchor3, anchor4",
+        "signal strengths in training rows and test rows of anchor2",
+    ]
+    strong = record.observation + np.float32(55)  # some rows above 0 dBm
+    assert list(strength_scale(replace(record, observation=strong, official=None))) == []
+
+
+def test_channels_without_phase_are_suspected() -> None:
+    record = channels()
+    assert list(channel_phase(record)) == []
+    size = np.abs(record.observation)
+    for values, what in (
+        (size, "magnitudes without phase"),
+        (20 * np.log10(size), r"decibels; give complex coefficients, 10^(value / 20) times their phase factor"),
+        (record.observation.real, "without imaginary part"),
+    ):
+        ((name, text),) = channel_phase(replace(record, observation=values.astype(np.complex64)))
+        assert name == "channels"
+        assert what in text
+    up = replace(record, uplink=size[0, :, :, None].astype(np.complex64))
+    assert [text.partition(" are ")[0] for _, text in channel_phase(up)] == ["all uplink coefficients"]
+    assert list(channel_phase(strengths())) == []

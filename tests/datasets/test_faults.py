@@ -1,0 +1,234 @@
+"""All faults of a data set are collected; without collection the first one ends reading, as before."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import test_ble_folder as ble
+import test_nerf2_ble as nerf2_ble
+import test_nerf2_csi as nerf2_csi
+import test_newrf as newrf
+import test_spectrum_folder as spectra
+from changed_folders import DATA, needs, text, write
+from spectrum_records import make_record
+
+from wrf_mi.core import DataFault, InputError
+from wrf_mi.datasets import load, write_spectrum_folder
+from wrf_mi.datasets.faults import attempt, collect_faults, recoverable, refuse, stop_at_faults
+
+
+def write_ble(folder: Path) -> None:
+    for name, content in (("anchors.csv", ble.ANCHORS), (ble.TRAIN_FILE, ble.TRAINING), (ble.TEST_FILE, ble.TEST)):
+        (folder / name).write_text(content)
+
+
+def write_nerf2_ble(folder: Path) -> None:
+    for name, content in (
+        (nerf2_ble.YML, nerf2_ble.GATEWAYS),
+        (nerf2_ble.POS, nerf2_ble.POSITIONS),
+        (nerf2_ble.RSSI, nerf2_ble.POWERS),
+        ("train_index.txt", "3\n0\n"),
+        ("test_index.txt", "1\n"),
+    ):
+        (folder / name).write_text(content)
+
+
+def write_nerf2_csi(folder: Path) -> None:
+    np.save(folder / "csidata.npy", nerf2_csi.channels())
+    nerf2_csi.station()(folder)
+    (folder / "train_index.txt").write_text("5\n0\n3\n1\n")
+    (folder / "test_index.txt").write_text("4\n2\n")
+
+
+def write_newrf(folder: Path) -> None:
+    np.savez(folder / "hall.npz", **newrf.room())
+
+
+def write_spectra(folder: Path) -> None:
+    write_spectrum_folder(folder, make_record(), replace=True)
+
+
+LAYOUTS: dict[str, tuple[Callable[[Path], None], dict[str, Callable[[Path], object]]]] = {
+    "spectra": (write_spectra, {name: case[0] for name, case in spectra.WRONG.items()}),
+    "ble": (write_ble, {name: case[0] for name, case in ble.WRONG.items()}),
+    "nerf2-ble": (write_nerf2_ble, {name: case[0] for name, case in nerf2_ble.WRONG.items()}),
+    "nerf2-csi": (write_nerf2_csi, {name: case[0] for name, case in nerf2_csi.WRONG.items()}),
+    "newrf": (
+        write_newrf,
+        {
+            name: lambda folder, arrays=arrays: np.savez(folder / "hall.npz", **arrays)
+            for name, (arrays, _) in newrf.WRONG.items()
+        },
+    ),
+}
+CASES = [(layout, case) for layout, (_, cases) in LAYOUTS.items() for case in cases]
+
+
+def made(folder: Path, layout: str, *cases: str) -> Path:
+    """A folder of a layout with some changes."""
+    folder.mkdir(parents=True)
+    content, changes = LAYOUTS[layout]
+    content(folder)
+    for case in cases:
+        changes[case](folder)
+    return folder
+
+
+def lines(folder: Path) -> list[str]:
+    record, faults = collect_faults(lambda: load(folder))
+    assert (record is None) == bool(faults)
+    return [str(fault) for fault in faults]
+
+
+@pytest.mark.parametrize(("layout", "case"), CASES)
+def test_collection_finds_the_fault_that_reading_ends_at(layout: str, case: str, tmp_path: Path) -> None:
+    folder = made(tmp_path / "data", layout, case)
+    with pytest.raises(InputError) as error:
+        load(folder)
+    found = lines(folder)
+    first = str(error.value).partition(" (")[0]  # what stands in brackets may be another library's message
+    assert any(line.startswith(first) for line in found)
+    assert len(set(found)) == len(found)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_any_two_faults_are_collected_without_another_error(layout: str, tmp_path: Path) -> None:
+    """Placeholders of what could not be read break no later step."""
+    cases = list(LAYOUTS[layout][1])
+    rng = np.random.default_rng(0)
+    pairs = list(itertools.combinations(cases, 2))
+    for number, pair in enumerate(rng.permutation(pairs)[:80].tolist()):
+        try:
+            folder = made(tmp_path / str(number), layout, *pair)
+        except (AssertionError, FileNotFoundError, IndexError, UnicodeDecodeError):
+            continue  # the first change leaves nothing for the second
+        try:
+            load(folder)
+            correct = True  # the second change corrects the first
+        except InputError:
+            correct = False
+        assert (lines(folder) == []) == correct, pair
+
+
+def test_faults_of_all_files_are_collected(tmp_path: Path) -> None:
+    folder = made(tmp_path / "data", "spectra")
+    text("gateway_info.yml", "0.8", "0.9")(folder)
+    rows = (folder / "tx_pos.csv").read_text().splitlines()
+    rows[2], rows[5] = "nan,1,far", "1,2"
+    (folder / "tx_pos.csv").write_text("\n".join(rows))
+    (folder / "spectrum" / "00003.png").unlink()
+    write("spectrum/00004.png", "hello")(folder)
+    write("spectrum/00099.png", "hello")(folder)
+    (folder / "train_index.txt").write_text("1\n1\n99\nx\n5\n")
+    (folder / "test_index.txt").write_text("2\n5\n")
+    write("blocked_folds.txt", "0\none\n")(folder)
+    record, faults = collect_faults(lambda: load(folder))
+    assert record is None
+    found = [(fault.file.name, fault.place, fault.row) for fault in faults if isinstance(fault, DataFault)]
+    assert sorted(found, key=str) == sorted(
+        [
+            ("gateway_info.yml", "", None),
+            ("tx_pos.csv", "row 5", 5),  # number of fields
+            ("tx_pos.csv", "row 2", 2),  # x
+            ("tx_pos.csv", "row 2", 2),  # z
+            ("00003.png", "row 3", 3),
+            ("00004.png", "row 4", 4),
+            ("00099.png", "", None),
+            ("train_index.txt", "line 2", None),
+            ("train_index.txt", "line 3", None),
+            ("train_index.txt", "line 4", None),
+            ("test_index.txt", "", None),
+            ("blocked_folds.txt", "line 2", None),
+            ("blocked_folds.txt", "", None),  # number of lines
+            ("blocked_folds.txt", "", None),  # a single fold
+        ],
+        key=str,
+    )
+    assert len(faults) == len(found)
+
+
+def test_every_faulty_field_is_collected_once(tmp_path: Path) -> None:
+    folder = made(tmp_path / "data", "ble")
+    (folder / "anchors.csv").write_text("id,x,y,z,pattern\n3,1.5,2,2.5,star\n1,far,-1,2,\n")
+    header = "x,y,rssi_1,rssi_3,count_1,count_3\n"
+    train = "0,0,-50,-60,2,3\nb,c,d,-61,1,many\n1,1,,-60,4,1\n1,1\n2,2,-50,,0,0\n"
+    (folder / ble.TRAIN_FILE).write_text(header + train)
+    (folder / ble.TEST_FILE).write_text(header + "0,0,-50,-60,2,3\n")
+    assert sorted(line.partition(f"{folder}/")[2] for line in lines(folder)) == [
+        "anchors.csv: row 1: antenna: pattern is 'star'; choose from iso, dipole, hw_dipole, tr38901",
+        "anchors.csv: row 2: x is 'far'; give a finite number",
+        f"{ble.TRAIN_FILE}: row 2: count_3 is 'many'; give a finite number, or leave it empty",
+        f"{ble.TRAIN_FILE}: row 2: rssi_1 is 'd'; give a finite number, or leave it empty",
+        f"{ble.TRAIN_FILE}: row 2: x is 'b'; give a finite number",
+        f"{ble.TRAIN_FILE}: row 2: y is 'c'; give a finite number",
+        f"{ble.TRAIN_FILE}: row 3: count_1 is '4', but rssi_1 is empty; leave it empty, too",
+        f"{ble.TRAIN_FILE}: row 4: 2 fields, but the header has 6; correct or remove the row",
+        f"{ble.TRAIN_FILE}: row 5: count_1 is '0', where rssi_1 is known; give the number of readings, 1 to a million",
+    ]
+
+
+def test_rows_of_other_lengths_are_the_only_faults_of_their_columns(tmp_path: Path) -> None:
+    folder = made(tmp_path / "data", "ble")
+    for name in (ble.TRAIN_FILE, ble.TEST_FILE):
+        header = (folder / name).read_text().splitlines()[0]
+        (folder / name).write_text(f"{header}\n1,2\n3\n")
+    found = lines(folder)
+    assert len(found) == 4
+    assert all("; correct or remove the row" in line for line in found)
+
+
+def test_columns_that_both_tables_lack_are_collected(tmp_path: Path) -> None:
+    folder = made(tmp_path / "data", "ble")
+    for name in (ble.TRAIN_FILE, ble.TEST_FILE):
+        (folder / name).write_text("x,y,rssi_1,rssi_3,count_1\n1,2,-50,-60,7\n")
+    assert [line.partition(": ")[2] for line in lines(folder)] == [
+        "line 1: no column count_3; give one for every anchor in both files, or none"
+    ] * 2
+
+
+@needs("flat-ble")
+def test_correct_data_have_no_faults() -> None:
+    record, faults = collect_faults(lambda: load(DATA / "flat-ble"))
+    assert faults == []
+    assert record is not None
+    np.testing.assert_array_equal(record.observation, load(DATA / "flat-ble").observation)
+
+
+def test_parts_without_a_value_are_skipped() -> None:
+    def wrong() -> int:
+        raise DataFault("a.csv", "wrong; correct it", row=3)
+
+    def later(*parts: Any) -> None:
+        raise AssertionError("a part was read that needs one without a value")
+
+    def read() -> None:
+        first = attempt(wrong)
+        attempt(later, first)
+        attempt(later, [first])
+        with recoverable():
+            later(first.value)
+        refuse(DataFault("b.csv", "wrong, too; correct it"))
+        stop_at_faults()
+        later()
+
+    assert list(map(str, collect_faults(read)[1])) == [
+        "a.csv: row 3: wrong; correct it",
+        "b.csv: wrong, too; correct it",
+    ]
+    with pytest.raises(InputError, match=r"a\.csv: row 3"):
+        attempt(wrong)
+    with pytest.raises(InputError, match=r"b\.csv: wrong"):
+        refuse(DataFault("b.csv", "wrong; correct it"))
+    stop_at_faults()
+
+
+def test_faults_pass_between_processes() -> None:
+    fault = DataFault(Path("a.png"), "wrong; correct it", row=3, file_per_row=True)
+    again = pickle.loads(pickle.dumps(fault))
+    assert (str(again), again.row, again.kind) == (str(fault), 3, (".", "correct it"))

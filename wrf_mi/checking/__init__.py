@@ -1,0 +1,6 @@
+"""Checks of whole data sets: every fault, and data that are likely wrong."""
+
+from .check import SUSPICIONS, check_data
+from .report import DataReport, Suspicion
+
+__all__ = ["SUSPICIONS", "DataReport", "Suspicion", "check_data"]

@@ -1,0 +1,178 @@
+"""Positions against the building that a data set's folder shows: a plan, a mesh or a scene folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from ..core import Record
+from ..core.angles import FloatArray
+from ..scene.folder import FACTS_FILE, XML_FILE
+from ..scene.make import has_faces
+from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
+from ..scene.plan_sources import Mask, read_layout
+from ..scene.points import lidar_package
+from ..scene.surfaces import Surface, bodies
+from .placements import placements
+from .repeats import named_rows
+from .units import Found
+
+LAYOUT = "layout.csv"
+"""File of wall vertices in a data set's folder."""
+HEIGHT_M = 2.7
+"""Height of the walls of a plan, at which positions are not compared."""
+THICKEST_WALL_M = 0.4
+"""Largest distance of the two sides of a wall in a plan."""
+PARALLEL = np.cos(np.radians(5))
+DEEP_M = 0.03
+"""Least depth within a wall or a solid: what hangs on a surface is at it, with the error of a tape measure."""
+THICKEST_SOLID_M = 1.0
+"""Bodies with all sides longer than this are rooms or buildings, whose inside is air."""
+
+
+@dataclass(frozen=True)
+class Building:
+    """What a folder shows of the building.
+
+    Attributes:
+        source: file or folder of the building.
+        surfaces: floors, ceilings, walls and others.
+        solids: triangles [f, 3, 3] of each closed body that is thinner than `THICKEST_SOLID_M`.
+        walls_m: stretches [n, 2, 2] of the walls of a plan; none for a mesh.
+    """
+
+    source: Path
+    surfaces: Sequence[Surface]
+    solids: Sequence[FloatArray]
+    walls_m: FloatArray
+
+
+def building_file(source: str | Path) -> Path | None:
+    """The plan, mesh or scene folder that belongs to the data of a file or folder; None without a single one.
+
+    That of a file is a mesh with its name; that of a folder is `LAYOUT`, the only scene folder, or the only mesh.
+    """
+    path = Path(source)
+    if not path.is_dir():
+        named = [path.with_suffix(suffix) for suffix in SUFFIXES]
+        return next((file for file in named if file.is_file()), None) if path.is_file() else None
+    if (path / LAYOUT).is_file():
+        return path / LAYOUT
+    scenes = [facts.parent for facts in sorted(path.glob(f"*/{FACTS_FILE}")) if (facts.parent / XML_FILE).is_file()]
+    found = scenes or [file for file in sorted(path.iterdir()) if has_faces(file)]
+    return found[0] if len(found) == 1 else None
+
+
+def need_packages() -> None:
+    """Refuse to go on without the packages of the extra ``lidar`` that plans and meshes need (`InputError`)."""
+    for name in ("shapely", "mapbox_earcut"):
+        lidar_package(name)
+
+
+def read_building(path: Path) -> Building:
+    """Read a plan, a mesh or a scene folder.
+
+    Raises:
+        InputError: it is not readable, or a package of the extra ``lidar`` is not installed.
+    """
+    need_packages()
+    from ..scene.plan import plan_surfaces
+
+    if path.name == LAYOUT:
+        vertices = read_layout(path)
+        walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
+        return Building(path, plan_surfaces(vertices, height_m=HEIGHT_M, name=str(path)), (), walls)
+    files = sorted((path / "meshes").glob("*.ply")) if path.is_dir() else [path]
+    raw = [surface for file in files for surface in read_mesh(file)]
+    corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
+    solids = []
+    for faces, closed, volume in bodies(corners):
+        body = corners[faces]
+        if closed and volume and np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M:
+            solids.append(body)
+    return Building(path, planes_of_mesh(raw), solids, np.empty((0, 2, 2)))
+
+
+def plan_against_walls(record: Record, building: Building) -> Found:
+    """Transmitters outside the building or across its walls, and the plan in which they are not."""
+    from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
+
+    if not record.has_positions or not any(surface.kind == "wall" for surface in building.surfaces):
+        return
+    count = len(distinct(record.tx_pos_m))
+    crossings, outside = conflicts(record.tx_pos_m, building.surfaces)
+    vertices = np.concatenate([surface.vertices_m for surface in building.surfaces])[:, :2]
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    tolerated = TOLERATED + TOLERATED_SHARE * count
+    text = f"{crossings} lines between neighbouring transmitters cross walls of {building.source.name}"
+    text += f" and {outside} of {count} transmitters lie outside"
+    others = [(conflicts(other.positions_m, building.surfaces), other) for other in placements(record.tx_pos_m, middle)]
+    (crossed, beyond), best = min(others, key=lambda pair: sum(pair[0]))
+    allowed = tolerated + LARGEST_SHARE * count
+    if crossed + beyond <= allowed and crossings + outside > 2 * (crossed + beyond) + tolerated:
+        plan, _, remedy = best.text.partition("; ")
+        yield "walls", f"{text}, and {crossed} and {beyond} if {plan}; {remedy}"
+    elif crossings + outside > allowed:
+        yield "walls", f"{text}; give positions and building in one frame"
+
+
+def inside_solids(record: Record, building: Building) -> Found:
+    """Receivers and transmitters within walls and solid bodies; a few transmitters are errors of their positions."""
+    from ..scene.positions import TOLERATED_SHARE
+
+    groups = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
+    for what, places in groups.items():
+        known = np.flatnonzero(np.isfinite(places).all(axis=1))
+        within = np.zeros(len(known), bool)
+        for solid in building.solids:
+            within |= in_solid(places[known], solid)
+        within |= in_wall(places[known, :2], building.walls_m)
+        found = known[within]
+        if len(found) <= (TOLERATED_SHARE * len(places) if what == "transmitters" else 0):
+            continue
+        names = named_rows(found) if what == "transmitters" else ", ".join(record.receivers[k].name for k in found)
+        text = f"{len(found)} of {len(places)} {what} lie inside walls or solids of {building.source.name}: {names}"
+        yield "inside-solids", f"{text}; correct their positions, or the frame of the building"
+
+
+def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
+    """Which places [n, 2] lie between two parallel stretches of wall [m, 2, 2] as far apart as a wall is thick."""
+    inside = np.zeros(len(places_m), bool)
+    length = np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=1)
+    walls, length = walls_m[length > 0], length[length > 0]
+    along = (walls[:, 1] - walls[:, 0]) / length[:, None]
+    for k, place in enumerate(places_m):
+        to = place - walls[:, 0]
+        foot, side = (to * along).sum(axis=1), to[:, 1] * along[:, 0] - to[:, 0] * along[:, 1]
+        near = np.flatnonzero((foot >= 0) & (foot <= length) & (np.abs(side) < THICKEST_WALL_M))
+        for one in near:
+            cosine = along[near] @ along[one]
+            # Sides are measured against each stretch's own direction.
+            other_side = side[near] * np.sign(cosine)
+            facing = (np.abs(cosine) > PARALLEL) & (other_side * side[one] < 0)
+            width = np.abs(side[near]) + abs(side[one])
+            deep = np.minimum(np.abs(side[near]), abs(side[one])) >= DEEP_M
+            inside[k] |= bool((facing & deep & (width <= THICKEST_WALL_M)).any())
+    return inside
+
+
+def in_solid(places_m: FloatArray, body_m: FloatArray) -> Mask:
+    """Which places [n, 3] lie at least `DEEP_M` inside a closed body of triangles [f, 3, 3], by its solid angle.
+
+    Source: van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30, 1983.
+    """
+    inside = np.zeros(len(places_m), bool)
+    low, high = body_m.min(axis=(0, 1)) + DEEP_M, body_m.max(axis=(0, 1)) - DEEP_M
+    for k in np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1)):
+        a, b, c = np.moveaxis(body_m - places_m[k], 1, 0)
+        la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
+        triple = (a * np.cross(b, c)).sum(axis=-1)
+        rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+        if abs(2 * np.arctan2(triple, rest).sum()) > 2 * np.pi:  # 4 pi inside, 0 outside
+            nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
+            inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
+    return inside

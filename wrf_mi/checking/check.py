@@ -1,0 +1,125 @@
+"""All faults of a data set, and suspicions about data that read well (the command ``wrf-mi data check``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+
+from ..core import InputError, Record
+from ..datasets.faults import collect_faults
+from ..datasets.layouts import is_data
+from ..datasets.registry import find, known, locate
+from ..models.checks import check_parts
+from ..synthetic import load_record
+from .building import building_file, inside_solids, need_packages, plan_against_walls, read_building
+from .directions import spectrum_axes
+from .distances import distance_law
+from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
+from .report import DataReport, Suspicion
+from .units import Found, channel_phase, heading_unit, position_unit, strength_scale
+
+SUSPICIONS = {
+    "headings": "headings in degrees, or clockwise",
+    "positions": "positions in centimetres or millimetres",
+    "strengths": "powers on a linear scale, or without their sign, for dBm",
+    "channels": "channels that are magnitudes or decibels for complex coefficients",
+    "spectrum-axes": "image rows or columns in another order or with another origin",
+    "orientation": "quaternions in the order w, x, y, z, or of the inverse rotation",
+    "plan": "transmitters in a plan that is mirrored or turned against that of the receivers",
+    "walls": "transmitters outside the building of the folder or across its walls",
+    "inside-solids": "receivers or transmitters inside walls or solid bodies",
+    "building": "a plan or mesh beside the data that cannot be read",
+    "train-test": "test rows that are training rows too",
+    "repeated-rows": "rows that repeat an earlier row",
+    "repeated-observations": "spectra or channels of a row elsewhere",
+    "constant": "receivers that observe the same in every row, and blank spectra",
+    "single-position": "a single position of the transmitter",
+}
+"""Names of the suspicions, and what the data are instead."""
+Check = Callable[[Record], Found]
+OF_VALUES: tuple[Check, ...] = (
+    heading_unit,
+    strength_scale,
+    channel_phase,
+    repeated_rows,
+    repeated_observations,
+    constant_observations,
+    single_position,
+)
+"""Suspicions about the values of a record."""
+OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
+"""Suspicions about directions and distances, which need the unit of positions."""
+
+
+def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progress: bool = False) -> DataReport:
+    """Find every fault of a data set, and data that read well but are likely wrong (``docs/data.md``, "Checks").
+
+    >>> report = check_data("laboratory")
+    >>> report.ok, report.suspicions
+    (True, ())
+
+    Args:
+        dataset: a folder, a file, or the name of a known data set, as of `wrf_mi.load`; or a record.
+        ignore: names of suspicions that are not reported, keys of `SUSPICIONS`.
+        progress: show a progress bar on standard error where the data set is made on this machine first.
+
+    Returns:
+        Faults, suspicions, and checks that could not be made.
+
+    Raises:
+        InputError: there is no such data set, or no such suspicion.
+    """
+    if unknown := sorted(set(ignore) - set(SUSPICIONS)):
+        raise InputError(f"suspicion {unknown[0]!r}: unknown; known are {', '.join(SUSPICIONS)}")
+    if isinstance(dataset, Record):
+        name, source = dataset.name, dataset.source
+    else:
+        name, source = str(dataset), str(_path(dataset) or "")
+
+    def read() -> Record:
+        record = dataset if isinstance(dataset, Record) else load_record(dataset, progress)
+        check_parts(record)
+        return record
+
+    record, faults = collect_faults(read)
+    if record is None:
+        return DataReport(name, source, None, tuple(faults), ())
+    skipped: list[str] = []
+    found = [suspicion for check in OF_VALUES for suspicion in check(record)]
+    wrong_unit = list(position_unit(record))
+    found += wrong_unit
+    if not wrong_unit or "positions" in ignore:
+        found += [suspicion for check in OF_PLACES for suspicion in check(record)]
+        found += _of_building(record, skipped)
+    suspicions = tuple(Suspicion(name, text) for name, text in found if name not in ignore)
+    return DataReport(name, record.source, record, (), suspicions, tuple(skipped))
+
+
+def _path(dataset: str | Path) -> Path | None:
+    """The data's folder or file; None if it has yet to be made on this machine.
+
+    Raises:
+        InputError: there is no such data set.
+    """
+    if isinstance(dataset, str) and not is_data(Path(dataset)) and known(dataset).base_url is None:
+        return locate(dataset)
+    return find(dataset)[0]
+
+
+def _of_building(record: Record, skipped: list[str]) -> Iterator[tuple[str, str]]:
+    """Suspicions about positions in the building of the folder; adds the reason to ``skipped`` if it is not known."""
+    file = building_file(record.source) if record.source else None
+    if file is None:
+        return
+    try:
+        need_packages()
+    except InputError as error:
+        skipped.append(f"positions against {file.name}: {error}")
+        return
+    try:
+        building = read_building(file)
+    except InputError as error:
+        yield "building", f"{error}"
+        return
+    # Transmitters in another plan are in its walls, too.
+    yield from list(plan_against_walls(record, building)) or inside_solids(record, building)

@@ -1,0 +1,104 @@
+"""Rows that repeat one another, in training and test rows too, and observations and positions that never change."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Record
+from ..core.types import IntArray
+from .units import Found
+
+FEWEST_STRENGTHS = 4
+"""Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
+where a transmitter stands still."""
+SHOWN = 10
+"""Number of rows that a text names."""
+
+
+def named_rows(rows: IntArray) -> str:
+    """Rows, counted from 1, in words: the first `SHOWN` and the number of the others."""
+    text = ", ".join(str(row + 1) for row in rows[:SHOWN])
+    more = f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else ""
+    return f"row{'s' if len(rows) > 1 else ''} {text}{more}"
+
+
+def repeated_rows(record: Record) -> Found:
+    """Rows with position, conditions and observation of an earlier row, and test rows among the training rows."""
+    received = _received_values(record) >= (FEWEST_STRENGTHS if record.task == "rssi" else 1)
+    parts = [part for part in (record.tx_pos_m, record.tx_heading_rad, record.carriers_hz) if part is not None]
+    per_receiver = [part for part in (record.observation, record.n_readings, record.std) if part is not None]
+    per_row = [*parts, *(np.moveaxis(part, 1, 0) for part in per_receiver)]
+    if record.uplink is not None:
+        per_row.append(record.uplink)
+    first = _first_equal(per_row)
+    repeated = np.flatnonzero((first != np.arange(len(record))) & received)
+    if record.official is not None:
+        train, test = record.official
+        # A row is the same as another one if both are the same as one earlier row.
+        leaked = test[np.isin(first[test], first[train]) & received[test]]
+        if len(leaked):
+            what = f"{len(leaked)} of {len(test)} test rows are training rows too, observation included"
+            yield "train-test", f"{what}: {named_rows(np.sort(leaked))}; remove them from one of the two"
+            repeated = np.setdiff1d(repeated, np.flatnonzero(np.isin(first, first[leaked])))
+    if len(repeated):
+        what = f"{len(repeated)} of {len(record)} rows repeat an earlier row, observation included"
+        yield "repeated-rows", f"{what}: {named_rows(repeated)}; remove them, or give what was measured there"
+
+
+def repeated_observations(record: Record) -> Found:
+    """Spectra and channels that are those of a row elsewhere."""
+    if record.task == "rssi" or not record.has_positions:
+        return
+    first = _first_equal([np.moveaxis(record.observation, 1, 0)])
+    elsewhere = (record.tx_pos_m != record.tx_pos_m[first]).any(axis=1) & (_received_values(record) > 0)
+    copied = np.flatnonzero(elsewhere)
+    if len(copied) and len(np.unique(first)) > 1:
+        what = f"{len(copied)} of {len(record)} rows have the observation of an earlier row at another position"
+        yield "repeated-observations", f"{what}: {named_rows(copied)}; give what was measured there"
+
+
+def constant_observations(record: Record) -> Found:
+    """Receivers whose observations are all the same, and spectra of a single grey value."""
+    if len(record) < 2:
+        return
+    for receiver, observed in zip(record.receivers, record.observation, strict=True):
+        values = observed.reshape(len(record), -1)
+        received = np.flatnonzero(np.isfinite(values).all(axis=1))
+        if len(received) > 1 and (values[received] == values[received[0]]).all():
+            what = "received the same in every row; give what was measured, or leave the receiver out"
+            yield "constant", f"receiver {receiver.name}: {what}"
+        elif record.task == "spectrum":
+            blank = np.flatnonzero(values.min(axis=1) == values.max(axis=1))
+            if len(blank):
+                what = f"spectra of a single grey value in {named_rows(blank)}"
+                yield "constant", f"receiver {receiver.name}: {what}; give what was measured, or remove the rows"
+
+
+def single_position(record: Record) -> Found:
+    """A single position of the transmitter."""
+    if len(record) > 1 and record.has_positions and (record.tx_pos_m == record.tx_pos_m[0]).all():
+        place = ", ".join(f"{value:g}" for value in record.tx_pos_m[0])
+        yield "single-position", f"all {len(record)} transmitters are at ({place}); give the position of each row"
+
+
+def _received_values(record: Record) -> IntArray:
+    """Number of finite values of each row [n], over all receivers."""
+    finite = np.isfinite(record.observation)
+    return np.asarray(np.moveaxis(finite, 1, 0).reshape(len(record), -1).sum(axis=1), np.int64)
+
+
+def _first_equal(parts: Sequence[NDArray[Any]]) -> IntArray:
+    """Number of the first row that is equal in all parts [n, ...], for each row; NaN equals NaN."""
+    keys: dict[bytes, int] = {}
+    first = []
+    for row, values in enumerate(zip(*parts, strict=True)):
+        digest = hashlib.blake2b(digest_size=16)
+        for value in values:
+            digest.update(np.ascontiguousarray(value).tobytes())
+        first.append(keys.setdefault(digest.digest(), row))
+    return np.array(first, np.int64)
