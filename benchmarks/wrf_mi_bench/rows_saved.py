@@ -1,4 +1,5 @@
-"""Score of WRF-GS+ against the number of training rows: random start, start from a mesh, and jointly with its paths.
+"""Score of WRF-GS+ against the number of training rows: random start, start from a mesh, jointly with its paths, and
+the paths alone with trained gain and materials.
 
 The *rows saved* are the share of the rows of a random start that joint training needs for the same score.
 """
@@ -34,17 +35,25 @@ ROWS: Mapping[str, Sequence[int]] = {
     FLAT: (50, 100, 200, 400),
 }
 STEPS = 3000
-RANDOM, MESH, JOINT, IDW = "random start", "start from the mesh", "joint with its paths", "IDW"
+RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
+PATHS, IDW = "paths alone", "IDW"
+CURVES = (RANDOM, MESH, JOINT, PATHS)
+CALIBRATION = ("calibration=gain,materials", "transmission=true")
+"""Settings of the paths alone."""
 
 
 def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:
-    """Median scores of all three by name, and of inverse-distance weighting; ``task``."""
-    scene, found = scene_of_cell(cell, folder.parent), dict[str, Any]()
-    for name, given, start in ((RANDOM, None, []), (MESH, None, [f"initial.mesh={scene}"]), (JOINT, scene, [])):
+    """Median scores of all `CURVES` by name, and of inverse-distance weighting; ``task``."""
+    scene, found, field = scene_of_cell(cell, folder.parent), dict[str, Any](), (f"steps={steps}",)
+    for name, model, given, settings in (
+        (RANDOM, "wrf-gs+", None, field),
+        (MESH, "wrf-gs+", None, (*field, f"initial.mesh={scene}")),
+        (JOINT, "wrf-gs+", scene, field),
+        (PATHS, "ray-tracing", scene, CALIBRATION),
+    ):
         place = folder / name.replace(" ", "-")
         shutil.rmtree(place, ignore_errors=True)
-        settings = [f"steps={steps}", *start]
-        run = train(cell.dataset, place, scene=given, n_train=cell.n_train, seed=seed, settings=settings)
+        run = train(cell.dataset, place, model, scene=given, n_train=cell.n_train, seed=seed, settings=settings)
         task, reference = TASKS[run.metrics["task"]], run.metrics["reference"]
         idw = reference[task.reference]["median"]
         found |= {name: run.metrics[task.block]["median"], IDW: idw, "task": task.name}
@@ -80,7 +89,7 @@ def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
     lines = []
     for dataset, rows in ROWS.items():
         task = _task(found, dataset)
-        means = {name: curves(found, dataset, name).mean(axis=1) for name in (RANDOM, MESH, JOINT)}
+        means = {name: curves(found, dataset, name).mean(axis=1) for name in CURVES}
         for number, n in enumerate(rows):
             shown = ", ".join(f"{name} {means[name][number]:.{task.digits}f}" for name in means)
             needed = rows_needed(rows, means[JOINT], means[RANDOM][number], task.higher_is_better)
@@ -99,7 +108,7 @@ def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(3.4 * len(ROWS), 3.4), layout="constrained", facecolor="white")
     panels = figure.subplots(1, len(ROWS), squeeze=False)[0]
     for axes, (dataset, rows) in zip(panels, ROWS.items(), strict=True):
-        for name in (RANDOM, MESH, JOINT):
+        for name in CURVES:
             scores = curves(found, dataset, name)
             (drawn,) = axes.plot(rows, scores.mean(axis=1), marker="o", label=name)
             axes.fill_between(rows, scores.min(axis=1), scores.max(axis=1), alpha=0.2, color=drawn.get_color())

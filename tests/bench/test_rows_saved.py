@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from wrf_mi_bench import rows_saved
 from wrf_mi_bench.ingredients import LAB, Cell
-from wrf_mi_bench.rows_saved import IDW, JOINT, MESH, RANDOM, ROWS, measure, picture, rows_needed, saved
+from wrf_mi_bench.rows_saved import CURVES, IDW, JOINT, ROWS, measure, picture, rows_needed, saved
 
 
 @pytest.mark.parametrize(
@@ -21,16 +21,16 @@ def test_rows_needed_are_where_the_curve_reaches_the_score(score: Any, goal: flo
     assert rows_needed((10, 20, 40), lower, -goal, False) == (None if rows is None else pytest.approx(rows))
 
 
-def test_a_cell_is_measured_with_all_three_starts(tmp_path: Path) -> None:
+def test_a_cell_is_measured_with_all_starts_and_the_paths_alone(tmp_path: Path) -> None:
     found = measure(Cell(LAB, "official", 5), 0, tmp_path / "cell", steps=2)
-    assert {RANDOM, MESH, JOINT, IDW, "task"} == set(found)
-    assert len({found[RANDOM], found[MESH], found[JOINT]}) == 3
+    assert {*CURVES, IDW, "task"} == set(found)
+    assert len({found[name] for name in CURVES}) == len(CURVES)
     assert not (tmp_path / "cell").exists()
 
 
 def test_table_states_the_share_of_the_rows_and_the_picture_has_a_panel_a_data_set() -> None:
     found = [
-        {"dataset": name, "rows": n, "seed": 0, "task": "spectrum", RANDOM: k, MESH: k, JOINT: k + 1, IDW: 0.1}
+        {"dataset": name, "rows": n, "seed": 0, "task": "spectrum", IDW: 0.1, **dict.fromkeys(CURVES, k), JOINT: k + 1}
         for name, rows in ROWS.items()
         for k, n in enumerate(rows)
     ]
