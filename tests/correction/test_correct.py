@@ -16,7 +16,7 @@ from wrf_mi_scenes import scenes
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
-from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.correction.misfit import Misfit, search_options
 from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
@@ -58,7 +58,13 @@ def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Pa
     slabs = found.misfit.sides[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
     expected = (
-        Misfit(found.misfit.record, found.misfit.rows[:2], true, search_options(1, 4096, 0.0, 0), lambda name: True)
+        Misfit(
+            found.misfit.record,
+            found.misfit.rows[:2],
+            true,
+            search_options(CorrectionOptions(depth=1, rays=4096, faint=0.0)),
+            lambda name: True,
+        )
         .sides[0]
         .slabs
     )
@@ -106,6 +112,28 @@ def test_a_scene_without_errors_stays_as_good(tmp_path: Path) -> None:
     assert mean[found.kept] >= mean[""]
 
 
+def strengths(record: Any) -> Any:
+    """Received powers in dB of a record of channels."""
+    power_db = 10 * np.log10(np.square(np.abs(record.observation)).mean(axis=2)).astype(np.float32)
+    return replace(record, task="rssi", observation=power_db, frequencies_hz=np.array([CARRIER_HZ]))
+
+
+def test_strengths_correct_materials_by_a_bounded_number_of_rows(tmp_path: Path) -> None:
+    """Planes stay; all rows but a random subset are left out, and an offset of the receiver changes nothing."""
+    record = strengths(channels(stated_scene(tmp_path / "true", TRUE_MATERIALS), 80))
+    scene, split = stated_scene(tmp_path / "scene"), make_splits(record, "official")[0]
+    options = replace(default_options(record), rows=40, rays=4096)
+    found, again = (
+        correct_scene(scene, replace(record, observation=record.observation + offset), split, options)
+        for offset in (0, -40)
+    )
+    assert found.facts["rows"] == 40 < len(split.all_train)
+    assert set(found.misfit.rows) < set(split.all_train)
+    assert found.kept == "materials+gain"
+    assert np.nanmean(found.scores[found.kept]) < np.nanmean(found.scores[""])
+    np.testing.assert_allclose(again.scores[again.kept], found.scores[found.kept], atol=0.05)
+
+
 def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
     """A record of a task, the scene it is from, and a number of rows."""
     if task == "spectrum":
@@ -113,10 +141,8 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
         return record, open_scene("laboratory", instrument_of(record).carrier_hz), 5
     record = channels(scene, 12)
     if task == "rssi":
-        power_db = 10 * np.log10(np.square(np.abs(record.observation)).mean(axis=2)).astype(np.float32)
-        power_db[0, 0] = np.nan
-        carrier = np.array([CARRIER_HZ])
-        record = replace(record, task="rssi", observation=power_db, frequencies_hz=carrier)
+        record = strengths(record)
+        record.observation[0, 0] = np.nan
     return record, open_scene(scene, CARRIER_HZ), len(record)
 
 
@@ -124,7 +150,7 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
 def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) -> None:
     """To 1 %, or the rounding of float32 reports, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
     record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
-    options = search_options(2, 4096, 0.0, 1)
+    options = search_options(CorrectionOptions(("patterns",), depth=2, rays=4096, faint=0.0, pattern_degree=1))
     misfit = Misfit(record, np.arange(rows), scene, options, lambda name: True)
     planes, slabs = misfit.counts()
     place_of = {"plane": int(planes.argmax()), "material": int(slabs.argmax())}  # those that most paths meet

@@ -25,8 +25,9 @@ def misfit(tmp_path_factory: pytest.TempPathFactory) -> Misfit:
     record = channels(scene, 24)
     observed = record.observation.copy()
     observed[0, 3] = np.nan
-    record, options = replace(record, observation=observed), search_options(2, 8192, 0.0, 0)
-    return Misfit(record, np.arange(16), open_scene(scene, CARRIER_HZ), options, CorrectionOptions().changes)
+    record, options = replace(record, observation=observed), CorrectionOptions(depth=2, rays=8192, faint=0.0)
+    opened = open_scene(scene, CARRIER_HZ)
+    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
 
 
 def moved(misfit: Misfit, shift_m: float = 4e-3, tilt_rad: float = 1e-3) -> np.ndarray:

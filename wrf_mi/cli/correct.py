@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +24,10 @@ def add_parser(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
     parts = "what is changed, from materials,planes,frame,gain,pose,patterns"
-    add("--fit", metavar="LIST", help=f"{parts} (default: the first three; gain, too, for signal strengths)")
-    add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
+    add("--fit", metavar="LIST", help=f"{parts} (default: the first three; for signal strengths materials and gain)")
+    add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
+    add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
+    add("--rows", type=int, metavar="N", help="most training rows that are compared (default: 600)")
     add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
@@ -38,18 +41,19 @@ def correct_command(a: Arguments) -> int:
     """Correct a scene, and write its page."""
     from ..core import InputError
     from ..core.settings import with_settings
-    from ..correction import CorrectionOptions, correct_scene, write_page
+    from ..correction import correct_scene, default_options, write_page
     from ..datasets import make_splits
     from ..synthetic import load_record
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
-    given = {"depth": a.depth, "rays": a.rays, "shift_sd_m": a.shift_sd}
-    parts = CorrectionOptions().parts if a.fit is None else tuple(a.fit.split(","))
-    options = with_settings(
-        CorrectionOptions(parts), [f"{key}={value}" for key, value in given.items() if value is not None]
-    )
     record = load_record(a.dataset, progress=sys.stderr.isatty())
+    options = default_options(record)
+    if a.fit is not None:
+        options = replace(options, parts=tuple(a.fit.split(",")))
+    names = ("depth", "reflections", "rows", "rays")
+    given = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
+    options = with_settings(options, [f"{key}={value}" for key, value in given.items() if value is not None])
     splits = make_splits(record, a.split, a.seed, a.n_train)
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")

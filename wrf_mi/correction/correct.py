@@ -30,7 +30,7 @@ from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
-from .options import DEFAULTS, CorrectionOptions, OnStage
+from .options import DEFAULTS, GAIN, STRENGTHS, CorrectionOptions, OnStage
 
 
 @dataclass
@@ -73,11 +73,16 @@ class Correction:
         return self.misfit.named(self.vector)
 
 
+def default_options(record: Record) -> CorrectionOptions:
+    """Options for a record where none are given."""
+    return STRENGTHS if task_of(record).in_decibel else DEFAULTS
+
+
 def correct_scene(
     scene: str | Path,
     record: Record,
     split: Split,
-    options: CorrectionOptions = DEFAULTS,
+    options: CorrectionOptions | None = None,
     material: str | None = None,
     on_stage: OnStage = lambda what, share: None,
 ) -> Correction:
@@ -87,7 +92,7 @@ def correct_scene(
         scene: see `wrf_mi.tracing.open_scene`.
         record: measurements of any task, positions known.
         split: its training and validation rows are used, its test rows are not.
-        options: parts that may change, and the prior knowledge of them.
+        options: parts that may change, and the prior knowledge of them; None: `default_options`.
         material: radio material of a bare mesh.
         on_stage: called as the correction goes on.
 
@@ -101,8 +106,10 @@ def correct_scene(
     if record.carriers_hz is not None:
         raise InputError(f"{name}: {carriers_text(record.carriers_hz)}; correct a scene at one carrier")
     check_observations(record, split, complete=task.image)
-    if task.in_decibel and "gain" not in options.parts:
-        options = replace(options, parts=(*options.parts, "gain"))
+    options = options or default_options(record)
+    if task.in_decibel and GAIN not in options.parts:
+        options = replace(options, parts=(*options.parts, GAIN))
+    split = _at_most(split, options.rows)
     opened = open_scene(scene, instrument_of(record).carrier_hz, material=material)
     check_materials(opened)
     prepared = Prepared(opened)
@@ -115,10 +122,7 @@ def correct_scene(
 
     def misfit(rows: IntArray, what: str) -> Misfit:
         on_stage(what, 0.0)
-        search = search_options(options.depth, options.rays, options.faint, options.pattern_degree)
-        if "patterns" not in options.parts:
-            search = replace(search, pattern_degree=0)
-        return Misfit(record, rows, opened, search, options.changes, prepared)
+        return Misfit(record, rows, opened, search_options(options), options.changes, prepared)
 
     first = misfit(known, "tracing")
     if not any(side.exists.any() for side in first.sides):
@@ -154,6 +158,12 @@ def correct_scene(
         time.perf_counter() - begun,
         {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
     )
+
+
+def _at_most(split: Split, count: int) -> Split:
+    """The split with a random subset of its training and validation rows."""
+    rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:count]
+    return replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
 
 
 def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:

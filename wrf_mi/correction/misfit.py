@@ -8,6 +8,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -28,6 +29,7 @@ from ..tracing import TraceOptions
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_field import TracedField, TracedOptions
+from .options import PATTERNS, CorrectionOptions
 
 LATTICE = (12, 40)
 """Most elevations and azimuths of the lattice of directions."""
@@ -79,9 +81,10 @@ class Misfit:
             self._strides = [_stride(length, most) for length, most in zip(shape, LATTICE, strict=True)]
             size = whole_size[0] // self._strides[0], whole_size[1] // self._strides[1]
         outputs = tuple(map(int, shape)) if task.is_complex else ()
-        form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs)
+        floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
+        form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
         self.models: list[ReceiverModel] = [RECEIVERS[form.receiver].make(form, r) for r in self.receivers]
-        whole = Form(task.receiver_with_scene, whole_size, record.frequencies_hz, outputs)
+        whole = replace(form, size=whole_size)
         self._whole: list[ReceiverModel] = [RECEIVERS[form.receiver].make(whole, r) for r in self.receivers]
         values: dict[str, NDArray[np.float32]] = {}
         for side in self.sides:
@@ -228,7 +231,10 @@ def _stride(length: int, most: int) -> int:
     return found if 3 * (length // found) >= most else 1
 
 
-def search_options(depth: int, rays: int, faint: float, pattern_degree: int) -> TracedOptions:
+def search_options(options: CorrectionOptions) -> TracedOptions:
     """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
-    trace = TraceOptions(transmission=True, max_depth=depth, rays=rays)
-    return TracedOptions(trace, pattern_degree, faint=faint, materials="surface", thickness=True, planes=True)
+    trace = TraceOptions(
+        transmission=True, max_depth=options.depth, max_reflections=options.reflections, rays=options.rays
+    )
+    degree = options.pattern_degree if PATTERNS in options.parts else 0
+    return TracedOptions(trace, degree, faint=options.faint, materials="surface", thickness=True, planes=True)

@@ -16,8 +16,8 @@ from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.traced_field import TX_PATTERN
 
 FRAME = "frame"
-MATERIALS, PLANES = "materials", "planes"
-PARTS = (MATERIALS, PLANES, FRAME, "gain", "pose", "patterns")
+MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
+PARTS = (MATERIALS, PLANES, FRAME, GAIN, "pose", PATTERNS)
 """What a correction may change."""
 FLAT = 10.0
 """Standard deviation of the logarithm of a gain, and of its phase in rad: no prior knowledge."""
@@ -33,6 +33,8 @@ class CorrectionOptions(CheckedSettings):
     Attributes:
         parts: parts that may change, of `PARTS`.
         depth: largest number of interactions of a path, transmissions included.
+        reflections: largest number of reflections among them.
+        rows: most training rows that are compared; of more, a random subset, seeded by the split.
         rays: number of rays that search from each receiver.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
         steps: largest number of least-squares steps.
@@ -50,6 +52,8 @@ class CorrectionOptions(CheckedSettings):
 
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME)
     depth: Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")] = 3
+    reflections: Annotated[int, NOT_NEGATIVE] = 3
+    rows: Annotated[int, Field(ge=1, description="1 or more")] = 600
     rays: Annotated[int, Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
     faint: ShareBelow1 = 1e-3
     steps: Annotated[int, NOT_NEGATIVE] = 8
@@ -82,8 +86,8 @@ class CorrectionOptions(CheckedSettings):
         if name in (SHIFT, TILT):
             return PLANES in self.parts or FRAME in self.parts
         last = name.rpartition(".")[2]
-        kinds = {"gain": "gain", "position": "pose", "turn": "pose", "pattern": "patterns"}
-        return (name == TX_PATTERN and "patterns" in self.parts) or kinds.get(last) in self.parts
+        kinds = {"gain": GAIN, "position": "pose", "turn": "pose", "pattern": PATTERNS}
+        return (name == TX_PATTERN and PATTERNS in self.parts) or kinds.get(last) in self.parts
 
     def deviation(self, name: str) -> float:
         """Standard deviation of the entries of a parameter before the correction; of planes without the frame's."""
@@ -103,3 +107,5 @@ class CorrectionOptions(CheckedSettings):
 
 
 DEFAULTS = CorrectionOptions()
+STRENGTHS = CorrectionOptions((MATERIALS, GAIN), depth=6, reflections=2)
+"""Defaults for signal strengths: waves pass several walls, and powers do not tell planes a few centimetres apart."""

@@ -30,8 +30,6 @@ Complex = NDArray[np.complex128]
 STEP = 3e-3
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: 0.3 %, where
 rounding to single precision is below 1e-3 of it."""
-SMALLEST = 1e-30
-"""Added to gains that divide."""
 
 
 class PathSum:
@@ -71,7 +69,7 @@ class PathSum:
         return known and SHIFT in misfit.parts and task_of(record).is_complex and record.observation.ndim == 3
 
     def residual(self, vector: FloatArray) -> FloatArray:
-        """Residuals as `Misfit.residual`, lengths linear in planes, gains those of one changed surface at a time."""
+        """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
         touched, waves = self._changed(vector)
         return self._residual(self._total + self._sums(waves - self._waves[touched], touched))
 
@@ -138,15 +136,15 @@ class PathSum:
         return touched, self._gain_at(vector, touched)[:, None] * self._phase[1]
 
     def _gain_at(self, vector: FloatArray, touched: IntArray) -> Complex:
-        gain, differs = self._gain[touched], vector != self.at
-        for slab in np.flatnonzero(differs[self._material].any(axis=0)):
-            there = self.at.copy()
-            there[self._material[:, slab]] = vector[self._material[:, slab]]
-            key = there[self._material].tobytes()
-            if key not in self._gains:
-                self._gains[key] = self.misfit.gains(there)
-            gain = gain * (self._gains[key][touched] / (self._gain[touched] + SMALLEST))
-        return gain
+        materials = self._material.ravel()
+        if not (vector != self.at)[materials].any():
+            return self._gain[touched]
+        there = self._start.copy()  # angles of all gains are those of the first vector
+        there[materials] = vector[materials]
+        key = there[materials].tobytes()
+        if key not in self._gains:
+            self._gains[key] = self.misfit.gains(there)
+        return self._gains[key][touched]
 
 
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
