@@ -82,7 +82,7 @@ class SceneWalls:
         Args:
             params: Dr.Jit tensors by the names of `wrf_mi.tracing.material_parameters.SlabMaterials.parameters`.
         """
-        tables = self._slabs.tables(params, self._stated[:3])[:2]  # thicknesses are constants of the meshes
+        tables = self._slabs.tables(params, self._stated)[:2]  # thicknesses are constants of the meshes
         return {
             f"wall_{i}.bsdf.{name}": dr.gather(mi.Float, table, mi.UInt32(k))
             for i, k in enumerate(self._used)

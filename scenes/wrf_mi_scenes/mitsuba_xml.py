@@ -64,7 +64,8 @@ PERFECT_THICKNESS_M = 0.1
 
 
 Constants = Mapping[str, Mapping[str, float]]
-"""``relative_permittivity``, ``conductivity`` (S/m) and ``thickness`` (m) of materials by their names."""
+"""``relative_permittivity``, ``conductivity`` (S/m) and ``thickness`` (m) of materials by their names; further numbers
+are left out of the scene file."""
 PERFECT_CONSTANTS = {
     "relative_permittivity": 1.0,
     "conductivity": PERFECT_CONDUCTIVITY,
@@ -89,7 +90,8 @@ def scene_xml(materials: Mapping[str, str], constants: Constants = MappingProxyT
         colour = COLOURS.get(material, OTHER_COLOUR)
         if material in known:
             lines.append(f'    <bsdf type="radio-material" id="mat-{material}">')
-            lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in known[material].items()]
+            stated = [(name, value) for name, value in known[material].items() if name in PERFECT_CONSTANTS]
+            lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in stated]
             lines.append("    </bsdf>")
             continue
         lines += [

@@ -103,6 +103,9 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> No
     assert len(rt.load_scene(str(folder / "scene.xml"), merge_shapes=False).objects) == 3
 
 
+PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08, {}}}}}"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -117,6 +120,12 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> No
         ("walls: {}", r"give the keys rules, surfaces, thickness_m, constants, no others"),
         ("rules: itu_wood", r"rules must be a mapping"),
         ("rules: {", r"not YAML"),
+        (
+            PANEL.format("conductivity_exponent: 1"),
+            r"panel: give relative_permittivity, .* with",
+        ),
+        (PANEL.format("conductivity_exponent: 9, carrier_hz: 1.0e+9"), r"conductivity_exponent is 9; give -5 to 5"),
+        (PANEL.format("conductivity_exponent: 1, carrier_hz: 0"), r"carrier_hz is 0; give a number from 0 upwards"),
     ],
 )
 def test_unusable_materials_are_refused(text: str, message: str, folder: Path) -> None:

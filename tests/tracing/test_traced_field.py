@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+from box_room import CEILING, FREQUENCY_HZ, PARTITION, THICKNESS_M, WALLS, receiver, room, transmitters
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 from scipy.special import sph_harm_y
+from traced_rooms import write_xml
 
 from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Antenna, InputError, Receiver
@@ -23,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 from sionna.rt.utils import itu_coefficients_single_layer_slab
 
-from wrf_mi.tracing import TraceOptions, recompute, trace_paths
+from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.buffer import to_buffer
 from wrf_mi.tracing.fields import field_of
 from wrf_mi.tracing.pattern_parameters import pattern_coefficients, pattern_factor
@@ -106,6 +107,19 @@ def test_gains_for_other_materials_are_those_of_sionna_rt(scene: Any) -> None:
     finally:
         concrete.relative_permittivity, concrete.conductivity = before
     np.testing.assert_allclose(gain, expected, atol=SINGLE * np.abs(expected).max())
+
+
+def test_gains_at_another_carrier_are_those_of_sionna_rt(tmp_path: Path) -> None:
+    """Conductivities follow the laws of ITU-R P.2040, with materials of names and of surfaces."""
+    parts, high_hz = {**WALLS, **CEILING, **PARTITION}, 3.5e9
+    low, high = (open_scene(write_xml(tmp_path / str(hz), parts), hz, THICKNESS_M) for hz in (1.8e9, high_hz))
+    found = trace_paths(low, transmitters(3), receiver(), OPTIONS)
+    expected = recompute(found, high).paths.gain
+    assert np.abs(expected - found.paths.gain).max() > 0.1 * np.abs(expected).max()
+    for options in (TracedOptions(OPTIONS), TracedOptions(OPTIONS, materials="surface", exponent=True)):
+        traced = TracedField(low, transmitters(3), receiver(), options, traced=found, frequency_hz=high_hz)
+        gain, _, _ = existing(traced, tensors(traced))
+        np.testing.assert_allclose(gain, expected, atol=SINGLE * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("cosine", [0.02, 0.4, 1.0])

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
-from ..core.carriers import carriers_text
 from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..scene.folder import read_scene_folder
@@ -103,14 +102,12 @@ def correct_scene(
     task, name = task_of(record), record.name
     if not task.receiver_with_scene:
         raise InputError(f"{name}: no receiver model reports {task.name} from paths")
-    if record.carriers_hz is not None:
-        raise InputError(f"{name}: {carriers_text(record.carriers_hz)}; correct a scene at one carrier")
     check_observations(record, split, complete=task.image)
     options = options or default_options(record)
     if task.in_decibel and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
     split = _at_most(split, options.rows)
-    opened = open_scene(scene, instrument_of(record).carrier_hz, material=material)
+    opened = open_scene(scene, _carrier(record, split), material=material)
     check_materials(opened)
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
@@ -158,6 +155,14 @@ def correct_scene(
         time.perf_counter() - begun,
         {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
     )
+
+
+def _carrier(record: Record, split: Split) -> float:
+    """Carrier in Hz at which parameters of materials hold: of several training carriers the one in the middle."""
+    if record.carriers_hz is None:
+        return instrument_of(record).carrier_hz
+    carriers = np.unique(record.carriers_hz[split.all_train])
+    return float(carriers[len(carriers) // 2])
 
 
 def _at_most(split: Split, count: int) -> Split:

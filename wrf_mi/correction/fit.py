@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import PREFIX
+from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .frame import rigid_motions
 from .least_squares import Prior, Solution, solve
@@ -37,7 +37,7 @@ class Fit:
         self.stated = misfit.start.copy()
         self.taken: dict[tuple[str, str], str] = {}
         self.means: dict[str, FloatArray] = {}
-        self.frequency_hz = misfit.sides[0].frequency_hz
+        self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
         planes, slabs = misfit.counts()
         self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
         self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
@@ -45,21 +45,21 @@ class Fit:
         self.prior_deviation = np.ones(len(self.stated))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)
-        for r, side in enumerate(misfit.sides):
-            if side.gain_name in misfit.parts:
-                self._match_gain(r)
+        self._match_gains()
 
-    def _match_gain(self, r: int) -> None:
-        """The stated gain matches mean magnitudes, as least squares of a phase need."""
-        misfit = self.misfit
+    def _match_gains(self) -> None:
+        """Stated gains match mean magnitudes over a receiver's carriers, as least squares of a phase need."""
+        misfit, missing = self.misfit, dict[str, list[float]]()
+        if not any(side.gain_name in misfit.parts for side in misfit.sides):
+            return
         whole = misfit.residual(self.stated) + misfit.observed
-        count = len(misfit.rows)
-        report, seen = (values[r * count : (r + 1) * count] for values in (whole, misfit.observed))
-        known = np.isfinite(seen).all(axis=1)
-        shape = misfit.models[r].shape
-        if known.any():
-            pair = (values[known].reshape(-1, *shape) for values in (report, seen))
-            self.stated[misfit.parts[misfit.sides[r].gain_name].start] += misfit.models[r].missing_gain(*pair)
+        for side, model, places in zip(misfit.sides, misfit.models, misfit.places, strict=True):
+            known = places[np.isfinite(misfit.observed[places]).all(axis=1)]
+            if len(known):
+                pair = (values[known].reshape(-1, *model.shape) for values in (whole, misfit.observed))
+                missing.setdefault(side.gain_name, []).append(model.missing_gain(*pair))
+        for name, found in missing.items():
+            self.stated[misfit.parts[name].start] += np.mean(found)
 
     def free(self, kept: str) -> IntArray:
         """Entries of the vector that a stage changes: those of surfaces and planes that enough paths meet."""
@@ -68,7 +68,8 @@ class Fit:
         for name, part in self.misfit.parts.items():
             entries = np.arange(part.start, part.stop)
             if name.startswith(PREFIX):
-                free.append(entries[self.slabs] if MATERIALS in parts else entries[:0])
+                known = MATERIALS in parts and (self.misfit.several_carriers or not name.endswith(EXPONENT))
+                free.append(entries[self.slabs] if known else entries[:0])
             elif name in (SHIFT, TILT):
                 size = len(entries) // len(self.misfit.sides[0].surfaces.normal)
                 moved = entries.reshape(-1, size)[self.planes].ravel()
@@ -141,6 +142,7 @@ class Fit:
 
     def _refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
+        places = places[np.isin(places, self.free("+".join(self.options.parts)))]
         misfit, vector, mean = self.misfit, start.copy(), start.copy()
         planes = misfit.plane_entries
         mean[planes] = self.stated[planes]

@@ -43,13 +43,16 @@ class Misfit:
     Args:
         record: measurements of any task.
         rows: rows that are compared.
-        scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier.
+        scene: scene of `wrf_mi.tracing.open_scene`, at the record's carrier or, of several, at the one at which
+            parameters of materials hold.
         options: options of the traced side.
         wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
         prepared: shared state of the scene.
 
     Attributes:
-        sides: traced side of each receiver.
+        sides: traced side of each receiver at each carrier, receiver by receiver.
+        models: receiver models of the sides.
+        places: entries of ``observed`` of each side.
         start: stated values of the vector [p].
         parts: slice of each parameter in the vector, by name.
         observed: observations [n_rx * rows, values] in the residuals' unit, NaN where nothing was received.
@@ -69,11 +72,6 @@ class Misfit:
         self.receivers = placed_receivers(record, by_uplink=False)
         self._image = task.image
         shared = prepared or Prepared(scene)
-        heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
-        self.sides = [
-            TracedField(scene, record.tx_pos_m[rows], receiver, options, heading, prepared=shared)
-            for receiver in self.receivers
-        ]
         shape = record.observation.shape[2:]
         size, whole_size = (1, 1), (1, 1)
         if task.image:
@@ -83,9 +81,18 @@ class Misfit:
         outputs = tuple(map(int, shape)) if task.is_complex else ()
         floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
         form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
-        self.models: list[ReceiverModel] = [RECEIVERS[form.receiver].make(form, r) for r in self.receivers]
-        whole = replace(form, size=whole_size)
-        self._whole: list[ReceiverModel] = [RECEIVERS[form.receiver].make(whole, r) for r in self.receivers]
+        self.sides, self.places = list[TracedField](), list[IntArray]()
+        self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
+        for number, receiver in enumerate(self.receivers):
+            for carrier_hz, which in _by_carrier(record, rows):
+                at = rows[which]
+                heading = None if record.tx_heading_rad is None else record.tx_heading_rad[at]
+                given = record.tx_pos_m[at], receiver, options, heading
+                self.sides.append(TracedField(scene, *given, prepared=shared, frequency_hz=carrier_hz))
+                here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
+                self.models.append(RECEIVERS[form.receiver].make(here, receiver))
+                self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
+                self.places.append(number * len(rows) + which)
         values: dict[str, NDArray[np.float32]] = {}
         for side in self.sides:
             values |= {name: value for name, value in side.parameters().items() if wanted(name)}
@@ -111,6 +118,11 @@ class Misfit:
             unit = np.sqrt(power + FLOOR**2 * np.nanmedian(power))
             return pairs / unit[:, None], unit
         return seen.astype(float).reshape(count, -1), np.ones(count)
+
+    @property
+    def several_carriers(self) -> bool:
+        """Whether rows of several carriers tell how conductivities depend on the frequency."""
+        return len({side.frequency_hz for side in self.sides}) > 1
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
@@ -150,9 +162,10 @@ class Misfit:
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
-        params = self._device(vector)
-        found = [np.asarray(report(params).numpy(), float).reshape(len(self.rows), -1) for report in self._reports]
-        return np.concatenate(found) / self.unit[:, None] - self.observed
+        params, found = self._device(vector), np.zeros(self.observed.shape)
+        for report, places in zip(self._reports, self.places, strict=True):
+            found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
+        return found / self.unit[:, None] - self.observed
 
     def gains(self, vector: FloatArray) -> NDArray[np.complex128]:
         """Gains of the paths of a vector, receiver by receiver, without exp(-j k length)."""
@@ -167,12 +180,11 @@ class Misfit:
     ) -> NDArray[np.float32]:
         """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
-        count, params = len(self.rows), self._device(vector)
+        params = self._device(vector)
         for place, column in enumerate(columns):
             direction = self._device(np.eye(1, len(vector), column)[0])
-            for r, tangent in enumerate(self._tangents):
-                slope = tangent(params, direction).numpy()
-                slopes[r * count : (r + 1) * count, :, place] = slope.reshape(count, -1)
+            for tangent, places in zip(self._tangents, self.places, strict=True):
+                slopes[places, :, place] = tangent(params, direction).numpy().reshape(len(places), -1)
             on_column(place)
         slopes /= self.unit[:, None, None]
         slopes[~np.isfinite(self.observed).all(axis=1)] = 0
@@ -180,15 +192,17 @@ class Misfit:
 
     def scores(self, vector: FloatArray) -> FloatArray:
         """Scores of the task of whole reports, [n_rx * rows]; NaN where nothing was received."""
-        task, params, found = task_of(self.record), self._device(vector), []
-        for side, model, seen in zip(self.sides, self._whole, self.record.observation, strict=True):
+        task, params = task_of(self.record), self._device(vector)
+        seen = self.record.observation[:, self.rows]
+        seen = seen.reshape(-1, *seen.shape[2:])
+        found = np.zeros(len(seen))
+        for side, model, places in zip(self.sides, self._whole, self.places, strict=True):
             with dr.suspend_grad():
                 report = model(side(params), None).numpy()
-            truth = seen[self.rows]
-            pairs = np.asarray(report, float)
+            truth, pairs = seen[places], np.asarray(report, float)
             values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
-            found.append(task.score(values.reshape(truth.shape), truth))
-        return np.concatenate(found)
+            found[places] = task.score(values.reshape(truth.shape), truth)
+        return found
 
     @property
     def plane_entries(self) -> IntArray:
@@ -225,6 +239,14 @@ def _recorded_gain(side: TracedField) -> Recorded:
     return Recorded(gain, lambda: side.arrays)
 
 
+def _by_carrier(record: Record, rows: IntArray) -> list[tuple[float | None, IntArray]]:
+    """Carriers and the entries of ``rows`` at each; (None, all) for records of one carrier."""
+    if record.carriers_hz is None:
+        return [(None, np.arange(len(rows)))]
+    carriers = record.carriers_hz[rows]
+    return [(float(carrier), np.flatnonzero(carriers == carrier)) for carrier in np.unique(carriers)]
+
+
 def _stride(length: int, most: int) -> int:
     """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
     found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
@@ -237,4 +259,5 @@ def search_options(options: CorrectionOptions) -> TracedOptions:
         transmission=True, max_depth=options.depth, max_reflections=options.reflections, rays=options.rays
     )
     degree = options.pattern_degree if PATTERNS in options.parts else 0
-    return TracedOptions(trace, degree, faint=options.faint, materials="surface", thickness=True, planes=True)
+    whole: dict[str, Any] = {"materials": "surface", "thickness": True, "exponent": True, "planes": True}
+    return TracedOptions(trace, degree, faint=options.faint, **whole)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
-from ..tracing.material_parameters import PREFIX
+from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.traced_field import TX_PATTERN
@@ -19,6 +19,9 @@ FRAME = "frame"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
 PARTS = (MATERIALS, PLANES, FRAME, GAIN, "pose", PATTERNS)
 """What a correction may change."""
+EXPONENT_SD = 0.3
+"""Standard deviation of the exponent of a conductivity with the frequency; ITU-R P.2040 has 0.16 to 1.34 for building
+materials other than metal."""
 FLAT = 10.0
 """Standard deviation of the logarithm of a gain, and of its phase in rad: no prior knowledge."""
 
@@ -93,6 +96,8 @@ class CorrectionOptions(CheckedSettings):
         """Standard deviation of the entries of a parameter before the correction; of planes without the frame's."""
         scale = {"permittivity": 1.0, "conductivity": 2.0, "thickness": 0.5}
         last = name.rpartition(".")[2]
+        if last == EXPONENT:
+            return EXPONENT_SD
         if name.startswith(PREFIX):
             return self.material_sd * scale[last]
         tight = PLANES not in self.parts

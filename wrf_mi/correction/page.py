@@ -23,14 +23,19 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_figure
 from ..tasks import task_of
-from ..tracing.corrected_scene import material_constants, moved_triangles, write_corrected_scene
+from ..tracing.corrected_scene import (
+    material_constants,
+    material_exponents,
+    moved_triangles,
+    write_corrected_scene,
+)
 from ..tracing.material_parameters import SURFACE, name_of
 from ..tracing.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
 from .frame import rigid_motion
 from .options import FRAME, MATERIALS
-from .search import ABSENT
+from .search import ABSENT, CONSTANTS, QUANTITIES
 
 PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
 SUPPORTED = 0.5
@@ -140,7 +145,9 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
     paths = misfit.counts()[1]
     before = material_constants(slabs, {})
     after = material_constants(slabs, correction.parameters) if correction.kept else before
-    parts = [misfit.parts.get(name_of(SURFACE, q)) for q in ("permittivity", "conductivity", "thickness")]
+    exponent = material_exponents(slabs, correction.parameters if correction.kept else {})
+    quantities = QUANTITIES if misfit.several_carriers else CONSTANTS
+    parts = [misfit.parts.get(name_of(SURFACE, quantity)) for quantity in quantities]
     found = []
     for index, name in enumerate(slabs.names):
         places = [part.start + index for part in parts if part is not None]
@@ -156,6 +163,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
                 "permittivity": [float(before[index, 0]), float(after[index, 0])],
                 "conductivity": [float(before[index, 1]), float(after[index, 1])],
                 "thickness_m": [float(before[index, 2]), float(after[index, 2])],
+                "conductivity_exponent": [float(slabs.exponent[index]), float(exponent[index])],
                 "sd_log": None if sd is None else sd.tolist(),
                 "measured": None if sd is None else (sd / correction.prior[places] <= SUPPORTED).tolist(),
             }
@@ -216,16 +224,22 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         lines.append("")
     fitted = [one for one in facts["materials"] if one["sd_log"] is not None]
     if fitted:
-        lines += ["## Materials", "", "Constants hold at the carrier; a constant in parentheses is not identified."]
-        lines += ["", "| surface | paths | chosen | permittivity | conductivity (S/m) | thickness (m) |"]
-        lines.append("| --- | ---: | --- | ---: | ---: | ---: |")
+        several, hz = correction.misfit.several_carriers, float(correction.scene.frequency[0])
+        law = " At another carrier f it is multiplied by (f / f0)^d." if several else ""
+        text = f"Conductivities hold at the carrier f0 = {hz / 1e9:.6g} GHz.{law} A constant in parentheses is not"
+        lines += ["## Materials", "", f"{text} identified."]
+        more = " exponent d |" if several else ""
+        lines += ["", f"| surface | paths | chosen | permittivity | conductivity (S/m) | thickness (m) |{more}"]
+        lines.append("| --- | ---: | --- | ---: | ---: | ---: |" + " ---: |" * several)
         for one in sorted(fitted, key=lambda one: -one["paths"]):
             cells = []
-            for key, sd, sure in zip(
-                ("permittivity", "conductivity", "thickness_m"), one["sd_log"], one["measured"], strict=True
-            ):
+            keys = "permittivity", "conductivity", "thickness_m"
+            for key, sd, sure in zip(keys, one["sd_log"], one["measured"], strict=False):
                 value = f"{one[key][1]:.3g}" + (f" x/ {math.exp(sd):.2g}" if sure else "")
                 cells.append(value if sure else f"({value})")
+            if several:
+                exponent, sd = one["conductivity_exponent"][1], one["sd_log"][-1]
+                cells.append(f"{exponent:.2f} ± {sd:.2f}" if one["measured"][-1] else f"({exponent:.2f})")
             taken = "absent, left out" if one["absent"] else one["first_choice"] or "as stated"
             lines.append(f"| {one['surface']} | {one['paths']} | {taken} | " + " | ".join(cells) + " |")
         lines.append("")

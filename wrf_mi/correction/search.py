@@ -16,8 +16,14 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, SURFACE, name_of
-from ..tracing.materials import itu_constants
+from ..tracing.material_parameters import (
+    EXPONENT,
+    LEAST_CONDUCTIVITY,
+    LEAST_SUSCEPTIBILITY,
+    SURFACE,
+    name_of,
+)
+from ..tracing.materials import itu_constants, itu_exponent
 from ..tracing.plane_parameters import SHIFT, TILT
 from .least_squares import Noise
 from .misfit import Misfit
@@ -25,6 +31,9 @@ from .path_sum import PathSum, near
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
+CONSTANTS = ("permittivity", "conductivity", "thickness")
+QUANTITIES = (*CONSTANTS, EXPONENT)
+"""Parameters of a surface's material, in the order of a choice's values."""
 ABSENT = "absent"
 """Choice of a surface that waves do not notice."""
 ABSENT_THICKNESS_M = 0.001
@@ -71,13 +80,16 @@ def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list
     """Choices of materials of the slabs ``hit``, those with most paths first."""
     known = {name: values for name, values in itu_constants(frequency_hz).items() if name in COMMON}
     values = {
-        name: np.log([max(permittivity - 1, LEAST_SUSCEPTIBILITY), max(conductivity, LEAST_CONDUCTIVITY), thickness])
+        name: np.append(
+            np.log([max(permittivity - 1, LEAST_SUSCEPTIBILITY), max(conductivity, LEAST_CONDUCTIVITY), thickness]),
+            itu_exponent(name, frequency_hz),
+        )
         for name, (permittivity, conductivity, thickness) in known.items()
     }
-    values[ABSENT] = np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, ABSENT_THICKNESS_M])
-    first = [misfit.parts[name_of(SURFACE, q)].start for q in ("permittivity", "conductivity", "thickness")]
+    values[ABSENT] = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, ABSENT_THICKNESS_M]), 0.0)
+    first = [misfit.parts[name_of(SURFACE, quantity)].start for quantity in QUANTITIES]
     names = misfit.sides[0].slabs.names
-    return [Choice(names[slab], np.add(first, slab), values, np.full(3, np.inf)) for slab in hit]
+    return [Choice(names[slab], np.add(first, slab), values, np.full(len(first), np.inf)) for slab in hit]
 
 
 def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, frequency_hz: float) -> list[Choice]:

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 import yaml
 from numpy.typing import ArrayLike
-from wrf_mi_scenes.mitsuba_xml import PERFECT, scene_xml
+from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
 from ..core.files import atomic_folder, one_line, write_atomically
@@ -148,7 +148,7 @@ def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, f
     """Material of each surface, and constants of those that are used and of the scene's own."""
     used = materials.by_surface()
     own = {name: values for name, values in materials.constants.items() if name in used.values()}
-    return used, {name: {key: float(f"{value:.9g}") for key, value in values.items()} for name, values in own.items()}
+    return used, {name: {key: float(f"{values[key]:.9g}") for key in PERFECT_CONSTANTS} for name, values in own.items()}
 
 
 def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:

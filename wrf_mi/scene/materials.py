@@ -7,7 +7,9 @@ perfect conductor:
     surfaces: {floor: floor, wall_01: wall, wall_02: itu_glass}
     thickness_m: {itu_concrete: 0.25, itu_plasterboard: 0.1}
 
-Materials of one's own have constants, which hold at every frequency, and names that do not begin with ``itu``:
+Materials of one's own have constants, which hold at every frequency, and names that do not begin with ``itu``. With
+``conductivity_exponent`` d and ``carrier_hz`` f0 the conductivity at a frequency f is that stated times (f / f0)^d,
+the law of ITU-R P.2040; a scene file holds it at f0:
 
     surfaces: {wall_03: panel}
     constants: {panel: {relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08}}
@@ -32,6 +34,10 @@ from .surfaces import KINDS
 
 FILE = "materials.yml"
 KEYS = ("rules", "surfaces", "thickness_m", "constants")
+EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
+"""Optional numbers of a material with constants; both or neither."""
+STEEPEST = 5.0
+"""Largest exponent; ITU-R P.2040 has 0 to 2.4."""
 NAME = re.compile(r"\w+", re.ASCII)
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
 """Default slab thickness of every material, metres."""
@@ -68,6 +74,11 @@ class Materials:
     def by_surface(self) -> dict[str, str]:
         """Material of each listed surface by its name."""
         return {name: self.of(name, "other") for name in self.surfaces}
+
+    @property
+    def laws(self) -> dict[str, tuple[float, float]]:
+        """Exponent of the conductivity, and the carrier in Hz at which it is stated, of materials with such a law."""
+        return {name: (v[EXPONENT], v[CARRIER]) for name, v in self.constants.items() if EXPONENT in v}
 
     def complete(self, kinds: Mapping[str, str]) -> Materials:
         """Materials with every rule, every surface and the thickness of every used material stated.
@@ -128,12 +139,16 @@ def _check_constants(file: Path, name: Any, values: Any) -> None:
     where = f"{file}: constants: {name}"
     if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*THICKNESS_M, *KINDS) or name[:3] == "itu":
         raise InputError(f"{where}: choose a name of letters, digits and _ that is no kind and does not begin with itu")
-    if not isinstance(values, dict) or set(values) != set(PERFECT_CONSTANTS):
-        raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}")
-    least = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
+    needed = set(PERFECT_CONSTANTS)
+    if not isinstance(values, dict) or set(values) not in (needed, needed | {EXPONENT, CARRIER}):
+        law = f"{EXPONENT} and {CARRIER} for a law of the conductivity"
+        raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}, with {law}")
+    least = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0, EXPONENT: -STEEPEST, CARRIER: 0.0}
     for key, value in values.items():
-        if not _is_number(value) or value < least[key] or (key == "thickness" and value <= 0):
+        if not _is_number(value) or value < least[key] or (key in ("thickness", CARRIER) and value <= 0):
             raise InputError(f"{where}: {key} is {value!r}; give a number from {least[key]:g} upwards")
+    if abs(values.get(EXPONENT, 0)) > STEEPEST:
+        raise InputError(f"{where}: {EXPONENT} is {values[EXPONENT]!r}; give -{STEEPEST:g} to {STEEPEST:g}")
 
 
 def materials_text(materials: Materials) -> str:

@@ -15,9 +15,18 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..scene.folder import write_scene
-from ..scene.materials import THICKNESS_M, Materials
+from ..scene.materials import CARRIER, THICKNESS_M, Materials
+from ..scene.materials import EXPONENT as LAW
 from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
-from .material_parameters import SURFACE, MaterialGrouping, SlabMaterials, name_of, read_materials, slabs_of_faces
+from .material_parameters import (
+    EXPONENT,
+    SURFACE,
+    MaterialGrouping,
+    SlabMaterials,
+    name_of,
+    read_materials,
+    slabs_of_faces,
+)
 from .materials import in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
@@ -94,6 +103,12 @@ def material_constants(slabs: SlabMaterials, parameters: Mapping[str, NDArray[An
     return values
 
 
+def material_exponents(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
+    """Exponents of the conductivities of n slabs [n], from ``parameters`` where they have them."""
+    found = parameters.get(name_of(SURFACE, EXPONENT)) if slabs.grouping == "surface" else None
+    return slabs.exponent if found is None else np.asarray(found, float).ravel()
+
+
 def write_corrected_scene(
     folder: str | Path,
     scene: Any,
@@ -107,7 +122,8 @@ def write_corrected_scene(
     """Write a scene with moved planes and changed materials as a scene folder.
 
     Objects whose surfaces differ in material become several. Materials that have not changed keep their names, unless
-    Sionna RT does not know them at the carrier that the scene is set to; others have constants, which hold there.
+    Sionna RT does not know them at the carrier that the scene is set to; others have constants, which hold there, and
+    the exponent of the conductivity with the frequency.
 
     Args:
         folder: the new folder.
@@ -131,6 +147,7 @@ def write_corrected_scene(
     triangles = moved_triangles(surfaces, parameters)
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
     stated, fitted = material_constants(slabs, {}), material_constants(slabs, parameters)
+    exponent = material_exponents(slabs, parameters)
     changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
     carrier_hz = float(scene.frequency[0])
     parts, entries, constants, thickness = [], {}, {}, {}
@@ -145,7 +162,8 @@ def write_corrected_scene(
             material = scene.objects[name].radio_material.name
             if changed[slab] or material not in THICKNESS_M:
                 material = f"fitted_{(part if grouping == 'surface' else material).replace('-', '_')}"
-                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
+                law = {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
+                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True)) | law
             elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):
                 material = f"{itu}_{carrier_hz / 1e6:.0f}mhz"
                 constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))

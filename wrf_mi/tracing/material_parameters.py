@@ -1,7 +1,9 @@
 """Radio materials as parameters without bounds.
 
 Relative permittivity 1 + exp(x), conductivity exp(y) in S/m and thickness exp(z) in metres: a step of an optimiser
-changes each by a factor, and permittivity > 1, conductivity > 0, thickness > 0 hold by construction.
+changes each by a factor, and permittivity > 1, conductivity > 0, thickness > 0 hold by construction. At another
+frequency f than that f0 of the scene, the conductivity is exp(y) (f / f0)^d, the law of ITU-R P.2040; the exponent d
+is an optional parameter, too.
 
 A scene has them for each of its named materials or, started from those, for each of its surfaces, the faces of an
 object in a plane. The thickness is an optional parameter.
@@ -9,7 +11,8 @@ object in a plane. The thickness is an optional parameter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 from ..backend.device import on_device
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from .materials import conductivity_exponent
 from .surfaces import Surfaces
 
 LEAST_SUSCEPTIBILITY = 1e-3
@@ -27,7 +31,7 @@ LEAST_SUSCEPTIBILITY = 1e-3
 LEAST_CONDUCTIVITY = 1e-6
 """Start of the conductivity of lossless materials, S/m."""
 
-PREFIX = "material."
+PREFIX, EXPONENT = "material.", "exponent"
 SURFACE = "surface"
 """In place of a material's name: parameters [n] of all surfaces."""
 MaterialGrouping = Literal["named", "surface"]
@@ -35,8 +39,8 @@ MaterialGrouping = Literal["named", "surface"]
 
 
 def name_of(material: str, quantity: str) -> str:
-    """A material's parameter: ``material.<name>.permittivity``, ``.conductivity`` or ``.thickness``; `SURFACE` for all
-    surfaces.
+    """A material's parameter: ``material.<name>.permittivity``, ``.conductivity``, ``.thickness`` or ``.exponent``;
+    `SURFACE` for all surfaces.
     """
     return f"{PREFIX}{material}.{quantity}"
 
@@ -51,6 +55,7 @@ class SlabMaterials:
         conductivity: S/m, shape [n].
         thickness_m: thickness of the slab that stands for a surface, shape [n].
         reflected: share of the reflected amplitude that is not scattered, shape [n].
+        exponent: exponent of the frequency in the conductivity, shape [n].
         grouping: parameters are [1] for each named material, or [n] for all surfaces.
     """
 
@@ -59,16 +64,21 @@ class SlabMaterials:
     conductivity: FloatArray
     thickness_m: FloatArray
     reflected: FloatArray
+    exponent: FloatArray
     grouping: MaterialGrouping = "named"
 
-    def parameters(self, thickness: bool = False) -> dict[str, NDArray[np.float32]]:
-        """Parameters x, y and, with the thickness, z: of each material [1], or of all surfaces [n]."""
+    def parameters(self, thickness: bool = False, exponent: bool = False) -> dict[str, NDArray[np.float32]]:
+        """Parameters x, y and, with the thickness, z, and the exponent d: of each material [1], or of all surfaces
+        [n].
+        """
         values = {
             "permittivity": np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)),
             "conductivity": np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)),
         }
         if thickness:
             values["thickness"] = np.log(self.thickness_m)
+        if exponent:
+            values[EXPONENT] = self.exponent
         columns = {quantity: column.astype(np.float32) for quantity, column in values.items()}
         if self.grouping == "surface":
             return {name_of(SURFACE, quantity): column for quantity, column in columns.items() if len(column)}
@@ -76,38 +86,44 @@ class SlabMaterials:
         return {name_of(name, quantity): columns[quantity][k : k + 1] for name, k, quantity in each}
 
     def constants(self, float_type: Any) -> list[Any]:
-        """Stated permittivity, conductivity, thickness and reflected share, [n] each, on the device."""
-        return [
-            on_device(c, float_type) for c in (self.permittivity, self.conductivity, self.thickness_m, self.reflected)
-        ]
+        """Stated permittivity, conductivity, thickness, reflected share and exponent, [n] each, on the device."""
+        columns = self.permittivity, self.conductivity, self.thickness_m, self.reflected, self.exponent
+        return [on_device(c, float_type) for c in columns]
 
-    def tables(self, parameters: Mapping[str, Any], stated: Sequence[Any]) -> tuple[Any, Any, Any]:
-        """Relative permittivity, conductivity and thickness [n], from parameters where there are any. Differentiable.
+    def tables(
+        self, parameters: Mapping[str, Any], stated: Sequence[Any], frequency_ratio: float = 1.0
+    ) -> tuple[Any, Any, Any, Any]:
+        """Relative permittivity, conductivity, thickness and reflected share [n], from parameters where there are any.
+        Differentiable.
 
         Args:
             parameters: Dr.Jit tensors by the names of `parameters`.
-            stated: the first three of `constants`, whose float type is that of the result.
+            stated: `constants`, whose float type is that of the result.
+            frequency_ratio: frequency over that at which the scene and parameters state the conductivity.
         """
 
-        def table(quantity: str, constant: FloatArray, given: Any, least: float = 0.0) -> Any:
+        def table(
+            quantity: str, constant: FloatArray, given: Any, least: float = 0.0, inverse: Callable[[Any], Any] = dr.exp
+        ) -> Any:
             float_type: Any = type(given)
             if self.grouping == "surface":
                 whole = parameters.get(name_of(SURFACE, quantity))
-                return given if whole is None else least + dr.exp(float_type(whole.array))
+                return given if whole is None else least + inverse(float_type(whole.array))
             found = [parameters.get(name_of(name, quantity)) for name in self.names]
             if all(parameter is None for parameter in found):
                 return given
             entries = []
             for value, parameter in zip(constant, found, strict=True):
                 fixed = float_type(float(value))
-                entries.append(fixed if parameter is None else least + dr.exp(float_type(parameter.array)))
+                entries.append(fixed if parameter is None else least + inverse(float_type(parameter.array)))
             return dr.concat(entries)
 
-        return (
-            table("permittivity", self.permittivity, stated[0], 1.0),
-            table("conductivity", self.conductivity, stated[1]),
-            table("thickness", self.thickness_m, stated[2]),
-        )
+        conductivity = table("conductivity", self.conductivity, stated[1])
+        if frequency_ratio != 1:
+            exponent = table(EXPONENT, self.exponent, stated[4], inverse=lambda value: value)
+            conductivity = conductivity * dr.exp(exponent * math.log(frequency_ratio))
+        permittivity = table("permittivity", self.permittivity, stated[0], 1.0)
+        return permittivity, conductivity, table("thickness", self.thickness_m, stated[2]), stated[3]
 
 
 def read_materials(scene: Any) -> SlabMaterials:
@@ -119,7 +135,9 @@ def read_materials(scene: Any) -> SlabMaterials:
 
     reflected = np.sqrt(1 - column("scattering_coefficient") ** 2)
     constants = column("relative_permittivity"), column("conductivity"), column("thickness")
-    return SlabMaterials(tuple(known), *constants, reflected)
+    hz = float(scene.frequency[0])
+    exponent = np.array([conductivity_exponent(material, hz) for material in known.values()])
+    return SlabMaterials(tuple(known), *constants, reflected, exponent)
 
 
 def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
@@ -145,6 +163,7 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
     slab_of_face[is_slab] = surface.reshape(-1)
     names = tuple(f"{surfaces.names[index]}/{plane}" for index, plane in pairs)
     which = number[pairs[:, 0]]
-    permittivity, conductivity = named.permittivity[which], named.conductivity[which]
-    constants = permittivity, conductivity, named.thickness_m[which], named.reflected[which]
-    return SlabMaterials(names, *constants, grouping), slab_of_face
+    columns = named.permittivity, named.conductivity, named.thickness_m, named.reflected, named.exponent
+    permittivity, conductivity, thickness_m, reflected, exponent = (column[which] for column in columns)
+    found = SlabMaterials(names, permittivity, conductivity, thickness_m, reflected, exponent, grouping)
+    return found, slab_of_face

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M, THICKNESS_M
 
 from ..core import InputError
+from ..scene.materials import EXPONENT
 
 logger = logging.getLogger(__name__)
 
@@ -52,13 +54,19 @@ def perfect_reflector() -> Any:
     )
 
 
-def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, float] | None = None) -> None:
+def set_frequency(
+    scene: Any,
+    frequency_hz: float,
+    thickness_m: Mapping[str, float] | None = None,
+    laws: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> None:
     """Set a Sionna RT scene's frequency, with explicit constants for ITU materials below their range (logged).
 
     Args:
         scene: a ``sionna.rt.Scene``.
         frequency_hz: carrier frequency.
         thickness_m: new slab thickness of materials by name in the scene (``itu_*``), metres.
+        laws: exponent of the conductivity, and carrier in Hz at which it is stated, of materials with constants.
 
     Raises:
         InputError: a material has neither a range of ITU-R P.2040 nor a constant at this frequency.
@@ -72,6 +80,8 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
             material.thickness = thickness_m[name]
         itu_type = getattr(material, "itu_type", None)
         if itu_type is None:
+            if name in laws and not hasattr(material, EXPONENT):
+                _follow(material, *laws[name])
             continue
         if in_itu_range(itu_type, frequency_hz):
             continue
@@ -91,6 +101,29 @@ def set_frequency(scene: Any, frequency_hz: float, thickness_m: Mapping[str, flo
             ", ".join(sorted(constant)),
         )
     scene.frequency = frequency_hz
+
+
+def _follow(material: Any, exponent: float, carrier_hz: float) -> None:
+    """Let a material's conductivity, stated at a carrier, follow a power of the frequency."""
+    permittivity, conductivity = material.relative_permittivity, material.conductivity
+    material.frequency_update_callback = lambda hz: (permittivity, conductivity * (hz / carrier_hz) ** exponent)
+    setattr(material, EXPONENT, exponent)
+
+
+def conductivity_exponent(material: Any, frequency_hz: float) -> float:
+    """Exponent d of a material's conductivity, which is proportional to f^d about a frequency; 0 without a law."""
+    if (itu_type := getattr(material, "itu_type", None)) is None:
+        return float(getattr(material, EXPONENT, 0.0))
+    return itu_exponent(itu_type, frequency_hz)
+
+
+def itu_exponent(name: str, frequency_hz: float) -> float:
+    """`conductivity_exponent` of a material of ITU-R P.2040; 0 outside its range."""
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    ranges = ITU_MATERIALS_PROPERTIES[name].items()
+    known = [float(values[3]) for (low, high), values in ranges if low <= frequency_hz / 1e9 <= high]
+    return known[0] if known else 0.0
 
 
 def in_itu_range(name: str, frequency_hz: float) -> bool:

@@ -48,13 +48,11 @@ def open_scene(
             material that is missing, unknown or superfluous.
     """
     backend.init()
-    path = Path(source)
+    path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()
     if not path.exists() and (known := scenes().get(str(source))):
         path, stated_m = known.xml, known.thickness_m
     elif path.is_dir():
-        path, stated_m = _folder(path)
-    else:
-        stated_m = {}
+        path, stated_m, laws = _folder(path)
     if not path.is_file():
         ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
         raise InputError(f"{source}: no such scene file; give {ways}")
@@ -70,18 +68,18 @@ def open_scene(
     if (height := float(bounds.max.z - bounds.min.z)) > HIGHEST_M:
         text = f"{height:.0f} m high, as if in millimetres"
         raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
-    set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})})
+    set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})}, laws)
     return scene
 
 
-def _folder(folder: Path) -> tuple[Path, Mapping[str, float]]:
-    """Scene file and thicknesses of a scene folder, from a scan or like those that come with the package."""
+def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float, float]]]:
+    """Scene file, thicknesses and laws of a scene folder, from a scan or like those that come with the package."""
     if (folder / MATERIALS_FILE).is_file():
         read = read_scene_folder(folder)
-        return read.xml, read.materials.thickness_m
+        return read.xml, dict(read.materials.thickness_m), read.materials.laws
     try:
         facts = yaml.safe_load((folder / FACTS_FILE).read_text(encoding="utf-8"))
-        return folder / facts["xml"], facts.get("thickness_m", {})
+        return folder / facts["xml"], dict(facts.get("thickness_m", {})), {}
     except FileNotFoundError:
         raise InputError(f"{folder}: no {FACTS_FILE} in it, so not a scene folder; give one, or a file") from None
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:

@@ -63,6 +63,7 @@ class TracedOptions:
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the scene's materials, add up
             to less than this share of the amplitudes of all; 0: none.
         thickness: whether thicknesses of materials are parameters, too.
+        exponent: whether exponents of conductivities with the frequency are parameters, too.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -73,6 +74,7 @@ class TracedOptions:
     planes: bool = False
     faint: float = 0.0
     thickness: bool = False
+    exponent: bool = False
 
     def __post_init__(self) -> None:
         """Check the options of the search.
@@ -117,8 +119,10 @@ class TracedField:
         traced: known paths from these transmitters to this receiver; None: paths are searched.
         prepared: shared state of the scene for several fields in it: rays of a receiver are then shot once, and the
             caller checks the antennas (`wrf_mi.tracing.solve.Prepared.check`).
+        frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
 
     Attributes:
+        frequency_hz: carrier of the paths.
         chains: surfaces that each path meets, planes as stated.
         slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
         surfaces: surfaces of the scene, with the planes of the parameters.
@@ -139,6 +143,7 @@ class TracedField:
         tx_heading_rad: ArrayLike | None = None,
         traced: TraceResult | None = None,
         prepared: Prepared | None = None,
+        frequency_hz: float | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
         if self.tx_pos_m.ndim != 2 or self.tx_pos_m.shape[1] != 3 or not np.isfinite(self.tx_pos_m).all():
@@ -158,7 +163,8 @@ class TracedField:
         self._prepared = prepared
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
-        self.frequency_hz = float(scene.frequency[0])
+        self._stated_hz = float(scene.frequency[0])
+        self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
         self.searches = 0
         self.surfaces: Surfaces = prepared.surfaces if prepared else scene_surfaces(scene)
         self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
@@ -202,7 +208,7 @@ class TracedField:
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
-        values = self.slabs.parameters(self.options.thickness) | pose_parameters(self.receiver)
+        values = self.slabs.parameters(self.options.thickness, self.options.exponent) | pose_parameters(self.receiver)
         values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
         if self.options.pattern_degree:
             names = self.pattern_name, TX_PATTERN
@@ -238,7 +244,7 @@ class TracedField:
             chosen = row * self._each + slot % self._each
             chains = chains.select(chosen)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        tables = (*self.slabs.tables(parameters, self._constants[:3]), self._constants[3])
+        tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
         pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
