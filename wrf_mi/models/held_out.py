@@ -37,7 +37,9 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
     parts. A fold holds out a cluster, whose rows lie as far from the remaining ones as those of a blocked split, and a
     part, whose rows lie as near as those of a random split. Up to `FEW_ROWS` rows are held out one by one.
 
-    Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds.
+    Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds; where
+    it holds out a carrier, the trained carriers are held out in turn, at held-out positions if the split's test
+    positions are not among the training rows'.
 
     Args:
         record: data with known positions.
@@ -49,6 +51,8 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
     """
     if split.held_receivers:
         return _hold_out_receivers(record, split)
+    if record.carriers_hz is not None and not np.isin(record.carriers_hz[split.test], _carriers(record, split)).any():
+        return _hold_out_carriers(record, split)
     rows = split.all_train
     n, positions = len(rows), record.tx_pos_m[rows]
     places = len(np.unique(positions, axis=0))
@@ -88,6 +92,32 @@ def _hold_out_receivers(record: Record, split: Split) -> list[Split]:
         )
         for number, group in enumerate(np.array_split(order, min(FOLDS, len(trained))))
     ]
+
+
+def _carriers(record: Record, split: Split) -> FloatArray:
+    """Carriers of the training rows, ascending, Hz."""
+    assert record.carriers_hz is not None
+    return np.unique(record.carriers_hz[split.all_train])
+
+
+def _hold_out_carriers(record: Record, split: Split) -> list[Split]:
+    carriers, rows = _carriers(record, split), split.all_train
+    if len(carriers) < 2:
+        return []
+    assert record.carriers_hz is not None
+    place = np.unique(record.tx_pos_m, axis=0, return_inverse=True)[1].reshape(-1)
+    known = np.isin(place[split.test], place[rows]).any()
+    order = np.random.default_rng([split.seed, 4]).permutation(np.unique(place[rows]))
+    parts = [order] * len(carriers) if known else np.array_split(order, len(carriers))
+    folds = []
+    for number, (carrier, held) in enumerate(zip(carriers, parts, strict=True)):
+        at, there = record.carriers_hz == carrier, np.isin(place, held)
+        gone = rows[at[rows] | (there[rows] if not known else False)]
+        train, validation = (np.setdiff1d(part, gone) for part in (split.train, split.validation))
+        test = rows[at[rows] & there[rows]]
+        if len(test) and len(train) + len(validation) >= 2:
+            folds.append(Split(f"fold {number}", split.seed, train, validation, test))
+    return folds
 
 
 def distance_to_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receiver: int) -> FloatArray:

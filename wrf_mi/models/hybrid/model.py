@@ -256,6 +256,7 @@ MODEL = Model(
     scene="optional",
     uplink="optional",
     headings=True,
+    several_carriers=True,
     new_receivers=True,
     check=check,
 )
