@@ -23,7 +23,7 @@ from wrf_mi.runs.api import open_run, plan_run, train
 from wrf_mi.runs.evaluate import reference_predictions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
-from wrf_mi.tasks import TASKS, instrument_of
+from wrf_mi.tasks import CARRIER, TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace
 from wrf_mi.tracing.polarization import cross_polarized
 from wrf_mi.tracing.result import join_traces, recompute
@@ -74,7 +74,7 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
 
 def test_models_of_several_carriers_are_named(flat: Record) -> None:
     with pytest.raises(
-        InputError, match=r"so choose another model \(idw, kriging, trees, mri\) or give the rows of ea"
+        InputError, match=r"so choose another model \(hybrid, idw, kriging, trees, mri\) or"
     ):
         plan_run(flat, "wrf-gs+")
 
@@ -149,6 +149,8 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
     settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
     found = read_run(train(three, tmp_path / "run", name, split="frequency-known:1", settings=settings).folder)
     assert (carriers[found.row] == middle).all()
+    step = found.references[TASKS["rssi"].reference] - found.references[CARRIER]
+    np.testing.assert_allclose(step, -20 * np.log10(middle / LOW), atol=FLOAT32_DB)  # the lower of two as near
     lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
     low = train(three, tmp_path / "low", name, split=lowest, settings=settings)
     turned = heading[found.row] if heading is not None and name in ("kriging", "trees") else None

@@ -22,7 +22,7 @@ from ..models import Fitted, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import default_settings, inputs_of
-from ..tasks import LAW, TASKS, UPLINK
+from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from ..training.trainer import peak_memory_mb
 from .folder import METRICS, PREDICTIONS, RunConfig
@@ -252,7 +252,9 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
     """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] of the test rows by key.
 
     Inverse-distance weighting (IDW) needs positions of training and test rows; the copy of the uplink needs an uplink.
-    At receivers that the split holds out, the path-loss law of the others' training rows takes their place.
+    At receivers that the split holds out, the path-loss law of the others' training rows takes their place. Where test
+    rows have carriers without training rows, IDW interpolates between carriers, and a further reference is IDW at the
+    nearest carrier with training rows.
 
     Raises:
         InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
@@ -269,6 +271,12 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
         fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
         inputs, receivers = inputs_of(record, rows), range(len(record.receivers))
         found[key] = np.stack([fitted.predict(inputs, receiver).mean for receiver in receivers]).astype(kind)
+        if record.carriers_hz is not None and inputs.carriers_hz is not None:
+            known = np.unique(record.carriers_hz[split.all_train])
+            nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
+            if (nearest != inputs.carriers_hz).any():
+                there = replace(inputs, carriers_hz=nearest)
+                found[CARRIER] = np.stack([fitted.predict(there, receiver).mean for receiver in receivers]).astype(kind)
     if not found:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")

@@ -8,7 +8,7 @@ from ..core import InputError, Record
 from ..core.registry import Registry
 from ..receivers.instruments import Instrument
 from . import csi, rssi, spectrum
-from .task import LAW, UPLINK, Task
+from .task import CARRIER, LAW, UPLINK, Task
 
 ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""
@@ -58,4 +58,4 @@ def require(record: Record, *names: str, why: str) -> None:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = ["ENTRY_POINTS", "LAW", "TASKS", "UPLINK", "Task", "instrument_of", "register", "require", "task_of"]
+__all__ = ["ENTRY_POINTS", "CARRIER", "LAW", "TASKS", "UPLINK", "Task", "instrument_of", "register", "require", "task_of"]

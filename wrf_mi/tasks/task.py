@@ -18,6 +18,8 @@ UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
 LAW = "law"
 """Key of the reference at receivers that were held out."""
+CARRIER = "carrier"
+"""Key of the reference at carriers without training rows: that of `Task.reference` at the nearest carrier with some."""
 
 
 class Task(ABC):
@@ -102,6 +104,7 @@ class Task(ABC):
         """Words for each possible reference by its key; the first that a run has is its headline."""
         known = {self.reference: f"IDW of {self.neighbours} nearest"}
         known |= {LAW: "one path-loss law of all receivers"} if self.in_decibel else {}
+        known |= {} if self.is_complex else {CARRIER: "nearest carrier's rows"}
         return {UPLINK: self.from_uplink} | known if self.from_uplink else known
 
     def headline(self, stored: Container[str]) -> str | None:
