@@ -99,8 +99,6 @@ def with_intervals(entry: Model) -> Model:
 def _folds(entry: Model, problem: Problem, split: Split) -> list[Split]:
     record, rows = problem.record, problem.rows(split)
     known_positions(record, rows, f"{entry.name} with intervals")
-    if record.carriers_hz is not None:
-        raise InputError(f"{record.name}: rows of several carriers; intervals serve one, so omit --intervals")
     folds = hold_out_folds(record, split) if len(rows) else []
     if split.held_receivers and not folds:
         raise InputError(f"{record.name}: one receiver trains; intervals at others need two at least")
