@@ -74,9 +74,9 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
 
 def test_models_of_several_carriers_are_named(flat: Record) -> None:
     with pytest.raises(
-        InputError, match=r"so choose another model \(hybrid, idw, kriging, trees, mri\) or"
+        InputError, match=r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
     ):
-        plan_run(flat, "wrf-gs+")
+        plan_run(flat, "physics")
 
 
 def test_inconsistent_carriers_are_refused(flat: Record) -> None:
@@ -251,10 +251,9 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
     assert read.prediction[0] == pytest.approx(anew, abs=FLOAT32_DB)
 
 
-@pytest.mark.parametrize("setting", ["calibration=gain", "target_error_db=1"])
-def test_calibration_and_target_error_refuse_carriers(setting: str, flat: Record, room: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"rows at 2 carriers, .* calibration and target_error_db serve one carrier"):
-        train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=[setting])
+def test_target_error_refuses_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"rows at 2 carriers, .* target_error_db serves one carrier"):
+        train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["target_error_db=1"])
 
 
 def test_unknown_material_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:

@@ -31,6 +31,12 @@ def by_carrier(
     return np.take(found, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
 
 
+def middle_carrier(carriers_hz: FloatArray) -> float:
+    """The carrier in the middle of those of rows [m], Hz, at which parameters of materials are stated."""
+    distinct = np.unique(carriers_hz)
+    return float(distinct[len(distinct) // 2])
+
+
 def carriers_text(carriers_hz: FloatArray) -> str:
     """Carriers of rows in words, such as ``rows at 2 carriers, 920000000, 2440000000 Hz``."""
     known = [f"{carrier:.10g}" for carrier in np.unique(carriers_hz)]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
+from ..core.carriers import middle_carrier
 from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..scene.folder import read_scene_folder
@@ -161,8 +162,7 @@ def _carrier(record: Record, split: Split) -> float:
     """Carrier in Hz at which parameters of materials hold: of several training carriers the one in the middle."""
     if record.carriers_hz is None:
         return instrument_of(record).carrier_hz
-    carriers = np.unique(record.carriers_hz[split.all_train])
-    return float(carriers[len(carriers) // 2])
+    return middle_carrier(record.carriers_hz[split.all_train])
 
 
 def _at_most(split: Split, count: int) -> Split:

@@ -42,6 +42,7 @@ class Encoding:
         tx_scale_m: unit of transmitter positions, metres.
         features: number of features that replace the encoded transmitter (the uplink channel in the second case study
             of WRF-GS+); 0: the transmitter's position is encoded.
+        carrier: whether a last row of conditions, the logarithm of the carrier, is a feature, too.
     """
 
     position_octaves: int = 10
@@ -49,6 +50,7 @@ class Encoding:
     tx_octaves: int = 10
     tx_scale_m: float = 1.0
     features: int = 0
+    carrier: bool = False
 
     def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
         """Encoded Gaussian centres [6 * octaves, n], detached.
@@ -59,15 +61,19 @@ class Encoding:
         return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
 
     def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
-        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch]."""
-        return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
+        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch]; with the
+        carrier a row more.
+        """
+        if self.features or not self.carrier:
+            return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
+        return dr.concat([encode(points[:3], self.tx_octaves, self.tx_scale_m), points[3:]], axis=0)
 
     @property
     def sizes(self) -> dict[str, int]:
         """Number of features of each part."""
         return {
             "position": encoded_size(self.position_octaves),
-            "transmitter": self.features or encoded_size(self.tx_octaves),
+            "transmitter": (self.features or encoded_size(self.tx_octaves)) + self.carrier,
         }
 
 

@@ -4,6 +4,9 @@
                                                                  ├─► receiver model ─► spectrum, dBm, channel
     tx position ─► chains of planes ─► T ────────────────────────┘
 
+A *port* is a receiver at a carrier: rows of several carriers have as many ports of each receiver, which share its
+parameters; other data have one.
+
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
 ``receiver.*``, ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`) and ``surface.*``
@@ -57,6 +60,7 @@ class Batch:
         condition: positions [3, batch], metres, or features [features, batch] in their place.
         slots: rows of the traced side [batch].
         receiver: number of the receiver, from 0.
+        carrier: logarithm of the carrier over the middle one; None: rows have a single carrier.
         pose: pose of the receiver.
         plane: directions of the learned signal.
         weight: factor of the learned signal [batch], 0 to 1; None: 1.
@@ -68,6 +72,7 @@ class Batch:
     pose: Pose
     plane: Plane
     weight: Any | None = None
+    carrier: Any | None = None
 
 
 Report = Callable[[Mapping[str, Any], Batch], Any]
@@ -81,13 +86,16 @@ class Graph:
         field: field of Gaussians; None: only traced paths.
         receivers: poses, antennas and arrays.
         form: form of the observations.
-        scene: scene from `wrf_mi.tracing.open_scene`, at the carrier; None: only Gaussians.
+        scene: scene from `wrf_mi.tracing.open_scene`, at `Form.carrier_hz`; None: only Gaussians.
         traced: options of tracing, and learning rates.
         tx_antenna: antenna of the transmitters.
         evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
+        stated_hz: carrier relative to which networks see the carriers of rows; None: `Form.carrier_hz`.
 
     Attributes:
         surface: Gaussians on the scene's surfaces, which change its paths; None: none (`cover`).
+        models: receiver model of each port, receiver by receiver.
+        carriers: number of carriers, the ports of a receiver.
 
     Raises:
         InputError: a receiver model or a scene without the array or carrier it needs, or nothing to evaluate.
@@ -102,10 +110,12 @@ class Graph:
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
         evaluation: str = SPLATTED,
+        stated_hz: float | None = None,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
         array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
-        carrier = form.frequencies_hz is None and (self.kind.needs_carrier or scene is not None)
+        unknown = form.frequencies_hz is None and form.carriers_hz is None
+        carrier = unknown and (self.kind.needs_carrier or scene is not None)
         if array or carrier:
             what = "a scene" if scene is not None else f"setting receiver: {form.receiver}"
             needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
@@ -117,8 +127,25 @@ class Graph:
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.form, self.tx_antenna = form, tx_antenna
         self.surface: SurfaceGaussians | None = None
-        self.evaluation = evaluation_of(evaluation, scene, traced)
-        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(form, receiver) for receiver in receivers)
+        self.evaluation, self._evaluation = evaluation_of(evaluation, scene, traced), evaluation
+        self.stated_hz = form.carrier_hz if stated_hz is None else stated_hz
+        at = form.of_ports
+        self.carriers = len(at)
+        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(f, r) for r in receivers for f in at)
+
+    def at_carrier(self, carrier_hz: float) -> Graph:
+        """The same graph for rows of another carrier."""
+        form = replace(self.form, carriers_hz=np.array([carrier_hz]))
+        evaluation = self._evaluation, self.stated_hz
+        found = Graph(self.field, self.receivers, form, self.scene, self.traced, self.tx_antenna, *evaluation)
+        found.surface = self.surface
+        return found
+
+    def log_carrier(self, number: int) -> float | None:
+        """Logarithm of a port's carrier over that at which the scene is stated; None: rows have a single carrier."""
+        if self.form.carriers_hz is None:
+            return None
+        return float(np.log(self.form.carriers_hz[number % self.carriers] / self.stated_hz))
 
     @property
     def sphere(self) -> bool:
@@ -151,14 +178,17 @@ class Graph:
             check_polarization(self.scene, tx_pos_m, self.receivers, self.tx_antenna)
 
     def trace(self, tx_pos_m: ArrayLike, number: int, tx_heading_rad: ArrayLike | None = None) -> TracedField | None:
-        """The traced side of transmitters [n, 3], turned by [n], at one receiver; None without a scene."""
+        """The traced side of transmitters [n, 3], turned by [n], at one port; None without a scene."""
         if self.scene is None:
             return None
         t = self.traced
         trace = TraceOptions(transmission=t.transmission, max_depth=t.depth, max_reflections=t.reflections, rays=t.rays)
-        antenna, receiver = self.tx_antenna, self.receivers[number]
+        antenna, receiver = self.tx_antenna, self.receivers[number // self.carriers]
+        carrier = self.form.of_ports[number % self.carriers]
+        carrier_hz = None if self.form.carriers_hz is None else carrier.carrier_hz
         options = TracedOptions(trace, t.pattern_degree, 1.0, antenna, t.materials, t.moves_planes, t.faint)
-        side = TracedField(self.scene, tx_pos_m, receiver, options, tx_heading_rad, prepared=self._prepared)
+        given = tx_pos_m, receiver, options, tx_heading_rad
+        side = TracedField(self.scene, *given, prepared=self._prepared, frequency_hz=carrier_hz)
         if self.surface:
             side.attach(self.surface)
         return side
@@ -188,7 +218,7 @@ class Graph:
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
         """Starting values of the trained parameters beside the field's, by name, from the traced sides of all
-        receivers.
+        ports.
 
         Raises:
             InputError: without Gaussians, a receiver that no path reaches.
@@ -214,7 +244,7 @@ class Graph:
         """
         assert self.field is not None
         made = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
-        gaussians = by_component(made(params, batch.condition), self.form.components)
+        gaussians = by_component(made(params, _condition(batch)), self.form.components)
         if LEVEL not in params and batch.weight is None:
             return gaussians
         kind: Any = type(gaussians.signal[0])
@@ -240,16 +270,16 @@ class Graph:
         chunked: bool = False,
         surface: bool = True,
     ) -> Report:
-        """Reports of a receiver as a function of parameters, for transmitters of a traced side.
+        """Reports of a port as a function of parameters, for transmitters of a traced side.
 
         Args:
-            number: number of the receiver.
+            number: number of the port.
             side: its traced side, or None.
             learned: with the learned side, where the graph has one.
             chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
             surface: with the Gaussians on surfaces, where the graph has some.
         """
-        model, receiver = self.models[number], self.receivers[number]
+        model, receiver = self.models[number], self.receivers[number // self.carriers]
         moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
@@ -280,10 +310,10 @@ class Graph:
     def match_gain(
         self, number: int, side: TracedField, params: Mapping[str, Any], observed: NDArray[Any]
     ) -> dict[str, NDArray[np.float32]]:
-        """The receiver's starting gain, which matches the mean of the traced reports to the observations.
+        """The receiver's starting gain, which matches the mean of the traced reports of a port to the observations.
 
         Args:
-            number: number of the receiver.
+            number: number of the port.
             side: traced side of the observed transmitters.
             params: values by name, in place of the stated ones.
             observed: observations [n, *shape of a report], NaN where nothing was received.
@@ -298,3 +328,14 @@ class Graph:
             report = report.astype(float).reshape(np.shape(observed))
             gain[0] += model.missing_gain(report[known], observed[known]) if known.any() else 0.0
         return {side.gain_name: gain}
+
+
+def _condition(batch: Batch) -> Any:
+    """Conditions [3 or features, batch] with the carrier, if rows have several, as the last row."""
+    if batch.carrier is None:
+        return batch.condition
+    tensor = type(batch.condition)
+    flat = batch.condition.array
+    count, width = batch.condition.shape
+    whole = dr.concat([flat, dr.repeat(type(flat)(batch.carrier), width)])
+    return tensor(whole, (count + 1, width))

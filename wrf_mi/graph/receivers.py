@@ -8,7 +8,7 @@ of the group `ENTRY_POINTS` that names a `ReceiverKind`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver
 from ..core.angles import FloatArray
+from ..core.carriers import middle_carrier
 from ..core.registry import Registry
 from .combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
@@ -60,12 +61,13 @@ class Form:
     Attributes:
         receiver: name of the receiver model, a key of `RECEIVERS`.
         size: elevations and azimuths of the learned signal's directions; for spectra those of the image.
-        frequencies_hz: carrier [1] or subcarriers [k]; None: unknown.
+        frequencies_hz: carrier [1] or subcarriers [k]; None: unknown, or that of each row.
         outputs: shape of a channel: subcarriers, or antennas and subcarriers; () for other observations.
         basis: complex [components, outputs] that learned channels are sums of; None: no channels.
         features: number of features that describe a transmitter in place of its position; 0: its position.
         headings: whether the transmitters' antenna turns with their (known) headings.
         floor_db: power in dB that is received where no path arrives; NaN: none.
+        carriers_hz: carriers of rows, ascending; None: all rows have the same.
     """
 
     receiver: str
@@ -76,12 +78,15 @@ class Form:
     features: int = 0
     headings: bool = False
     floor_db: float = float("nan")
+    carriers_hz: FloatArray | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for a file."""
         hz = np.array([np.nan]) if self.frequencies_hz is None else np.asarray(self.frequencies_hz, float)
         basis = np.zeros((0, 0), complex) if self.basis is None else self.basis
+        carriers = np.zeros(0) if self.carriers_hz is None else np.asarray(self.carriers_hz, float)
         values = vars(self) | {"frequencies_hz": hz, "outputs": np.asarray(self.outputs, np.int64), "basis": basis}
+        values["carriers_hz"] = carriers
         return {f"form/{name}": np.asarray(value) for name, value in values.items()}
 
     @classmethod
@@ -98,6 +103,7 @@ class Form:
             int(arrays["form/features"]),
             bool(arrays["form/headings"]),
             float(arrays["form/floor_db"]),
+            carriers if (carriers := arrays.get("form/carriers_hz", np.zeros(0))).size else None,
         )
 
     @property
@@ -107,8 +113,17 @@ class Form:
 
     @property
     def carrier_hz(self) -> float:
-        """Mean of the frequencies; NaN where they are unknown."""
+        """Mean of the frequencies, or the middle carrier of rows; NaN where they are unknown."""
+        if self.carriers_hz is not None:
+            return middle_carrier(self.carriers_hz)
         return float("nan") if self.frequencies_hz is None else float(np.mean(self.frequencies_hz))
+
+    @property
+    def of_ports(self) -> tuple[Form, ...]:
+        """Forms at each carrier of rows, or this one alone."""
+        if self.carriers_hz is None:
+            return (self,)
+        return tuple(replace(self, frequencies_hz=np.array([hz]), carriers_hz=None) for hz in self.carriers_hz)
 
 
 @dataclass(frozen=True)

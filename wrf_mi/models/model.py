@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
+from ..core.carriers import middle_carrier
 from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..parallel import Scheduler
@@ -104,14 +105,18 @@ class Problem:
 
     @cached_property
     def opened_scene(self) -> Any | None:
-        """The scene (``sionna.rt.Scene``) at the record's carrier, opened on first access, or None.
+        """The scene (``sionna.rt.Scene``) at the record's carrier, or the middle one of its rows, opened on first
+        access, or None.
 
         Raises:
             InputError: it cannot be opened, or the carrier is unknown.
         """
         from ..tasks import instrument_of
 
-        return None if self.scene is None else self.open_scene(instrument_of(self.record).carrier_hz)
+        if self.scene is None:
+            return None
+        carriers = self.record.carriers_hz
+        return self.open_scene(instrument_of(self.record).carrier_hz if carriers is None else middle_carrier(carriers))
 
     def open_scene(self, frequency_hz: float) -> Any | None:
         """The scene at another frequency, Hz, or None.

@@ -197,7 +197,8 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     if problem.settings.calibration is not None:
         found = fit_field(_graph_problem(problem), split, session)
         if _changes_scene(problem):
-            write_corrected_scene(session.folder / CORRECTED, problem.opened_scene, found.params, replace=True)
+            scene = found.predictor.graph.scene
+            write_corrected_scene(session.folder / CORRECTED, scene, found.params, replace=True)
         kept = load(found.arrays(), problem, session.folder)
         kept.train_seconds = found.train_seconds
         return kept
@@ -276,12 +277,11 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
     settings, carriers = problem.settings, problem.record.carriers_hz
     if carriers is not None:
-        if settings.calibration is not None or settings.target_error_db is not None:
-            text = "calibration and target_error_db serve one carrier; omit both"
+        if settings.target_error_db is not None:
+            text = "target_error_db serves one carrier; omit it"
             raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
         for carrier_hz in np.unique(carriers):
             problem.open_scene(float(carrier_hz))
-        return
     if problem.settings.calibration is not None:
         if held := [split.name for split in splits if split.held_receivers]:
             text = "calibration trains the gain of each receiver, which one that was held out lacks"

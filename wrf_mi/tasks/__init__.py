@@ -58,4 +58,15 @@ def require(record: Record, *names: str, why: str) -> None:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = ["ENTRY_POINTS", "CARRIER", "LAW", "TASKS", "UPLINK", "Task", "instrument_of", "register", "require", "task_of"]
+__all__ = [
+    "CARRIER",
+    "ENTRY_POINTS",
+    "LAW",
+    "TASKS",
+    "UPLINK",
+    "Task",
+    "instrument_of",
+    "register",
+    "require",
+    "task_of",
+]

@@ -7,16 +7,29 @@ from typing import Any
 from ..core import InputError
 from ..gaussians import FIELDS, Encoding
 from ..graph.graph import Field
-from .config import TrainConfig
+from ..graph.receivers import Form
+from .config import PATHS_ALONE, TrainConfig
 
 
-def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> Field:
+def field_of(config: TrainConfig, form: Form) -> Field | None:
+    """The field of a configuration for observations of a form; None: paths are trained alone.
+
+    Raises:
+        InputError: as `make_field`.
+    """
+    if config.model == PATHS_ALONE:
+        return None
+    return make_field(config, form.components, form.features, form.carriers_hz is not None)
+
+
+def make_field(config: TrainConfig, components: int = 1, features: int = 0, carrier: bool = False) -> Field:
     """The field of a configuration.
 
     Args:
         config: settings.
         components: complex signals of a Gaussian.
         features: number of features that describe a transmitter instead of its position; 0: its position.
+        carrier: whether networks see the carrier.
 
     Raises:
         InputError: no trainable model of that name, unsuitable settings, or an unresolved scale of transmitters.
@@ -41,5 +54,5 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0) -> F
     if plus:
         sizes |= {"static_geometry": n.static_geometry, "phase_hz": n.phase_hz}
         sizes |= {"skip": n.layers // 2} if n.layers else {}
-    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features)
+    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
     return FIELDS[model](encoding=encoding, components=components, **sizes)

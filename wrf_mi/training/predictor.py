@@ -18,11 +18,13 @@ from ..backend.device import to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
+from ..core.carriers import by_carrier, carriers_text
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.chunks import CHUNK_SIZE
+from ..gaussians.footprint import Pose
 from ..gaussians.parameters import Gaussians
-from ..gaussians.tiles import perception_plane
+from ..gaussians.tiles import Plane, perception_plane
 from ..graph.graph import Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..tasks.conditions import known_uplink, normalised_uplink
@@ -74,10 +76,12 @@ class Predictor:
         # Operator and recorded prediction give the splatted magnitude at each direction.
         self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
         self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
-        self._poses = [device_pose(r) for r in self.receivers]
+        self._poses = [device_pose(r) for r in self.receivers for _ in range(self.graph.carriers)]
+        self._others: dict[float, Predictor] = {}
         self._plane = perception_plane(height, width, mi.Float)
         self._field, self._count = field, -1
-        self._by_operator, self._store = operator and self._pixels and getattr(field, "static_geometry", False), store
+        single = self._pixels and self.graph.form.carriers_hz is None
+        self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
         self._reports: dict[int | None, Recorded] = {}
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
@@ -91,6 +95,8 @@ class Predictor:
             self._count, self._reports = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
+        for other in self._others.values():
+            other.update(params)
 
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
@@ -110,9 +116,31 @@ class Predictor:
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
         """Predictions [m, ...] for rows of a record at one receiver (`__call__`)."""
-        uplink = None if record.uplink is None else record.uplink[rows]
         turned = record.tx_heading_rad if self.graph.form.headings else None
-        return self(record.tx_pos_m[rows], receiver, uplink, None if turned is None else turned[rows])
+        parts = (None if part is None else part[rows] for part in (record.uplink, turned, record.carriers_hz))
+        return self(record.tx_pos_m[rows], receiver, *parts)
+
+    def _at_carriers(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: ArrayLike
+    ) -> NDArray[Any]:
+        """Reports of rows at their carriers [m], Hz: of ports, or of the graph at another carrier."""
+        known = self.graph.form.carriers_hz
+        assert known is not None
+
+        def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
+            turned = None if heading_rad is None else heading_rad[rows]
+            if carrier_hz in known:
+                port = receiver * self.graph.carriers + int(np.searchsorted(known, carrier_hz))
+                return self._reported(tx_pos_m[rows], port, turned)
+            if carrier_hz not in self._others:
+                graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
+                made = Predictor(self._field, {}, self.receivers, *size, graph=graph)
+                made.update(self._params)
+                self._others[carrier_hz] = made
+            self._others[carrier_hz].reach = self.reach
+            return self._others[carrier_hz]._reported(tx_pos_m[rows], receiver, turned)
+
+        return by_carrier(np.asarray(carriers_hz, float), of_carrier)
 
     def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
         """Checked headings, or None where they are not used."""
@@ -137,8 +165,12 @@ class Predictor:
     ) -> Any:
         """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         learned = side is None or weight is None or bool(np.any(weight))
-        report, pose = self.graph.report(receiver, side, learned), self._poses[receiver]
-        return evaluated(report, self._params, tx_pos_m.T, receiver, pose, self._plane, slots, weight)
+        report = self.graph.report(receiver, side, learned)
+        return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight)
+
+    def _where(self, port: int) -> tuple[int, Pose, Plane, float | None]:
+        """Number, pose and directions of a port's receiver, and the logarithm of its carrier."""
+        return port // self.graph.carriers, self._poses[port], self._plane, self.graph.log_carrier(port)
 
     def of_side(
         self,
@@ -173,11 +205,11 @@ class Predictor:
         It is recorded, except for so many Gaussians that networks run in chunks: recording saves nothing there, and
         lists of tiles, which a recorded function cannot count, have room for all.
         """
-        pose, count = self._poses[receiver], condition.shape[1]
+        count, where = condition.shape[1], self._where(receiver)
         if self._count * self._together > CHUNK_SIZE:
             report = self.graph.report(receiver, None, chunked=True)
-            return evaluated(report, self._params, condition, receiver, pose, self._plane, weight=weight)
-        key = None if self._pixels else receiver  # one recording serves the pixels of all receivers
+            return evaluated(report, self._params, condition, *where, weight=weight)
+        key = None if self._pixels else receiver  # one recording serves the pixels of all ports
         if key not in self._reports:
             report = self.graph.report(receiver, None)
 
@@ -186,23 +218,24 @@ class Predictor:
                     return report(params, batch)
 
             # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(report, self._params, condition[:, :1], receiver, pose, self._plane)
+            evaluated(report, self._params, condition[:, :1], *where)
             self._reports[key] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
         # The batch size is a constant of the recorded kernels: copies fill the last batch.
         filled = np.minimum(np.arange(self._together), count - 1)
         tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, self._together)
         dr.make_opaque(slots)
         weights = None if weight is None else to_float(weight[filled])
-        found = self._reports[key](
-            self._params, Batch(tx, slots, dr.opaque(mi.UInt32, receiver), pose, self._plane, weights)
-        )
+        number, pose, plane, log_carrier = where
+        carrier = None if log_carrier is None else dr.opaque(mi.Float, log_carrier)
+        batch = Batch(tx, slots, dr.opaque(mi.UInt32, number), pose, plane, weights, carrier)
+        found = self._reports[key](self._params, batch)
         if count == self._together:
             return found
         return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // self._together)))
 
     def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Reports for positions [m, 3] or features [m, features], complex numbers as such."""
-        weight = None if self.reach is None else self.reach.weight(given, receiver)
+        weight = None if self.reach is None else self.reach.weight(given, receiver // self.graph.carriers)
         if weight is not None and weight.any() and not weight.all():
             # Gaussians of weight 0 are not evaluated.
             parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
@@ -254,6 +287,7 @@ class Predictor:
         receiver: int | str = 0,
         uplink: NDArray[Any] | None = None,
         tx_heading_rad: ArrayLike | None = None,
+        carriers_hz: ArrayLike | None = None,
     ) -> NDArray[Any]:
         """Predict the observations of transmitters at one receiver.
 
@@ -263,6 +297,7 @@ class Predictor:
             uplink: uplink channels [m, antennas, subcarriers], where the field was trained on them instead of
                 positions.
             tx_heading_rad: yaw of each transmitter [m], radians, if and only if the form has ``headings``.
+            carriers_hz: carrier of each transmitter [m], Hz, if and only if the form has carriers.
 
         Returns:
             Greys [m, height, width], powers [m] in dBm, or channels [m, k] or [m, antennas, k].
@@ -289,4 +324,9 @@ class Predictor:
         given = np.asarray(tx_pos_m, float)
         turned = self._headings(tx_heading_rad, len(given))
         self.graph.check(given)
-        return self._reported(given, index, turned)
+        if self.graph.form.carriers_hz is None:
+            return self._reported(given, index, turned)
+        if carriers_hz is None:
+            known = carriers_text(self.graph.form.carriers_hz)
+            raise InputError(f"trained with {known}; give the carrier of every transmitter")
+        return self._at_carriers(given, index, turned, carriers_hz)

@@ -63,6 +63,10 @@ class Reach:
         weight = np.exp(-np.square(self.distance(tx_pos_m, receiver) / self.length_m))
         return np.where(weight < NEGLIGIBLE, 0, weight).astype(np.float32)
 
+    def of_ports(self, carriers: int) -> Reach:
+        """The reach by ports, as many for each receiver as there are carriers."""
+        return replace(self, known_m=tuple(known for known in self.known_m for _ in range(carriers)))
+
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
         found = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]

@@ -132,6 +132,7 @@ def make_step(
         receiver: Any,
         pose: Pose,
         plane: Plane,
+        carrier: Any,
         factor: Any,
         decay: Any,
         number: Any,
@@ -144,7 +145,7 @@ def make_step(
         truth = truth * scale
         # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather again.
         dr.schedule(truth, scale)
-        prediction = report(params, Batch(condition, slots, receiver, pose, plane))
+        prediction = report(params, Batch(condition, slots, receiver, pose, plane, carrier=carrier))
         loss = loss_of(prediction * scale, truth, batch, *shape)
         mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
         view_gradient_norm = mi.Float(0)
@@ -177,17 +178,20 @@ def evaluated(
     receiver: int,
     pose: Pose,
     plane: Plane,
+    carrier: float | None = None,
     slots: NDArray[Any] | None = None,
     weight: NDArray[Any] | None = None,
 ) -> Any:
     """A report of conditions [3 or features, m], evaluated without gradients.
 
-    ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m] scales the Gaussians' signal.
+    ``carrier`` is `Batch.carrier`; ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m]
+    scales the Gaussians' signal.
     """
     with dr.suspend_grad():
         rows = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
         weights = None if weight is None else to_float(weight)
         tx = to_tensor(np.ascontiguousarray(condition))
-        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights))
+        log_carrier = None if carrier is None else dr.opaque(mi.Float, carrier)
+        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights, log_carrier))
         dr.eval(found)
     return found

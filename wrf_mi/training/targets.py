@@ -5,7 +5,7 @@ A *condition* is the input of a field: a row's transmitter position, or the upli
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class Targets:
         unit: unit of each receiver's differences in the loss, [n_rx].
         per_row: number of consecutive conditions of a row.
         weight: factor of each observation's difference in the loss [n_rx, c]; None: 1.
+        carriers_hz: carriers of the training rows, ascending; None: rows have a single carrier.
+        carrier: number of each condition's carrier [c], -1 for carriers without training rows.
     """
 
     condition: FloatArray
@@ -37,15 +39,31 @@ class Targets:
     unit: FloatArray
     per_row: int = 1
     weight: FloatArray | None = None
+    carriers_hz: FloatArray | None = None
+    carrier: IntArray | None = None
+
+    @property
+    def ports(self) -> int:
+        """Number of receivers times that of carriers."""
+        return len(self.truth) * self.carriers
+
+    @property
+    def carriers(self) -> int:
+        """Number of carriers of the training rows."""
+        return 1 if self.carriers_hz is None else len(self.carriers_hz)
+
+    def at(self, port: int, conditions: IntArray) -> IntArray:
+        """Those of the conditions that have a port's carrier."""
+        return conditions if self.carrier is None else conditions[self.carrier[conditions] == port % self.carriers]
 
     def conditions(self, rows: IntArray) -> IntArray:
         """Numbers of the conditions of rows."""
         return np.asarray((rows[:, None] * self.per_row + np.arange(self.per_row)).ravel())
 
-    def received(self, receiver: int, rows: IntArray) -> IntArray:
-        """Conditions of those rows that a receiver observed."""
-        chosen = self.conditions(rows)
-        seen = np.isfinite(self.truth[receiver, chosen]).all(axis=tuple(range(1, self.truth.ndim - 1)))
+    def received(self, port: int, rows: IntArray) -> IntArray:
+        """Conditions of those rows that a port's receiver observed at its carrier."""
+        chosen = self.at(port, self.conditions(rows))
+        seen = np.isfinite(self.truth[port // self.carriers, chosen]).all(axis=tuple(range(1, self.truth.ndim - 1)))
         return chosen[seen]
 
 
@@ -64,7 +82,12 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
             raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
         units = np.array([task.unit(values[rows]) for values in seen])
         weight = _weights(record, rows)
-        return Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
+        found = Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
+        if record.carriers_hz is None:
+            return found
+        carriers = np.unique(record.carriers_hz[rows])
+        number = np.where(np.isin(record.carriers_hz, carriers), np.searchsorted(carriers, record.carriers_hz), -1)
+        return replace(found, carriers_hz=carriers, carrier=number)
     outputs = outputs_of(record)
     features, divisor = normalised_uplink(record.uplink)
     channels = seen[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
@@ -118,7 +141,8 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
     # The tracer finds no path through many walls; what was measured there is the weakest of all.
     floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
-    return Form(name, (size[0], size[1]), record.frequencies_hz, outputs, basis, features, headings, floor_db)
+    given = record.frequencies_hz, outputs, basis, features, headings, floor_db, targets.carriers_hz
+    return Form(name, (size[0], size[1]), *given)
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
@@ -137,13 +161,15 @@ def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128
 
 
 def plan_rows(config: TrainConfig, targets: Targets, split: Split, joint: bool = False) -> Schedule:
-    """The schedule of a fit, in which each receiver learns from its observations; ``joint``: beside paths of a scene.
+    """The schedule of a fit, in which each port learns from its receiver's observations.
+
+    ``joint``: beside paths of a scene.
 
     Raises:
         InputError: as `wrf_mi.training.schedule.plan`, or no step is left for the Gaussians.
     """
-    everything = [targets.received(r, split.all_train) for r in range(len(targets.truth))]
-    train = [targets.received(r, split.train) for r in range(len(targets.truth))]
+    everything = [targets.received(port, split.all_train) for port in range(targets.ports)]
+    train = [targets.received(port, split.train) for port in range(targets.ports)]
     # A receiver without training rows learns from its validation rows.
     train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
     stages = _stages(config) if joint else ()

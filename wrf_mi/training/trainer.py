@@ -21,14 +21,15 @@ from ..core import InputError, Record, Split
 from ..datasets.observations import check_observations
 from ..gaussians import InitialGaussians
 from ..gaussians.density import adapt, reset_opacity
-from ..gaussians.tiles import perception_plane
+from ..gaussians.footprint import Pose
+from ..gaussians.tiles import Plane, perception_plane
 from ..graph.graph import LEVEL, SHARE, Field, Graph
 from ..graph.settings import TRACED_NAMES
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from .adam import NonFiniteReport
-from .config import PATHS_ALONE, TrainConfig
-from .fields import make_field
+from .config import TrainConfig
+from .fields import field_of
 from .initial import initial_gaussians
 from .loop import TrainingLoop
 from .predictor import Predictor
@@ -99,8 +100,6 @@ class Trainer(TrainingLoop):
         self.task = task_of(record)
         self.label, self.higher_is_better = self.task.label, self.task.higher_is_better
         check_observations(record, split, complete=self.task.image)
-        if record.carriers_hz is not None:
-            raise InputError(f"{record.name} has several carriers; train on one of them")
         known = split.all_train
         config = config.resolved(record.tx_pos_m[known])
         self.record, self.split, self.config = record, split, config
@@ -108,7 +107,7 @@ class Trainer(TrainingLoop):
         form = form_of(record, config, self.targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(
-            field or (None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)),
+            field or field_of(config, form),
             receivers,
             form,
             scene,
@@ -127,12 +126,15 @@ class Trainer(TrainingLoop):
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
-        # Slots of the traced sides: all rows that train or choose.
-        self._known = known
+        # Slots of the traced sides: all rows that train or choose, at each port those of its carrier.
+        self._known = [self.targets.at(port, known) for port in range(self.targets.ports)]
         self.graph.check(record.tx_pos_m)
-        turned = record.tx_heading_rad[known] if form.headings and record.tx_heading_rad is not None else None
-        self._sides = [self.graph.trace(record.tx_pos_m[known], r, turned) for r in range(len(receivers))]
-        self._poses = [device_pose(r) for r in receivers]
+        turned = record.tx_heading_rad if form.headings else None
+        self._sides = [
+            self.graph.trace(record.tx_pos_m[rows], port, None if turned is None else turned[rows])
+            for port, rows in enumerate(self._known)
+        ]
+        self._poses = [device_pose(receivers[port // self.graph.carriers]) for port in range(self.targets.ports)]
         self._plane = perception_plane(*form.size, mi.Float)
         self._data = TrainingData(
             to_tensor(self.targets.condition),
@@ -192,44 +194,54 @@ class Trainer(TrainingLoop):
             start = initial or initial_gaussians(self.config.initial, seen, self.split.train, rng, self.graph.sphere)
             values = self.graph.field.init(start, rng)
         values |= self.graph.parameters(self._sides) | self.graph.cover(self._sides)
-        for r, side in enumerate(self._sides):
-            if side is not None and side.gain_name in values:
-                values |= self.graph.match_gain(r, side, {}, self.targets.truth[r, self._known])
+        gains: dict[str, list[NDArray[np.float32]]] = {}
+        for port, side in enumerate(self._sides):
+            if side is not None and side.gain_name in values and len(side):
+                seen = self.targets.truth[port // self.graph.carriers, self._known[port]]
+                for name, gain in self.graph.match_gain(port, side, {}, seen).items():
+                    gains.setdefault(name, []).append(gain)
+        values |= {name: np.mean(found, axis=0, dtype=np.float32) for name, found in gains.items()}
         if LEVEL in values:
-            values[LEVEL][0] = [self._level(values, r) for r in range(len(self.record.receivers))]
+            values[LEVEL][0] = [self._level(values, self._ports(r)[0]) for r in range(len(self.record.receivers))]
         return values
 
-    def _level(self, values: Mapping[str, NDArray[np.float32]], receiver: int) -> float:
-        """Level at which Gaussians match a receiver's observations, or far below its paths' power."""
+    def _level(self, values: Mapping[str, NDArray[np.float32]], port: int) -> float:
+        """Level at which Gaussians match a receiver's observations, or far below its paths' power, by one port."""
         params = {name: to_tensor(value) for name, value in values.items()}
-        if (side := self._sides[receiver]) is not None:
+        if (side := self._sides[port]) is not None:
             return self.graph.power_level(side, params) + float(np.log(SHARE))
-        rows = self.targets.received(receiver, self._known)[:CHUNK_SIZE]
-        report, condition = self.graph.report(receiver, None), self.targets.condition[:, rows]
-        found = evaluated(report, params, condition, receiver, self._poses[receiver], self._plane).numpy()
-        observed = self.targets.truth[receiver, rows].astype(float)
-        return self.graph.models[receiver].missing_gain(found.astype(float).reshape(observed.shape), observed)
+        rows = self.targets.received(port, self._known[port])[:CHUNK_SIZE]
+        report, condition = self.graph.report(port, None), self.targets.condition[:, rows]
+        where = self._where(port)
+        found = evaluated(report, params, condition, *where).numpy()
+        observed = self.targets.truth[port // self.graph.carriers, rows].astype(float)
+        return self.graph.models[port].missing_gain(found.astype(float).reshape(observed.shape), observed)
 
-    def _step_of(self, receiver: int) -> Callable[..., Any]:
-        """Recorded step of a receiver; without paths one serves all, else each search for paths needs another."""
-        side = self._sides[receiver]
+    def _where(self, port: int) -> tuple[int, Pose, Plane, float | None]:
+        """Number, pose and directions of a port's receiver, and the logarithm of its carrier."""
+        receiver = port // self.graph.carriers
+        return receiver, self._poses[port], self._plane, self.graph.log_carrier(port)
+
+    def _step_of(self, port: int) -> Callable[..., Any]:
+        """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
+        side = self._sides[port]
         state = self.state
         if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
-            state.searched_m[receiver] = side.searched_at_m
+            state.searched_m[port] = side.searched_at_m
         learned = side is None or (
             self._stage == len(self.schedule.stages) and not (state.chosen and state.reach_m == 0)
         )
-        arrays = self.graph.arrays(receiver, side)
-        key = None if side is None and not arrays else (receiver, side and side.searches, learned, state.surface)
+        arrays = self.graph.arrays(port, side)
+        key = None if side is None and not arrays else (port, side and side.searches, learned, state.surface)
         if key not in self._steps:
-            self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != receiver}
-            report = self.graph.report(receiver, side, learned, surface=state.surface)
-            read = None if key is None else partial(self.graph.arrays, receiver, side)
+            self._steps = {k: v for k, v in self._steps.items() if k is None or k[0] != port}
+            report = self.graph.report(port, side, learned, surface=state.surface)
+            read = None if key is None else partial(self.graph.arrays, port, side)
             if read is not None:
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
                 params = {name: self.state.adam[name] for name in self.state.adam}
-                first = self.targets.condition[:, self.targets.conditions(self._known[:1])]
-                evaluated(report, params, first, receiver, self._poses[receiver], self._plane)
+                first = self.targets.condition[:, self.targets.conditions(self._known[port][:1])]
+                evaluated(report, params, first, *self._where(port))
             rest = self._loss, self._shape, read, self.graph.evaluation
             self._steps[key] = make_step(report, self._rates(), *rest)
         return self._steps[key]
@@ -267,26 +279,32 @@ class Trainer(TrainingLoop):
         self._predictor.reach = self.reach()
         return self._predictor
 
+    def _ports(self, receiver: int) -> range:
+        """Ports of a receiver."""
+        return range(receiver * self.graph.carriers, (receiver + 1) * self.graph.carriers)
+
     def reach(self) -> Reach | None:
         """Reach around the rows that train now; None: the Gaussians are used everywhere."""
         if not self.graph.corrects:
             return None
         joined = self.state.chosen and self.schedule.joined < self.config.steps
-        rows = self._known if joined else self._choosing.train
-        known = [self.record.tx_pos_m[self.targets.received(r, rows)] for r in range(len(self.record.receivers))]
-        return Reach(tuple(known), self.state.reach_m)
+        rows = self.split.all_train if joined else self._choosing.train
+        known = [self.record.tx_pos_m[self.targets.received(port, rows)] for port in range(self.targets.ports)]
+        every = [np.concatenate([known[port] for port in self._ports(r)]) for r in range(len(self.record.receivers))]
+        return Reach(tuple(every), self.state.reach_m)
 
     def _corrected_scores(self) -> NDArray[np.float64]:
         """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
         predict, record, reach, state = self.predictor(), self.record, self.reach(), self.state
         chosen = self._choosing if self._chooses_reach and not state.chosen else self.split
-        rows = [self.targets.received(r, chosen.validation) for r in range(len(record.receivers))]
+        rows = [self.targets.received(port, chosen.validation) for port in range(self.targets.ports)]
         assert reach is not None
+        reach = reach.of_ports(self.graph.carriers)
 
-        def score(r: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
-            slots = np.searchsorted(self._known, rows[r])
-            found = predict.of_side(record.tx_pos_m[rows[r]], r, self._sides[r], slots, weight)
-            return self.task.training_score(found, record.observation[r, rows[r]])
+        def score(port: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+            slots = np.searchsorted(self._known[port], rows[port])
+            found = predict.of_side(record.tx_pos_m[rows[port]], port, self._sides[port], slots, weight)
+            return self.task.training_score(found, record.observation[port // self.graph.carriers, rows[port]])
 
         held = [record.tx_pos_m[chosen_rows] for chosen_rows in rows]
         lengths = [reach.length_m]
@@ -308,9 +326,11 @@ class Trainer(TrainingLoop):
         if not len(rows):
             return float("nan")
         predict = self.predictor()
+        parts = [(r, self.targets.at(port, rows)) for r in range(len(record.receivers)) for port in self._ports(r)]
         scores = [
-            self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
-            for r in range(len(record.receivers))
+            self.task.training_score(predict.of_rows(record, part, r), record.observation[r, part])
+            for r, part in parts
+            if len(part)
         ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
@@ -338,19 +358,21 @@ class Trainer(TrainingLoop):
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""
         schedule, t = self.schedule, self.state.step
-        receiver, rows = int(schedule.receiver[t]), schedule.rows[t]
+        port, rows = int(schedule.receiver[t]), schedule.rows[t]
+        carrier = self.graph.log_carrier(port)
         if t in schedule.stages and not self.state.chosen:
             self._begin_stage()
         state = self.state
-        state.mean, trouble, report = self._step_of(receiver)(
+        state.mean, trouble, report = self._step_of(port)(
             state.adam,
             state.mean,
             self._data,
             mi.UInt32(rows.tolist()),
-            mi.UInt32(np.searchsorted(self._known, rows // self.targets.per_row).tolist()),
-            dr.opaque(mi.UInt32, receiver),
-            self._poses[receiver],
+            mi.UInt32(np.searchsorted(self._known[port], rows // self.targets.per_row).tolist()),
+            dr.opaque(mi.UInt32, port // self.graph.carriers),
+            self._poses[port],
             self._plane,
+            None if carrier is None else dr.opaque(mi.Float, carrier),
             dr.opaque(mi.Float, float(schedule.factor[t])),
             dr.opaque(mi.Float, float(schedule.decay[t])),
             dr.opaque(mi.UInt32, t + 1),

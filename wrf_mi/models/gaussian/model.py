@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
+from ...core.carriers import middle_carrier
 from ...graph.graph import Graph
 from ...graph.receivers import Form
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
-from ...training.config import PATHS_ALONE, PRESETS, TrainConfig, task_settings
-from ...training.fields import make_field
+from ...training.config import PRESETS, TrainConfig, task_settings
+from ...training.fields import field_of
 from ...training.initial import initial_gaussians
 from ...training.loop import Progress
 from ...training.packed import pack_params, unpack_params
@@ -58,8 +59,7 @@ class FittedField(Fitted):
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
         self._arrays, self._problem, self._store = arrays, problem, store
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
-        alone = config.model == PATHS_ALONE
-        self.field = None if alone else make_field(config, self.form.components, self.form.features)
+        self.field = field_of(config, self.form)
         self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
         self.uses_heading = self.form.headings
 
@@ -78,7 +78,7 @@ class FittedField(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""
         heading = inputs.tx_heading_rad if self.uses_heading else None
-        return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading))
+        return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading, inputs.carriers_hz))
 
     def arrays(self) -> Arrays:
         """Parameters, form of the observations, antennas, receivers and reach."""
@@ -124,7 +124,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     folder, record, config = session.folder, problem.record, problem.settings
     stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
     state = None if stored is None else FitState.from_arrays(stored)
-    trainer = Trainer(record, split, config, state=state, scene=problem.opened_scene)
+    trainer = Trainer(record, split, config, state=state, scene=_scene(problem, split))
     trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
     cut_log(folder, trainer.state.step)
 
@@ -146,6 +146,14 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     return fitted
 
 
+def _scene(problem: Problem, split: Split) -> Any | None:
+    """The scene at the carrier, or at the middle one of the training rows."""
+    carriers = problem.record.carriers_hz
+    if problem.scene is None or carriers is None:
+        return problem.opened_scene
+    return problem.open_scene(middle_carrier(carriers[split.all_train]))
+
+
 def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
     """Settings with number of steps and scale of transmitters resolved."""
     config: TrainConfig = problem.settings
@@ -155,14 +163,13 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trai
 def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse settings, files and scenes that a training would refuse."""
     record = problem.record
-    scene = None if problem.scene is None else problem.opened_scene
     for rows in splits:
-        known = rows.all_train
+        known, scene = rows.all_train, _scene(problem, rows)
         config = problem.settings.resolved(record.tx_pos_m[known])
         targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
-        field = None if config.model == PATHS_ALONE else make_field(config, form.components, form.features)
+        field = field_of(config, form)
         Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
         plan_rows(config, targets, rows, field is not None and scene is not None)
         drawn = np.random.default_rng([config.seed, 0])
@@ -186,6 +193,7 @@ def _entry(name: str) -> Model:
         SOURCE,
         scene="optional",
         uplink="optional",
+        several_carriers=True,
         given=("model", "seed", "deterministic", "receiver", "evaluation"),
         presets=PRESETS,
         check=check,

@@ -1,0 +1,124 @@
+"""Rows of several carriers in one graph: ports of a receiver, each at its carrier."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from box_room import CEILING, PARTITION, WALLS, receiver, transmitters
+from traced_rooms import write_xml
+
+import wrf_mi
+from wrf_mi.core import Receiver, Record
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.graph.graph import Graph
+from wrf_mi.graph.receivers import Form
+from wrf_mi.graph.settings import TracedConfig
+from wrf_mi.receivers.instruments import PowerInstrument, SpectrumInstrument
+from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.predictor import Predictor
+
+CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
+BETWEEN_HZ = 3.5e9
+OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
+CONFIG = TracedConfig(depth=2, reflections=2, rays=4096, faint=0.0)
+SIZE = (9, 24)
+SINGLE, SINGLE_DB = 1e-6, 2e-5
+"""Of greys in 0..1, and of dB: rounding of single precision."""
+STRENGTH_DB = 1e-3
+"""Gains of the tracer are in single precision."""
+QUICK = ("initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "validate_every=10", "batch=4")
+
+
+@pytest.fixture(scope="module")
+def xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_xml(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
+
+
+def array() -> Receiver:
+    return replace(receiver(), array_m=planar_array(4, 4, 0.026))
+
+
+def spectra(xml: Path, count: int = 12) -> Record:
+    """Spectra of each transmitter at each carrier, traced."""
+    positions, size = transmitters(count), len(CARRIERS_HZ)
+    instrument = SpectrumInstrument((array(),), np.array([CARRIERS_HZ[0]]), size=SIZE)
+    tracer, carriers = RayTracer(xml, instrument, OPTIONS), np.repeat(CARRIERS_HZ, count)
+    traced = tracer.trace(np.tile(positions, (size, 1)), carriers_hz=carriers)
+    observed = tracer.observe(traced).astype(np.float32)
+    return Record("bands", "spectrum", traced.tx_pos_m, (array(),), observed, carriers_hz=carriers)
+
+
+@pytest.mark.parametrize(("task", "tolerance"), [("spectrum", SINGLE), ("rssi", SINGLE_DB)])
+def test_ports_report_what_a_graph_of_each_carrier_reports(task: str, tolerance: float, xml: Path) -> None:
+    """At trained carriers and at others, in the order of the rows; materials follow the laws of ITU-R P.2040."""
+    receivers = (array(), replace(array(), name="second", position_m=np.array([4.0, 2.2, 0.7])))
+    form = Form("array" if task == "spectrum" else "power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+    rows = np.array([*CARRIERS_HZ, BETWEEN_HZ])[np.random.default_rng(0).permutation(np.arange(12) % 4)]
+    graph = Graph(None, receivers, form, open_scene(xml, form.carrier_hz), CONFIG)
+    predict = Predictor(None, {}, receivers, *SIZE, graph=graph)
+    found = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
+    for hz in np.unique(rows):
+        at = rows == hz
+        single = Graph(
+            None, receivers, replace(form, frequencies_hz=[hz], carriers_hz=None), open_scene(xml, hz), CONFIG
+        )
+        alone = Predictor(None, {}, receivers, *SIZE, graph=single)
+        for number in range(2):
+            np.testing.assert_allclose(found[number][at], alone(transmitters(12)[at], number), atol=tolerance)
+
+
+def test_strengths_at_ports_are_those_of_the_tracer(xml: Path) -> None:
+    rows = np.array([*CARRIERS_HZ, BETWEEN_HZ]).repeat(3)
+    tracer = RayTracer(xml, PowerInstrument((array(),), np.array([CARRIERS_HZ[0]])), OPTIONS)
+    expected = tracer.observe(tracer.trace(transmitters(12), carriers_hz=rows))[0]
+    form = Form("power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+    graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), CONFIG)
+    found = Predictor(None, {}, (array(),), *SIZE, graph=graph)(transmitters(12), 0, carriers_hz=rows)
+    np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
+
+
+@pytest.mark.parametrize("scene", [False, True])
+def test_a_field_of_several_carriers_is_trained_resumed_and_restored(scene: bool, xml: Path, tmp_path: Path) -> None:
+    """With and without paths; a carrier without training rows is predicted, and predictions depend on the carrier."""
+    record, place = spectra(xml), str(xml) if scene else None
+    settings = (*QUICK, "steps=30") + (("traced.rays=4096", "traced.depth=2") if scene else ())
+    given: dict[str, Any] = {"scene": place, "split": "frequency-known:1", "settings": settings}
+    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", **given)
+    again = wrf_mi.open_run(run.folder, record)
+    at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
+    positions = np.tile(record.tx_pos_m[:2], (2, 1))
+    found = again.predict(positions, 0, carriers_hz=at).mean
+    np.testing.assert_array_equal(found, run.predict(positions, 0, carriers_hz=at).mean)
+    assert np.abs(found[:2] - found[2:]).max() > 1e-3
+    with pytest.raises(wrf_mi.InputError, match=r"give frequency_hz for each position|carrier"):
+        again.predict(positions, 0)
+
+
+def test_networks_learn_from_the_carrier(xml: Path, tmp_path: Path) -> None:
+    """Strengths at one place that fall with the frequency: one field of all carriers follows them."""
+    positions = np.tile(transmitters(10), (3, 1))
+    carriers = np.repeat(CARRIERS_HZ, 10)
+    observed = (-40 - 20 * np.log10(carriers / CARRIERS_HZ[0]))[None].astype(np.float32)
+    record = Record("falling", "rssi", positions, (receiver(),), observed, carriers_hz=carriers)
+    settings = (*QUICK, "steps=400", "optimiser.network=0.003")
+    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", split="random", settings=settings)
+    assert run.metrics["abs_error_db"]["median"] < 2  # 5.7 dB for the mean of all carriers
+
+
+def test_paths_are_calibrated_at_several_carriers(xml: Path, tmp_path: Path) -> None:
+    """All surfaces are stated as wood: one permittivity and conductivity of each serve all carriers."""
+    record = spectra(xml, 16)
+    wrong = {name: ("itu_wood", mesh) for name, (_, mesh) in {**WALLS, **CEILING, **PARTITION}.items()}
+    stated = write_xml(tmp_path / "stated", wrong)
+    common = ("max_depth=2", "rays=4096", "transmission=true")
+    given: dict[str, Any] = {"scene": str(stated), "split": "frequency:1"}
+    plain = wrf_mi.train(record, tmp_path / "plain", "ray-tracing", settings=common, **given)
+    calibration = (*common, "calibration=gain,materials", "steps=120")
+    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", settings=calibration, **given)
+    assert run.metrics["ssim"]["mean"] > plain.metrics["ssim"]["mean"] + 0.01
+    assert open_scene(run.folder / "corrected", BETWEEN_HZ).radio_materials
