@@ -31,14 +31,14 @@ class Ingredient:
     default: bool = True
 
 
+TRANSMISSION = ("transmission=true",)
+"""Waves pass the slabs of a scene, furniture among them."""
 INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
     "physics-no-mesh": Ingredient("physics"),
-    "ray-tracing": Ingredient("ray-tracing", scene=True),
-    "surface": Ingredient(
-        "ray-tracing", scene=True, settings=("calibration=gain,materials,surface", "transmission=true")
-    ),
+    "ray-tracing": Ingredient("ray-tracing", scene=True, settings=TRANSMISSION),
+    "surface": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials,surface", *TRANSMISSION)),
     "trees": Ingredient("trees"),
     "mri": Ingredient("mri"),
     "idw": Ingredient("idw"),
