@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -314,3 +315,10 @@ def write_positions(path: Path, positions_m: FloatArray, carriers_hz: FloatArray
     if carriers_hz is not None:
         header, values = f"{AXES},{FREQUENCY}", np.column_stack([positions_m, carriers_hz])
     write_lines(path, [header, *(",".join(repr(float(v)) for v in row) for row in values)])
+
+
+def write_extra(folder: Path, extra: Mapping[str, str | bytes] | None) -> None:
+    """Write further files by their paths in a folder."""
+    for name, content in (extra or {}).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)

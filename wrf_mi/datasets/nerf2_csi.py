@@ -36,6 +36,7 @@ from .folder_files import (
     refuse_unstated,
     shown,
     unit_quaternion,
+    write_extra,
     write_official,
     write_positions,
 )
@@ -94,7 +95,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
 
 
 def write_nerf2_csi(
-    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str] | None = None
+    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
 ) -> Path:
     """Write a record atomically in the layout of NeRF2's channel coefficients.
 
@@ -103,7 +104,7 @@ def write_nerf2_csi(
         record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
             the downlink.
         replace: replace an existing folder.
-        extra: text of further files by their names.
+        extra: content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -131,8 +132,7 @@ def write_nerf2_csi(
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
         write_official(part, record, first=0)
-        for file, content in (extra or {}).items():
-            (part / file).write_text(content, encoding="utf-8")
+        write_extra(part, extra)
     return Path(path)
 
 

@@ -36,6 +36,7 @@ from .folder_files import (
     shown,
     unit_quaternion,
     whole_number,
+    write_extra,
     write_lines,
     write_official,
     write_positions,
@@ -155,9 +156,7 @@ def write_spectrum_folder(
         write_official(part, record, first=1, digits=5)
         if record.folds is not None:
             write_lines(part / FOLDS, [str(fold) for fold in record.folds])
-        for name, data in (extra or {}).items():
-            (part / name).parent.mkdir(exist_ok=True)
-            (part / name).write_bytes(data.encode() if isinstance(data, str) else data)
+        write_extra(part, extra)
     return Path(path)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import logging
+import tempfile
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from wrf_mi_scenes import scenes
+from wrf_mi_scenes.mitsuba_xml import Parts, write_scene
 
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
@@ -120,3 +122,11 @@ def scan_file(xml: Path, seed: int) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, points=points.astype(np.float32))
     return stream.getvalue()
+
+
+def scene_files(parts: Parts, folder: str, title: str = "Bare walls as measured, one material") -> dict[str, bytes]:
+    """Content of the files of a scene (`wrf_mi_scenes.mitsuba_xml.write_scene`) by their paths, in a folder."""
+    with tempfile.TemporaryDirectory() as work:
+        write_scene(Path(work), parts, title)
+        files = sorted(file for file in Path(work).rglob("*") if file.is_file())
+        return {f"{folder}/{file.relative_to(work).as_posix()}": file.read_bytes() for file in files}
