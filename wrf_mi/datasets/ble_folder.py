@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from .folder_files import (
     read_csv,
     refuse_unstated,
     shown,
+    write_extra,
 )
 
 logger = logging.getLogger(__name__)
@@ -107,7 +109,9 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     return record if carriers_hz is None else record.at_carriers(carriers_hz)
 
 
-def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
+def write_ble_folder(
+    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
+) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
     Args:
@@ -115,6 +119,7 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
         record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
             of that split.
         replace: replace an existing folder.
+        extra: content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -143,6 +148,7 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
                 if values is not None:
                     columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
             _write_csv(part / file, columns)
+        write_extra(part, extra)
     return Path(path)
 
 

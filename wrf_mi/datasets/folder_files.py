@@ -298,9 +298,9 @@ def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
             raise InputError(f"{path}: {record.name} has {name}, which this layout does not state; {remedy}")
 
 
-def write_official(folder: Path, record: Record, first: int, digits: int = 1) -> None:
-    """Write the index files of a record's official split, if it has one; `read_official` reads them."""
-    for file, rows in zip(INDEX_FILES, record.official or (), strict=False):
+def write_official(folder: Path, official: tuple[IntArray, IntArray] | None, first: int, digits: int = 1) -> None:
+    """Write the index files of an official split, if there is one; `read_official` reads them."""
+    for file, rows in zip(INDEX_FILES, official or (), strict=False):
         write_lines(folder / file, [f"{row + first:0{digits}d}" for row in rows])
 
 

@@ -131,7 +131,7 @@ def write_nerf2_csi(
             write_positions(part / POSITIONS, record.tx_pos_m)
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
-        write_official(part, record, first=0)
+        write_official(part, record.official, first=0)
         write_extra(part, extra)
     return Path(path)
 

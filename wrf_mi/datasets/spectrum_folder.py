@@ -153,7 +153,7 @@ def write_spectrum_folder(
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
         write_positions(part / POSITIONS, record.tx_pos_m, record.carriers_hz)
-        write_official(part, record, first=1, digits=5)
+        write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
             write_lines(part / FOLDS, [str(fold) for fold in record.folds])
         write_extra(part, extra)

@@ -131,7 +131,7 @@ def made_in_room(
             record = trace(truth.parent)
             bare = measured_parts(room.mesh_error_m, room.seed)
             extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: scan_file(truth, room.seed)}
-            extra |= scene_files(bare, MEASURED)
+            extra |= scene_files(bare, MEASURED, "wrf_mi_scenes.furnished")
             write_spectrum_folder(folder, record, replace=True, extra=extra)
     return read_spectrum_folder(folder, name)
 

@@ -36,6 +36,7 @@ from .furnished_room import (
     set_scattering,
     transmitters,
 )
+from .laboratory import provided
 
 NAME = "traced-room-bands"
 FORMAT = 1  # version of the files, to be raised when they change for equal parameters
@@ -85,17 +86,21 @@ def traced_room_bands(folder: str | Path | None = None, bands: RoomBands = DEFAU
     that of `wrf_mi.synthetic.traced_room`.
 
     Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room-bands/`` in the user's cache.
+        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room-bands/`` below ``WRF_MI_DATA`` if
+            it exists, else in the user's cache.
         bands: parameters.
         progress: show progress bars on standard error.
 
     Returns:
         A record with ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1.
     """
-    folder = user_cache() / NAME if folder is None else Path(folder)
+    if folder is None:
+        if (found := provided(NAME)) is not None:
+            return found
+        folder = user_cache() / NAME
     poses = {rx.name: [*rx.position_m.tolist(), *rx.orientation_xyzw.tolist()] for rx in RECEIVERS}
     facts = {"format": FORMAT, **asdict(bands), "carriers_hz": list(bands.carriers_hz), "receivers": poses}
-    return made_in_room(folder, NAME, facts, bands, lambda scene_folder: _trace(scene_folder, bands, progress))
+    return made_in_room(Path(folder), NAME, facts, bands, lambda scene_folder: _trace(scene_folder, bands, progress))
 
 
 def channels_at_carriers(
