@@ -1,11 +1,11 @@
 """The furnished room at several carriers: spectra of two arrays of 8 x 8 elements, one on the ceiling, one on a wall.
 
-``docs/data.md`` describes them. Scene, positions and kinds of path are those of `wrf_mi.synthetic.furnished_room`.
-Paths are searched for once, at ``searched_at_hz``, and evaluated at every carrier with its materials. Specular paths do
-not depend on the carrier of the search. Sionna RT draws paths with scattering or diffraction by the reflection
-coefficients at the carrier of the search; scattered fields are divided by the probabilities of the draw, so that their
-power at another carrier has the same expectation as by a search there, and all carriers have the same patches of rough
-wall.
+``docs/data.md`` describes them. Scene and kinds of path are those of `wrf_mi.synthetic.furnished_room`. Paths are
+searched for once, at ``searched_at_hz``, and evaluated at every carrier with its materials. Specular paths do not
+depend on the carrier of the search. Sionna RT draws paths with scattering or diffraction by the reflection coefficients
+at the carrier of the search; scattered fields are divided by the probabilities of the draw, so that their power at
+another carrier has the same expectation as by a search there, and all carriers have the same patches of rough wall.
+Which paths with both diffraction and reflections are found depends on the draw, at any carrier.
 """
 
 from __future__ import annotations
