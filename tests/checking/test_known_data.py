@@ -142,7 +142,8 @@ def test_copies_of_rows(name: str) -> None:
     rows[[5, 9]] = 3
     heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
     up = None if record.uplink is None else record.uplink[rows]
-    observed = replace(record, observation=record.observation[:, rows], truth=None)
+    carriers = None if record.carriers_hz is None else record.carriers_hz[rows]
+    observed = replace(record, observation=record.observation[:, rows], truth=None, carriers_hz=carriers)
     copied = replace(observed, tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, uplink=up)
     found = suspected(copied)
     assert found

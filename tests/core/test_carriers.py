@@ -281,16 +281,21 @@ def test_data_command_shows_carriers_readings_and_noise(
     readings = np.ones(shape, np.int64)
     readings[:, ::2] = 5
     own = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
+    # Runs are shown in the order of their first rows, as they are read: training rows first.
+    assert own.official is not None
+    own = replace(own, runs=np.where(np.isin(np.arange(len(own)), own.official[1]), "early", "late"))
     folder = write_ble_folder(tmp_path / "flat", own)
     status, out, _ = call(["data", "info", folder, "--json"], capsys)
     found = json.loads(out)
     assert status == 0
     assert found["carriers_hz"] == {str(LOW): 10, str(HIGH): 20}
+    assert list(found["runs"].items()) == [("late", 24), ("early", 6)]
     assert (found["n_readings"], found["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
     assert (found["receivers"], found["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
     status, out, _ = call(["data", "info", folder], capsys)
     assert status == 0
     assert "carrier:          1100000000 Hz in 10 rows, 5100000000 Hz in 20 rows\n" in out
+    assert "runs:             late 24, early 6\n" in out
     assert "readings per row: 1 to 5, median 3\nnoise:            1 to 3 dB, median 2 dB\n" in out
     status, _, err = call(["data", "info", tmp_path / "nothing"], capsys)
     assert (status, err.count("\n")) == (2, 1)

@@ -332,6 +332,33 @@ def test_attributes_beyond_the_layout_are_not_written(folder: Path, change: dict
     assert not (tmp_path / "new").exists()
 
 
+def test_the_run_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
+    assert read_ble_folder(folder).runs is None
+    text(TEST_FILE, "ts", "run")(folder)
+    with pytest.raises(InputError, match=rf"{TRAIN_FILE}: line 1: no column run, but {TEST_FILE} has one"):
+        read_ble_folder(folder)
+    text(TRAIN_FILE, ",ts", ",run")(folder)
+    text(TRAIN_FILE, "^1,1.6e18", '1,"second, late"')(folder)
+    record = read_ble_folder(folder)
+    assert record.runs is not None
+    assert record.runs.tolist() == ["1.6e18", "second, late", "1.6e18", "1.6e18", "1.6e18"]
+    again = read_ble_folder(write_ble_folder(tmp_path / "again", record))
+    np.testing.assert_array_equal(again.runs, record.runs)
+    text(TRAIN_FILE, "second, late", "")(folder)
+    refusal(read_ble_folder, folder, rf"{TRAIN_FILE}: row 2: run is empty; give the name or number of the run")
+
+
+@needs("flat-ble")
+def test_runs_of_flat_ble_are_its_two_files():
+    record = load("flat-ble")
+    (split,) = make_splits(record, "other-run:1", validation_fraction=0)
+    (official,) = make_splits(record, "official", validation_fraction=0)
+    np.testing.assert_array_equal(split.test, official.test)
+    np.testing.assert_array_equal(split.all_train, official.all_train)
+    assert record.runs is not None
+    assert (set(record.runs[split.train]), set(record.runs[split.test])) == ({"calibration"}, {"test"})
+
+
 def test_the_carrier_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
     record, carriers = read_ble_folder(folder), np.array([2.402e9, 2.426e9, 2.48e9, 2.402e9, 2.48e9])
     for own in (record.at_carriers(carriers), record.at_carrier(868e6), record):

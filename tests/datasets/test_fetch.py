@@ -21,7 +21,8 @@ from wrf_mi.datasets.registry import DataSet, RemoteFile, known, remote_files
 
 ROWS = 6
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room")
-NAMES += ("traced-csi-flat", "traced-csi-office")
+NAMES += ("traced-room-bands", "traced-csi-flat", "traced-csi-office")
+NAMES += ("traced-floor-receivers", "traced-floor-receivers-csi")
 PICKLES = Path(__file__).parent / "data"
 DATASET = DataSet("small", "spectrum", "MIT", "made up", base_url="http://unused")
 

@@ -82,6 +82,8 @@ def test_attributes_beyond_the_layout_are_not_written(folder: Path, tmp_path: Pa
     record = read_nerf2_csi(folder)
     with pytest.raises(InputError, match="has folds, which this layout does not state; set"):
         write_nerf2_csi(tmp_path / "new", replace(record, folds=np.zeros(len(record), np.int64)))
+    with pytest.raises(InputError, match="has runs, which this layout does not state; set"):
+        write_nerf2_csi(tmp_path / "new", replace(record, runs=np.full(len(record), "day 1")))
     assert not (tmp_path / "new").exists()
 
 

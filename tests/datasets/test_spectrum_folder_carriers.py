@@ -1,4 +1,4 @@
-"""The NeRF2 spectrum layout: one carrier for all rows, or that of each row."""
+"""The NeRF2 spectrum layout: one carrier for all rows, or that of each row; the run of each row."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -86,3 +86,36 @@ def test_wrong_carriers_of_rows_are_refused(folder: Path, row: str, message: str
     (folder / "tx_pos.csv").write_text("\n".join(["x,y,z,frequency_hz", *rows]) + "\n")
     with pytest.raises(InputError, match=message):
         read_spectrum_folder(folder)
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_the_run_of_each_row_is_kept(tmp_path: Path, several: bool):
+    runs = np.array(["day 1", "day 1", "2", "with, comma"])
+    record = replace(make_record(4), runs=runs)
+    if several:
+        record = record.at_carriers(np.array([915e6, 2.44e9, 915e6, 5.1e9]))
+    folder = write_spectrum_folder(tmp_path / "a", record)
+    header = (folder / "tx_pos.csv").read_text().splitlines()[0]
+    assert header == ("x,y,z,frequency_hz,run" if several else "x,y,z,run")
+    again = read_spectrum_folder(folder)
+    assert again.runs is not None
+    assert again.runs.tolist() == runs.tolist()
+    np.testing.assert_array_equal(again.carriers_hz, record.carriers_hz)
+    assert_same(again, record)
+
+
+def test_wrong_runs_are_refused(tmp_path: Path):
+    folder = write_spectrum_folder(tmp_path / "a", make_record(4))
+    assert read_spectrum_folder(folder).runs is None
+    for content, message in (
+        ("x,y,z,run\n1,2,3,a\n1,2,3, \n1,2,3,b\n1,2,3,b\n", "row 2: run is empty; give the name or number"),
+        ("x,y,z,run,frequency_hz\n" + "1,2,3,a,9e8\n" * 4, "line 1: header is 'x,y,z,run,frequency_hz'; it must be"),
+    ):
+        (folder / "tx_pos.csv").write_text(content)
+        with pytest.raises(InputError, match=rf"tx_pos\.csv: {message}"):
+            read_spectrum_folder(folder)
+    for run in ("", " a", "two\nlines"):
+        record = replace(make_record(4), runs=np.array(["a", run, "a", "b"]))
+        with pytest.raises(InputError, match=r"row 1: run .* does not fit into a field; give a text of one line"):
+            write_spectrum_folder(tmp_path / "b", record)
+        assert not (tmp_path / "b").exists()

@@ -203,6 +203,26 @@ def test_splits_depend_on_the_seed():
         np.testing.assert_array_equal(ours.test, theirs.test)
 
 
+def test_runs_are_held_out_in_the_order_of_their_first_rows():
+    record = replace(make_record(), runs=np.array(["tuesday"] * 20 + ["monday", "10"] * 15))
+    splits = make_splits(record, "other-run")
+    assert [split.name for split in splits] == ["other-run:0", "other-run:1", "other-run:2"]
+    for split, run in zip(splits, ("tuesday", "monday", "10"), strict=True):
+        assert_partition(split, 50)
+        np.testing.assert_array_equal(split.test, np.flatnonzero(record.runs == run))
+    (second,) = make_splits(record, "other-run:1", n_train=12)
+    np.testing.assert_array_equal(second.test, splits[1].test)
+    assert len(second.all_train) == 12
+    with pytest.raises(InputError, match=r"'other-run:3': no such fold; made-up has other-run:0 to other-run:2"):
+        make_splits(record, "other-run:3")
+
+
+def test_data_without_several_runs_are_refused():
+    for record, what in ((make_record(), "state none"), (replace(make_record(), runs=np.full(50, "a")), "have one")):
+        with pytest.raises(InputError, match=rf"made-up: split other-run .* {what}; give a column run .* with two"):
+            make_splits(record, "other-run")
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     rows=st.integers(5, 120),

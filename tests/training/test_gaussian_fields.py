@@ -366,6 +366,7 @@ def test_inconsistent_readings_and_noise_are_refused(tmp_path) -> None:
         ({"std": std[:1]}, r"std \[1, 60\] beside observations \[2, 60\]"),
         ({"std": 0 * std}, "receiver rx0, row 3: std is 0; give a number above 0"),
         ({"n_readings": np.zeros(std.shape, int)}, "receiver rx0, row 3: n_readings is 0"),
+        ({"runs": np.array(["a", "b"])}, r"runs \[2\]; give one for each of"),
     ):
         with pytest.raises(InputError, match=message):
             train(replace(record, **change), tmp_path / "run", "idw", split=halves(record))

@@ -97,7 +97,7 @@ def summary(record: Record) -> dict[str, Any]:
 
     ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
     training and test rows, ``frequencies_hz`` the carrier or the subcarriers, ``carriers_hz`` rows by carrier,
-    ``n_readings`` and ``std_db`` minimum, median and maximum.
+    ``runs`` rows by run, ``n_readings`` and ``std_db`` minimum, median and maximum.
 
     Raises:
         InputError: parts of the record that do not fit together.
@@ -110,6 +110,10 @@ def summary(record: Record) -> dict[str, Any]:
     if record.carriers_hz is not None:
         hz, rows = np.unique(record.carriers_hz, return_counts=True)
         carriers = dict(zip(hz.tolist(), rows.tolist(), strict=True))
+    runs = None
+    if record.runs is not None:
+        names, first, rows = np.unique(record.runs, return_index=True, return_counts=True)
+        runs = {str(names[k]): int(rows[k]) for k in np.argsort(first)}
     return {
         "name": record.name,
         "task": record.task,
@@ -120,6 +124,7 @@ def summary(record: Record) -> dict[str, Any]:
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
         "carriers_hz": carriers,
+        "runs": runs,
         "n_readings": _range(record.n_readings, seen),
         "std_db": _range(record.std, seen),
         "positions": record.has_positions,
@@ -153,6 +158,7 @@ def render(found: dict[str, Any]) -> str:
         "received": received,
         "official split": official,
         "carrier": carrier,
+        "runs": "not stated" if found["runs"] is None else ", ".join(f"{k} {n}" for k, n in found["runs"].items()),
         "readings per row": _shown(found["n_readings"], ""),
         "noise": _shown(found["std_db"], " dB"),
         "known": ", ".join(known) or "observations alone",

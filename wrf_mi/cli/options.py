@@ -46,10 +46,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     text = "of Gaussians: splatted (default) or traced by the Mitsuba plugins, through the walls of a scene (slower)"
     add("--evaluation", choices=get_args(EvaluationName), help=f"evaluation {text}")
     add_tracing(parser)
-    kinds = (
-        "official (default), random, trajectory, or with folds in turn blocked, frequency, frequency-known, receiver"
-    )
-    add("--split", help=f"{kinds}; one fold: blocked:K, frequency:K")
+    folded = "blocked, frequency, frequency-known, receiver, other-run"
+    text = f"official (default), random, trajectory, or with folds in turn {folded}; one fold: blocked:K, frequency:K"
+    add("--split", help=text)
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")

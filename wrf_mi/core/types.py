@@ -73,6 +73,8 @@ class Record:
             for a mean of readings the standard deviation of the mean. None where unknown.
         carriers_hz: carrier of each row in Hz, [n], of spectra and signal strengths that were measured at several
             carriers; None where all rows have the same.
+        runs: run of the measurement, such as a day or a session, in which each row was taken, texts [n]; None where
+            unknown.
         source: file or folder of the data.
     """
 
@@ -92,6 +94,7 @@ class Record:
     n_readings: IntArray | None = None
     std: FloatArray | None = None
     carriers_hz: FloatArray | None = None
+    runs: NDArray[np.str_] | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:

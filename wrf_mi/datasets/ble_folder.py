@@ -8,9 +8,9 @@ identity.
 
 from __future__ import annotations
 
-import csv
 import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +26,19 @@ from ..core.types import IntArray
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     ANTENNA_WORDS,
+    RUN,
     TX_ANTENNA_WORDS,
     CsvTable,
     carriers_of,
     data_folder,
     read_antenna,
     read_csv,
+    refuse_runs,
     refuse_unstated,
+    runs_of,
     shown,
+    write_csv,
+    write_extra,
 )
 
 logger = logging.getLogger(__name__)
@@ -76,6 +81,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
     stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY)}
+    runs = attempt(_runs, tables)
     strengths = [attempt(_signal_strength, table, ids) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
     attempt(_refuse_silent, folder / TRAINING, ids, strengths)
@@ -101,13 +107,16 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         tx_antenna=tx_antenna.value,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=noise[STD].value,
+        runs=runs.value,
         source=str(folder),
     )
     carriers_hz = stated[FREQUENCY].value
     return record if carriers_hz is None else record.at_carriers(carriers_hz)
 
 
-def write_ble_folder(path: str | Path, record: Record, replace: bool = False) -> Path:
+def write_ble_folder(
+    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
+) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
     Args:
@@ -115,6 +124,7 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
         record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
             of that split.
         replace: replace an existing folder.
+        extra: content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -132,17 +142,20 @@ def write_ble_folder(path: str | Path, record: Record, replace: bool = False) ->
             if any(antenna != ANTENNA for antenna in group)
         }
         positions = np.stack([receiver.position_m for receiver in record.receivers])
-        _write_csv(part / ANCHORS, {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated})
+        write_csv(part / ANCHORS, {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated})
         for file, rows in zip((TRAINING, TEST), official, strict=True):
             columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
             if record.tx_heading_rad is not None:
                 columns["heading"] = record.tx_heading_rad[rows].tolist()
             if carriers is not None:
                 columns[FREQUENCY] = carriers[rows].tolist()
+            if record.runs is not None:
+                columns[RUN] = record.runs[rows].tolist()
             for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
                 if values is not None:
                     columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
-            _write_csv(part / file, columns)
+            write_csv(part / file, columns)
+        write_extra(part, extra)
     return Path(path)
 
 
@@ -156,6 +169,7 @@ def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArra
     if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
     refuse_unstated(path, record, "folds", "truth", "uplink")
+    refuse_runs(path, record)
     numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
     if not all(np.isfinite(values).all() for values in numbers) or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
@@ -170,15 +184,6 @@ def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArra
             raise InputError(f"{text}: the name of receiver {shown(rx.name)} {wrong}; rename it")
         ids.append(anchor)
     return record.official, ids
-
-
-def _write_csv(path: Path, columns: dict[str, Any]) -> None:
-    """Write columns of texts or numbers to their last digit; NaN, and a count of zero, are empty fields."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
 
 
 def _read_ids(table: CsvTable) -> list[str]:
@@ -264,15 +269,27 @@ def _wrong_id(anchor: str, before: list[str]) -> str | None:
     return None
 
 
-def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
-    """An optional column of all tables, concatenated; None where no table has it."""
+def _having(column: str, tables: list[CsvTable]) -> list[CsvTable]:
+    """Tables with an optional column, which all or none must have."""
     having = [table for table in tables if column in table.header]
-    if not having:
-        return None
     for table in tables:
-        if table not in having:
+        if having and table not in having:
             text = f"no column {column}, but {having[0].path.name} has one; give it in both files or in neither"
             refuse(DataFault(table.path, text, line=1))
+    return having
+
+
+def _runs(tables: list[CsvTable]) -> NDArray[np.str_] | None:
+    """The run of each row of all tables; None where no table states it."""
+    having = _having(RUN, tables)
+    return np.concatenate([runs_of(table) for table in having]) if having else None
+
+
+def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
+    """An optional column of numbers of all tables, concatenated; None where no table has it."""
+    having = _having(column, tables)
+    if not having:
+        return None
     columns = [table.numbers(column) for table in having]
     if column == FREQUENCY:
         for table, values in zip(having, columns, strict=True):

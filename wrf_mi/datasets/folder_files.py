@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
@@ -21,6 +23,8 @@ from .faults import attempt, recoverable, refuse
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"
 """Columns of positions, metres."""
+RUN = "run"
+"""Column with the run of the measurement in which each row was taken: a text without line ends."""
 INDEX_FILES = ("train_index.txt", "test_index.txt")
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
@@ -224,17 +228,35 @@ def read_columns(path: Path, *headers: str) -> FloatArray:
     Raises:
         InputError: another header, or as `read_csv` and `CsvTable.numbers`.
     """
+    table = _read_table(path, headers)
+    return np.stack([table.numbers(name, index=index) for index, name in enumerate(table.header)], axis=-1)
+
+
+def _read_table(path: Path, headers: tuple[str, ...]) -> CsvTable:
     table = read_csv(path)
     found = ",".join(table.header)
     if found.lower() not in headers:
         raise DataFault(path, f"header is {found[:40]!r}; it must be {' or '.join(headers)}", line=1)
-    return np.stack([table.numbers(name, index=index) for index, name in enumerate(table.header)], axis=-1)
+    return table
 
 
-def read_positions(path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """Positions [n, 3] in metres and carriers [n] in Hz of a CSV file with the header ``x,y,z`` or `FREQUENCY` too."""
-    values = read_columns(path, AXES, f"{AXES},{FREQUENCY}")
-    return values[:, :3], carriers_of(path, values[:, 3]) if values.shape[1] > 3 else None
+@dataclass(frozen=True)
+class Positions:
+    """Content of `POSITIONS`: positions [n, 3], metres; carriers [n], Hz, and runs [n], None without the column."""
+
+    positions_m: FloatArray
+    carriers_hz: FloatArray | None = None
+    runs: NDArray[np.str_] | None = None
+
+
+def read_positions(path: Path) -> Positions:
+    """Read a CSV file with the header ``x,y,z``, to which `FREQUENCY` and then `RUN` may be added."""
+    optional = ("", f",{FREQUENCY}", f",{RUN}", f",{FREQUENCY},{RUN}")
+    table = _read_table(path, tuple(AXES + columns for columns in optional))
+    table = replace(table, header=[name.lower() for name in table.header])
+    positions = np.stack([table.numbers(axis) for axis in AXES.split(",")], axis=-1)
+    carriers = carriers_of(path, table.numbers(FREQUENCY)) if FREQUENCY in table.header else None
+    return Positions(positions, carriers, runs_of(table) if RUN in table.header else None)
 
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
@@ -243,6 +265,23 @@ def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
         text = f"{FREQUENCY} is {carriers_hz[row]:g}; give the carrier in Hz, such as 920e6"
         refuse(DataFault(path, text, row=int(row) + 1))
     return carriers_hz
+
+
+def runs_of(table: CsvTable) -> NDArray[np.str_]:
+    """Runs [rows] of a table's column `RUN`; an `InputError` if one is empty."""
+    runs = [text.strip() for text in table.texts(RUN)]
+    for row, run in enumerate(runs):
+        if not run and row not in table.damaged:
+            refuse(DataFault(table.path, f"{RUN} is empty; give the name or number of the run", row=row + 1))
+    return np.array(runs)
+
+
+def refuse_runs(path: str | Path, record: Record) -> None:
+    """Refuse to write runs that `runs_of` would read as others."""
+    for row, run in enumerate([] if record.runs is None else record.runs.tolist()):
+        if not run or run != run.strip() or not run.isprintable():
+            text = f"{path}: {record.name}, row {row}: run {shown(run)} does not fit into a field"
+            raise InputError(f"{text}; give a text of one line without spaces around it")
 
 
 def whole_number(path: Path, line: int, text: str) -> int:
@@ -297,9 +336,9 @@ def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
             raise InputError(f"{path}: {record.name} has {name}, which this layout does not state; {remedy}")
 
 
-def write_official(folder: Path, record: Record, first: int, digits: int = 1) -> None:
-    """Write the index files of a record's official split, if it has one; `read_official` reads them."""
-    for file, rows in zip(INDEX_FILES, record.official or (), strict=False):
+def write_official(folder: Path, official: tuple[IntArray, IntArray] | None, first: int, digits: int = 1) -> None:
+    """Write the index files of an official split, if there is one; `read_official` reads them."""
+    for file, rows in zip(INDEX_FILES, official or (), strict=False):
         write_lines(folder / file, [f"{row + first:0{digits}d}" for row in rows])
 
 
@@ -308,9 +347,26 @@ def write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
-def write_positions(path: Path, positions_m: FloatArray, carriers_hz: FloatArray | None = None) -> None:
-    """Write positions [n, 3] and carriers [n] to the last digit; `read_positions` reads them."""
-    header, values = AXES, positions_m
-    if carriers_hz is not None:
-        header, values = f"{AXES},{FREQUENCY}", np.column_stack([positions_m, carriers_hz])
-    write_lines(path, [header, *(",".join(repr(float(v)) for v in row) for row in values)])
+def write_csv(path: Path, columns: Mapping[str, Iterable[Any]]) -> None:
+    """Write columns of texts or numbers to their last digit; NaN, and a count of zero, are empty fields."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
+
+
+def write_positions(path: Path, stated: Positions) -> None:
+    """Write positions and carriers to the last digit, and runs; `read_positions` reads them."""
+    columns: dict[str, list[Any]] = dict(zip(AXES.split(","), stated.positions_m.astype(float).T.tolist(), strict=True))
+    for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs)):
+        if values is not None:
+            columns[name] = values.tolist()
+    write_csv(path, columns)
+
+
+def write_extra(folder: Path, extra: Mapping[str, str | bytes] | None) -> None:
+    """Write further files by their paths in a folder."""
+    for name, content in (extra or {}).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)

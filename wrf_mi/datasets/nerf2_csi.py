@@ -25,6 +25,7 @@ from .folder_files import (
     AXES,
     POSITIONS,
     TX_ANTENNA_WORDS,
+    Positions,
     antenna_entry,
     data_folder,
     fits_single,
@@ -36,6 +37,7 @@ from .folder_files import (
     refuse_unstated,
     shown,
     unit_quaternion,
+    write_extra,
     write_official,
     write_positions,
 )
@@ -94,7 +96,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
 
 
 def write_nerf2_csi(
-    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str] | None = None
+    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
 ) -> Path:
     """Write a record atomically in the layout of NeRF2's channel coefficients.
 
@@ -103,7 +105,7 @@ def write_nerf2_csi(
         record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
             the downlink.
         replace: replace an existing folder.
-        extra: text of further files by their names.
+        extra: content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -112,7 +114,7 @@ def write_nerf2_csi(
     if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
         need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
         raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
-    refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz")
+    refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz", "runs")
     receiver = record.receivers[0]
     info: dict[str, Any] = {
         "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),
@@ -127,12 +129,11 @@ def write_nerf2_csi(
         text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
-            write_positions(part / POSITIONS, record.tx_pos_m)
+            write_positions(part / POSITIONS, Positions(record.tx_pos_m))
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
-        write_official(part, record, first=0)
-        for file, content in (extra or {}).items():
-            (part / file).write_text(content, encoding="utf-8")
+        write_official(part, record.official, first=0)
+        write_extra(part, extra)
     return Path(path)
 
 

@@ -51,6 +51,7 @@ class DataSet:
         shared_folder: name of a folder that may hold the data set beside others, in place of ``<name>/``.
         frequency_hz: carrier, where the files do not state it.
         array: rows, columns and spacing (m) of the planar array, where the files do not state it.
+        runs: runs of the measurement of the training and of the test rows, where the files do not state them.
         note: remark for users who fetch the data.
     """
 
@@ -65,6 +66,7 @@ class DataSet:
     shared_folder: str | None = None
     frequency_hz: float | None = None
     array: list[Any] | None = None
+    runs: list[str] | None = None
     note: str = ""
 
 
@@ -153,6 +155,9 @@ def load(name_or_folder: str | Path) -> Record:
             record = replace(record, folds=parse_folds(folds, len(record)))
     if record.frequencies_hz is None and dataset.frequency_hz is not None:
         record = replace(record, frequencies_hz=np.array([dataset.frequency_hz]))
+    if record.runs is None and dataset.runs is not None and record.official is not None:
+        of_test = np.isin(np.arange(len(record)), record.official[1])
+        record = replace(record, runs=np.array(dataset.runs)[of_test.astype(int)])
     if dataset.array is not None:
         array_m = planar_array(*dataset.array)
         receivers = tuple(rx if rx.array_m is not None else replace(rx, array_m=array_m) for rx in record.receivers)

@@ -25,6 +25,7 @@ from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
     TX_ANTENNA_WORDS,
+    Positions,
     antenna_entry,
     data_folder,
     finite_numbers,
@@ -32,10 +33,12 @@ from .folder_files import (
     read_official,
     read_positions,
     read_yaml,
+    refuse_runs,
     refuse_unstated,
     shown,
     unit_quaternion,
     whole_number,
+    write_extra,
     write_lines,
     write_official,
     write_positions,
@@ -73,25 +76,27 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     table = attempt(read_positions, folder / POSITIONS)
     stated = attempt(_frequency, gateways, info)
     attempt(_one_carrier, folder / POSITIONS, table, stated)
-    rows = attempt(lambda read: len(read[0]), table)
+    rows = attempt(lambda read: len(read.positions_m), table)
     observation = attempt(_read_images, folder / "spectrum", poses, rows)
     official = attempt(read_official, folder, rows, 1)
     folds = attempt(_folds, folder / FOLDS, rows)
     tx_antenna = attempt(_tx_antenna, gateways, info)
     stop_at_faults()
-    positions, carriers = table.value
+    stated_rows = table.value
     record = Record(
         name=name or folder.resolve().name,
         task="spectrum",
-        tx_pos_m=positions,
+        tx_pos_m=stated_rows.positions_m,
         receivers=receivers.value,
         observation=observation.value,
         official=official.value,
         folds=folds.value,
         frequencies_hz=stated.value,
         tx_antenna=tx_antenna.value,
+        runs=stated_rows.runs,
         source=str(folder),
     )
+    carriers = stated_rows.carriers_hz
     return record if carriers is None else record.at_carriers(carriers)
 
 
@@ -128,6 +133,7 @@ def write_spectrum_folder(
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
         text = f"{record.name} has {len(record.frequencies_hz)} carriers for all rows, and {GATEWAYS} states one"
         raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
+    refuse_runs(path, record)
     refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
     grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
     with atomic_folder(Path(path), replace) as part:
@@ -151,13 +157,11 @@ def write_spectrum_folder(
             content["frequency_hz"] = float(record.frequencies_hz[0])
         info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        write_positions(part / POSITIONS, record.tx_pos_m, record.carriers_hz)
-        write_official(part, record, first=1, digits=5)
+        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
+        write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
             write_lines(part / FOLDS, [str(fold) for fold in record.folds])
-        for name, data in (extra or {}).items():
-            (part / name).parent.mkdir(exist_ok=True)
-            (part / name).write_bytes(data.encode() if isinstance(data, str) else data)
+        write_extra(part, extra)
     return Path(path)
 
 
@@ -191,9 +195,9 @@ def _tx_antenna(path: Path, info: dict[Any, Any]) -> Antenna:
     return read_antenna(path, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS)
 
 
-def _one_carrier(path: Path, table: tuple[FloatArray, FloatArray | None], stated: FloatArray | None) -> None:
+def _one_carrier(path: Path, table: Positions, stated: FloatArray | None) -> None:
     """Refuse a carrier for all rows beside one for each row."""
-    if stated is not None and table[1] is not None:
+    if stated is not None and table.carriers_hz is not None:
         text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
         raise DataFault(path, text, line=1)
 

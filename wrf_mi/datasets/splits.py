@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from ..core import InputError, Record, Split
 from ..core.files import readable, stored_arrays, write_arrays
 from ..core.types import IntArray
 
-FOLDED = ("blocked", "frequency", "frequency-known", "receiver")
+FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")
 """Splits of several folds."""
 SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory")
 TRAIN_FRACTION = 0.8
@@ -37,7 +38,7 @@ def make_splits(
     n_train: int | float | None = None,
     validation_fraction: float = 0.1,
 ) -> list[Split]:
-    """Split a record's rows by one of seven rules.
+    """Split a record's rows by one of eight rules.
 
     - ``official``: the split of the data.
     - ``random``: seeded, 80 % train and 20 % test.
@@ -49,17 +50,20 @@ def make_splits(
     - ``receiver``: a split per receiver, or per fold of four of more than eight receivers (seeded), whose test set is
       what these receive in the test rows; the other receivers' training rows train. Rows are those of the official
       split, or else of the random one.
+    - ``other-run``: a split per run of the measurement, in the order of first appearance, whose test set are its rows;
+      the rows of all other runs train.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
 
-    One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier), ``frequency-known:0`` or ``receiver:1``.
+    One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier), ``frequency-known:0``, ``receiver:1`` or
+    ``other-run:0``.
 
     Rows that no receiver received (NaN throughout) are in no part of any split. Validation rows are a seeded draw from
     the training rows. Subsets by ``n_train`` and their validation rows are nested for equal seeds.
 
     Args:
         record: any record with n rows.
-        name: ``official``, ``random``, ``trajectory``, or ``blocked``, ``frequency``, ``frequency-known``, ``receiver``
-            with or without the number of a fold.
+        name: ``official``, ``random``, ``trajectory``, or ``blocked``, ``frequency``, ``frequency-known``,
+            ``receiver``, ``other-run`` with or without the number of a fold.
         seed: seed of the random split, the held-out positions, folds of receivers, the subset and the validation rows;
             not of spatial folds.
         n_train: number of training rows to keep, validation rows included, or their share (a float up to 1); by default
@@ -192,8 +196,10 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     if kind == "receiver":
         return _receivers_held_out(record, name, seed)
     if kind in FOLDED:
-        of_row = (position_folds(record) if kind == "blocked" else _carrier_numbers(record, kind))[rows]
-        held = np.ones(len(rows), bool) if kind == "blocked" else _held_out_positions(record, seed)[rows]
+        found = {"blocked": position_folds, "other-run": _run_numbers}.get(kind, partial(_carrier_numbers, kind=kind))
+        of_row = found(record)[rows]
+        by_carrier = kind.startswith("frequency")
+        held = _held_out_positions(record, seed)[rows] if by_carrier else np.ones(len(rows), bool)
         trains = np.ones(len(rows), bool) if kind != "frequency" else ~held
         chosen = _folds(record, name, int(of_row.max(initial=0)) + 1)
         return [_Rows(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
@@ -210,6 +216,18 @@ def _carrier_numbers(record: Record, kind: str) -> IntArray:
         text = f"split {kind} holds out carriers, and these data have one"
         raise InputError(f"{record.name}: {text}; give rows of several carriers or choose another split")
     return np.unique(record.carriers_hz, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def _run_numbers(record: Record) -> IntArray:
+    """Number of each row's run [n], 0 for that of the first row."""
+    _, first, number = np.unique([] if record.runs is None else record.runs, return_index=True, return_inverse=True)
+    if len(first) < 2:
+        what = "state none" if record.runs is None else "have one"
+        remedy = "give a column run (docs/data.md) with two at least, or choose another split"
+        raise InputError(
+            f"{record.name}: split other-run holds out runs of the measurement, and these data {what}; {remedy}"
+        )
+    return np.argsort(np.argsort(first))[number.reshape(-1)].astype(np.int64)
 
 
 def _held_out_positions(record: Record, seed: int) -> NDArray[np.bool_]:

@@ -71,11 +71,13 @@ def check_parts(record: Record) -> None:
     """Refuse a record whose parts do not fit together.
 
     Raises:
-        InputError: numbers of rows, antennas, subcarriers and frequencies that differ; carriers, numbers of readings or
-            standard deviations that do not fit the observations.
+        InputError: numbers of rows, antennas, subcarriers and frequencies that differ; carriers, runs, numbers of
+            readings or standard deviations that do not fit the observations.
     """
     task_of(record).check(record)
     _check_noise(record)
+    if record.runs is not None and record.runs.shape != (len(record),):
+        raise InputError(f"{place_of(record)}: runs {list(record.runs.shape)}; give one for each of {len(record)} rows")
     carriers, place = record.carriers_hz, place_of(record)
     if carriers is None:
         return

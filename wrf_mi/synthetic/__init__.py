@@ -9,19 +9,33 @@ from pathlib import Path
 from ..core import Record
 from ..datasets import load
 from .floor_channels import PLACES, PREFIX, walked_channels
+from .floor_receivers import CHANNELS as FLOOR_CHANNELS
+from .floor_receivers import NAME as FLOOR_STRENGTHS
+from .floor_receivers import traced_floor_channels, traced_floor_strengths
 from .furnished_room import NAME as ROOM
 from .furnished_room import traced_room
 from .laboratory import NAME as LABORATORY
 from .laboratory import laboratory_record
+from .room_bands import NAME as BANDS
+from .room_bands import traced_room_bands
 
-__all__ = ["laboratory_record", "load_record", "traced_room", "walked_channels"]
+__all__ = [
+    "laboratory_record",
+    "load_record",
+    "traced_floor_channels",
+    "traced_floor_strengths",
+    "traced_room",
+    "traced_room_bands",
+    "walked_channels",
+]
 
 
 def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     """Read any data set as `wrf_mi.datasets.load` does, or trace a synthetic data set.
 
-    Synthetic are ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-csi-flat`` and
-    ``traced-csi-office`` (a minute or two each).
+    Synthetic are ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-room-bands``,
+    ``traced-csi-flat``, ``traced-csi-office``, ``traced-floor-receivers`` and ``traced-floor-receivers-csi`` (a minute
+    or two each).
 
     Args:
         name_or_folder: a folder, or the name of a known data set.
@@ -31,6 +45,12 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
         InputError: as `wrf_mi.datasets.load`.
     """
     makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: lambda **kw: traced_room(**kw)[0]}
+    # Looked up at the call, so that tests can replace them.
+    makers |= {
+        BANDS: lambda **kw: traced_room_bands(**kw),
+        FLOOR_STRENGTHS: lambda **kw: traced_floor_strengths(**kw),
+        FLOOR_CHANNELS: lambda **kw: traced_floor_channels(**kw),
+    }
     makers |= {f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES}
     if not Path(name_or_folder).is_dir() and str(name_or_folder) in makers:
         return makers[str(name_or_folder)](progress=progress)

@@ -27,12 +27,11 @@ from wrf_mi_scenes.registry import content_sha256
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..datasets import load, make_splits, read_nerf2_csi, user_cache, write_nerf2_csi
-from ..datasets.registry import locate
+from ..datasets import make_splits, read_nerf2_csi, user_cache, write_nerf2_csi
 from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
 from .furnished_room import trace_channels
-from .laboratory import RECIPE, is_made
+from .laboratory import RECIPE, is_made, provided, scene_files
 
 logger = logging.getLogger(__name__)
 
@@ -112,9 +111,8 @@ def walked_channels(
         raise InputError(f"place {place!r}: unknown; give one of {', '.join(PLACES)}")
     name = f"{PREFIX}{place}"
     if folder is None:
-        found = locate(name)
-        if found is not None and found.parent != user_cache():
-            return replace(load(found), name=name)
+        if (found := provided(name)) is not None:
+            return found
         folder = user_cache() / name
     folder, plan = Path(folder), PLACES[place]()
     with tempfile.TemporaryDirectory() as work:
@@ -131,13 +129,12 @@ def walked_channels(
             "sionna_rt": version("sionna-rt"),
         }
         recipe = yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)
-        if not is_made(folder, recipe) or not (folder / MEASURED / "scene.yml").is_file():
+        if not is_made(folder, recipe):
             logger.info("tracing channels in the %s into %s", place, folder)
             record = _trace(Path(work), name, plan, walk, progress)
-            write_nerf2_csi(folder, record, replace=True, extra={RECIPE: recipe})
             bare = floor_plans.measured(plan, walk.mesh_error_m, walk.seed)
-            title = f"{place.capitalize()}: bare walls as measured, one material"
-            write_scene(folder / MEASURED, bare, title, "wrf_mi_scenes.floor_plans")
+            extra: dict[str, str | bytes] = {RECIPE: recipe, **scene_files(bare, MEASURED, "wrf_mi_scenes.floor_plans")}
+            write_nerf2_csi(folder, record, replace=True, extra=extra)
     return read_nerf2_csi(folder, name)
 
 

@@ -8,9 +8,8 @@ height, including the space behind the array and the inner room.
 from __future__ import annotations
 
 import logging
-import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -36,10 +35,11 @@ from ..receivers.array import bartlett_spectrum, minmax_scale
 from ..receivers.channel import array_channels
 from ..tracing.devices import solid_around
 from ..tracing.options import TraceOptions
+from ..tracing.result import TraceResult
 from ..tracing.scenes import open_scene
 from ..tracing.solve import trace_paths
 from ..tracing.surfaces import scene_surfaces
-from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SPACING_M, is_made, scan_file
+from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, RECIPE, SCAN, SPACING_M, is_made, scan_file, scene_files
 
 logger = logging.getLogger(__name__)
 
@@ -107,25 +107,43 @@ def traced_room(
     """
     folder = user_cache() / NAME if folder is None else Path(folder)
     facts = {"format": FORMAT, **asdict(room), "frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
-    recipe = yaml.safe_dump(facts | {"sionna_rt": version("sionna-rt")}, sort_keys=False)
+    record = made_in_room(folder, NAME, facts, room, lambda scene_folder: _trace(scene_folder, room, progress))
+    return record, folder / MEASURED
+
+
+def made_in_room(
+    folder: Path, name: str, facts: Mapping[str, Any], room: TracedRoom, trace: Callable[[Path], Record]
+) -> Record:
+    """Spectra of the furnished room: read from a folder, or traced and stored with a scan and the measured room.
+
+    Args:
+        folder: folder of the spectra in the NeRF2 layout.
+        name: name of the record.
+        facts: parameters of the data; other ones make them anew.
+        room: seed of scan and measured room, and errors of the latter.
+        trace: function of the true scene's folder that traces the record.
+    """
+    recipe = yaml.safe_dump({**facts, "sionna_rt": version("sionna-rt")}, sort_keys=False)
     if not is_made(folder, recipe):
-        logger.info("tracing %d spectra of the furnished room into %s", room.train + room.test, folder)
+        logger.info("tracing %s into %s", name, folder)
         with tempfile.TemporaryDirectory() as work:
             truth = write_scene(Path(work) / "truth", furnished_parts(), "Furnished room, all that is in it")
-            given = Path(work) / MEASURED
-            write_scene(given, measured_parts(room.mesh_error_m, room.seed), "Bare walls as measured, one material")
-            record = _trace(truth.parent, room, progress)
+            record = trace(truth.parent)
+            bare = measured_parts(room.mesh_error_m, room.seed)
             extra: dict[str, str | bytes] = {RECIPE: recipe, SCAN: scan_file(truth, room.seed)}
+            extra |= scene_files(bare, MEASURED, "wrf_mi_scenes.furnished")
             write_spectrum_folder(folder, record, replace=True, extra=extra)
-            shutil.copytree(given, folder / MEASURED)
-    return read_spectrum_folder(folder, NAME), folder / MEASURED
+    return read_spectrum_folder(folder, name)
 
 
-def transmitters(scene: Any, room: TracedRoom) -> FloatArray:
-    """Positions [train + test, 3] in metres, uniform over the free volume of a ``sionna.rt.Scene``, to 0.1 mm."""
+def transmitters(scene: Any, room: TracedRoom, stations_m: FloatArray = RECEIVER.position_m) -> FloatArray:
+    """Positions [train + test, 3] in metres, uniform over the free volume of a ``sionna.rt.Scene``, to 0.1 mm.
+
+    They keep the distance ``from_array_m`` from ``stations_m`` [3] or [k, 3].
+    """
     low, high = np.array([0, 0, room.low_m]), np.array([LENGTH, WIDTH, room.high_m])
     rng = np.random.default_rng([room.seed, 0])
-    apart = room.seed, RECEIVER.position_m, room.from_array_m
+    apart = room.seed, stations_m, room.from_array_m
     return free_positions(scene, low, high, room.train + room.test, room.clear_m, rng, *apart)
 
 
@@ -150,8 +168,8 @@ def free_positions(
         clear_m: least distance from surfaces, metres.
         rng: generator of the positions.
         seed: seed of the points by which distances from surfaces are judged.
-        station_m: position [3] to keep away from, metres; None: none.
-        from_station_m: least distance from it, metres.
+        station_m: position [3], or positions [k, 3], to keep away from, metres; None: none.
+        from_station_m: least distance from these, metres.
     """
     surfaces = scene_surfaces(scene)
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
@@ -162,7 +180,8 @@ def free_positions(
         drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
         free = tree.query(drawn)[0] > clear_m
         if station_m is not None:
-            free &= np.linalg.norm(drawn - station_m, axis=1) > from_station_m
+            apart = np.linalg.norm(drawn[:, None] - np.atleast_2d(station_m), axis=-1)
+            free &= apart.min(axis=1) > from_station_m
         free &= solid_around(surfaces, drawn) < 0
         found = np.concatenate([found, drawn[free]])
     return found[:count]
@@ -180,13 +199,33 @@ def trace_channels(
 ) -> NDArray[np.complex128]:
     """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over searches for paths.
 
-    A search with scattering counts its scattered paths, another search all but those diffracted at other edges than of
-    the ``opaque`` objects. ``progress`` is the text of a progress bar on standard error.
+    Paths are those of `searched_paths`.
     """
     assert receiver.array_m is not None
     channel = np.zeros((len(positions), len(receiver.array_m), len(frequencies_hz)), complex)
-    for material in scene.radio_materials.values():
-        material.scattering_coefficient = options[0].scattering_coefficient
+    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, chunk_size, progress):
+        channel[rows] += array_channels(traced.paths, receiver, receiver.array_m, frequencies_hz)
+    return channel
+
+
+def searched_paths(
+    scene: Any,
+    receiver: Receiver,
+    positions: FloatArray,
+    options: Sequence[TraceOptions],
+    opaque: Sequence[str] = (),
+    chunk_size: int = CHUNK_SIZE,
+    progress: str | None = None,
+) -> Iterator[tuple[slice, TraceResult]]:
+    """Paths from a receiver's array, as "transmitter", to chunks of positions [n, 3], as "receivers".
+
+    A search with scattering counts its scattered paths, another search all but those diffracted at other edges than of
+    the ``opaque`` objects. ``progress`` is the text of a progress bar on standard error.
+
+    Yields:
+        Rows of a chunk, and its paths by a search.
+    """
+    set_scattering(scene, options[0].scattering_coefficient)
     with Progress(console=Console(stderr=True), transient=True, disable=progress is None) as bar:
         for start in bar.track(range(0, len(positions), chunk_size), description=progress or ""):
             part = positions[start : start + chunk_size]
@@ -195,28 +234,42 @@ def trace_channels(
                 # The array searches, so that all positions see the same patches of rough wall and the same edges.
                 # Sionna RT keeps the direction of the search where there is diffraction, so the array is the
                 # transmitter.
-                paths = trace_paths(scene, receiver.position_m, ends, search).paths
+                traced = trace_paths(scene, receiver.position_m, ends, search)
+                paths = traced.paths
                 kept = (paths.interactions == SCATTERING).any(axis=1)
                 if not search.scattering:
                     names = np.array([paths.object_names.index(name) for name in opaque if name in paths.object_names])
                     kept = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
-                part_channel = array_channels(paths.select(kept), receiver, receiver.array_m, frequencies_hz)
-                channel[start : start + chunk_size] += part_channel
-    return channel
+                yield slice(start, start + len(part)), traced.select(kept)
+
+
+def set_scattering(scene: Any, coefficient: float) -> None:
+    """Set the share of the reflected amplitude that every surface of a ``sionna.rt.Scene`` scatters."""
+    for material in scene.radio_materials.values():
+        material.scattering_coefficient = coefficient
+
+
+def room_searches(room: TracedRoom) -> tuple[TraceOptions, TraceOptions]:
+    """Searches for the paths in the furnished room: specular and diffracted ones, and scattered ones."""
+    shared: dict[str, Any] = {"transmission": True, "seed": room.seed, "scattering_coefficient": room.scattering}
+    exact = TraceOptions(
+        diffraction=True, max_depth=room.depth, max_reflections=room.reflections, rays=room.rays, **shared
+    )
+    return exact, TraceOptions(scattering=True, max_depth=room.scattered_depth, rays=room.scattered_rays, **shared)
+
+
+def opaque_parts() -> list[str]:
+    """Names of the furnished room's parts whose edges diffract."""
+    return [name for name, (material, _) in furnished_parts().items() if material == OPAQUE]
 
 
 def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
     scene, array_m = open_scene(scene_folder, FREQUENCY_HZ), planar_array(4, 4, SPACING_M)
     receiver, frequency_hz = replace(RECEIVER, array_m=array_m), np.array([FREQUENCY_HZ])
     positions = transmitters(scene, room)
-    shared: dict[str, Any] = {"transmission": True, "seed": room.seed, "scattering_coefficient": room.scattering}
-    exact = TraceOptions(
-        diffraction=True, max_depth=room.depth, max_reflections=room.reflections, rays=room.rays, **shared
-    )
-    rough = TraceOptions(scattering=True, max_depth=room.scattered_depth, rays=room.scattered_rays, **shared)
-    opaque = [name for name, (material, _) in furnished_parts().items() if material == OPAQUE]
+    how = room_searches(room), opaque_parts()
     text = "tracing the furnished room" if progress else None
-    signals = trace_channels(scene, receiver, positions, frequency_hz, (exact, rough), opaque, progress=text)[..., 0]
+    signals = trace_channels(scene, receiver, positions, frequency_hz, *how, progress=text)[..., 0]
     spectra = [minmax_scale(bartlett_spectrum(signal, array_m, FREQUENCY_HZ, 90, 360)) for signal in signals]
     rows = np.arange(len(positions))
     return Record(

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import io
 import logging
+import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from wrf_mi_scenes import scenes
+from wrf_mi_scenes.mitsuba_xml import Parts, write_scene
 
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
@@ -74,9 +77,8 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
         progress: show a progress bar on standard error.
     """
     if folder is None:
-        found = locate(NAME)
-        if found is not None and found.parent != user_cache():
-            return load(found)
+        if (found := provided(NAME)) is not None:
+            return found
         folder = user_cache() / NAME
     folder = Path(folder)
     info = scenes()[NAME]
@@ -109,14 +111,28 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
     return read_spectrum_folder(folder, NAME)
 
 
+def provided(name: str) -> Record | None:
+    """The record of a known data set below ``WRF_MI_DATA``; None if it is not there."""
+    found = locate(name)
+    return None if found is None or found.parent == user_cache() else replace(load(found), name=name)
+
+
 def is_made(folder: Path, recipe: str) -> bool:
     """Whether a folder holds data of the parameters of a recipe."""
     return (folder / RECIPE).is_file() and (folder / RECIPE).read_text(encoding="utf-8") == recipe
 
 
-def scan_file(xml: Path, seed: int) -> bytes:
-    """Content of the file `SCAN` of a scene."""
-    points = simulate_scan(xml, SCANNER_M, rays_per_pose=SCANNED_RAYS, seed=seed)
+def scan_file(xml: Path, seed: int, scanner_m: Sequence[tuple[float, float, float]] = SCANNER_M) -> bytes:
+    """Content of the file `SCAN` of a scene, by default one in the laboratory's room."""
+    points = simulate_scan(xml, scanner_m, rays_per_pose=SCANNED_RAYS, seed=seed)
     stream = io.BytesIO()
     np.savez_compressed(stream, points=points.astype(np.float32))
     return stream.getvalue()
+
+
+def scene_files(parts: Parts, folder: str, origin: str) -> dict[str, bytes]:
+    """Content of the files of a measured scene by their paths in a folder; ``origin`` is the module of its parts."""
+    with tempfile.TemporaryDirectory() as work:
+        write_scene(Path(work), parts, "Bare walls as measured, one material", origin)
+        files = sorted(file for file in Path(work).rglob("*") if file.is_file())
+        return {f"{folder}/{file.relative_to(work).as_posix()}": file.read_bytes() for file in files}

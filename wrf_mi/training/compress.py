@@ -124,7 +124,9 @@ def _taught(config: TrainConfig, params: Params, record: Record, split: Split) -
     height, width = map(int, record.observation.shape[-2:])
     predict = Predictor(make_field(config), params, record.receivers, height, width)
     spectra = np.stack([predict(positions, r) for r in range(len(record.receivers))])
-    return replace(record, tx_pos_m=positions, observation=spectra, official=None, folds=None, tx_heading_rad=None)
+    return replace(
+        record, tx_pos_m=positions, observation=spectra, official=None, folds=None, tx_heading_rad=None, runs=None
+    )
 
 
 def _fit(

@@ -1,0 +1,273 @@
+"""An office floor with receivers on its ceiling: signal strengths, and channels of single antennas.
+
+``docs/data.md`` describes both data sets, which have the same receivers, transmitters and paths. The floor is
+`wrf_mi_scenes.floor_plans.office`. There is no diffraction: metal shelves and the metal-clad core shade what neither
+reflections nor diffuse scattering reach.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from wrf_mi_scenes import floor_plans
+from wrf_mi_scenes.floor_plans import FloorPlan
+from wrf_mi_scenes.mitsuba_xml import write_scene
+from wrf_mi_scenes.registry import content_sha256
+
+from ..core import Paths, Receiver, Record
+from ..core.angles import FloatArray
+from ..core.antenna import UPRIGHT
+from ..datasets import read_ble_folder, read_deepmimo, user_cache, write_ble_folder
+from ..datasets.ble_folder import CARRIER_HZ
+from ..datasets.deepmimo_params import CHANNEL_PARAMS
+from ..datasets.folder_files import write_extra, write_official
+from ..receivers.channel import rssi_dbm
+from ..tracing.deepmimo import write_deepmimo
+from ..tracing.devices import winding_number
+from ..tracing.options import TraceOptions
+from ..tracing.result import TraceResult
+from ..tracing.scenes import open_scene
+from ..tracing.solve import trace_paths
+from .floor_channels import MEASURED
+from .furnished_room import SCATTERING, free_positions, set_scattering
+from .laboratory import RECIPE, SCAN, is_made, provided, scan_file, scene_files
+
+logger = logging.getLogger(__name__)
+
+NAME = "traced-floor-receivers"
+CHANNELS = f"{NAME}-csi"
+FORMAT = 1  # version of the files, to be raised when they change for equal parameters
+CANDIDATES = 1000
+"""Free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2."""
+SCANNER_M = tuple(
+    (x, y, 1.5)
+    for x, y in (
+        (1.6, 2.7),
+        (5.4, 4.85),
+        (8.2, 0.8),
+        (11.5, 3.0),
+        (14.5, 4.8),
+        (3.65, 6.2),
+        (14.5, 6.2),
+        (1.6, 7.7),
+        (6.2, 7.7),
+        (10.6, 7.7),
+        (15.0, 7.7),
+    )
+)
+"""Positions of the LiDAR, metres: five in the open plan, two in the corridor, one in each room."""
+
+
+@dataclass(frozen=True)
+class FloorReceivers:
+    """Parameters of the floor's receivers.
+
+    Attributes:
+        columns, rows: numbers of receivers along x and y, one in each cell of a grid over the floor.
+        train, test: numbers of training and test positions of the transmitter.
+        mount_m: height of the receivers, metres.
+        low_m, high_m: bounds of the transmitter's height, metres.
+        clear_m, from_receiver_m: least distances of antennas from surfaces, and of transmitters from receivers, metres.
+        depth, reflections: most interactions of a path, and reflections among them in paths without scattering.
+        rays, scattered_rays: numbers of rays for specular and for scattered paths.
+        scattering: share of the reflected amplitude that every surface scatters.
+        power_dbm: power that the transmitter radiates.
+        sensitivity_dbm: signal strength below which nothing is received.
+        offset_db: standard deviation of the receivers' offsets, each the same for all rows.
+        noise_db: standard deviation of the noise of each signal strength.
+        subcarriers, bandwidth_hz: number of the channels' subcarriers, from the carrier upwards, and their bandwidth.
+        mesh_error_m: standard deviation of the measured walls' positions along each axis, metres.
+        seed: seed of positions, rays, offsets, noise and errors of the measured floor.
+    """
+
+    columns: int = 4
+    rows: int = 4
+    train: int = 320
+    test: int = 80
+    mount_m: float = 2.85
+    low_m: float = 0.8
+    high_m: float = 1.6
+    clear_m: float = 0.1
+    from_receiver_m: float = 0.5
+    depth: int = 5
+    reflections: int = 3
+    rays: int = 1 << 17
+    scattered_rays: int = 1 << 9
+    scattering: float = 0.3
+    power_dbm: float = 0.0
+    sensitivity_dbm: float = -75.0
+    offset_db: float = 1.0
+    noise_db: float = 1.0
+    subcarriers: int = 16
+    bandwidth_hz: float = 20e6
+    mesh_error_m: float = 0.02
+    seed: int = 1
+
+
+DEFAULT = FloorReceivers()
+
+
+def traced_floor_strengths(
+    folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
+) -> Record:
+    """Signal strengths on the floor: read from an earlier call, or traced now and stored.
+
+    The official split is the first ``train`` rows and the rest; positions are drawn independently.
+
+    Args:
+        folder: folder in the layout of the BLE data; by default ``traced-floor-receivers/`` below ``WRF_MI_DATA`` if it
+            exists, else in the user's cache.
+        floor: parameters.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        A record with ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity.
+    """
+
+    def write(folder: Path, traced: TraceResult, extra: dict[str, str | bytes]) -> None:
+        write_ble_folder(folder, _strengths(traced, floor), replace=True, extra=extra)
+
+    return _made(NAME, folder, floor, progress, write, read_ble_folder)
+
+
+def traced_floor_channels(
+    folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
+) -> Record:
+    """Channels of single antennas on the floor, without noise: read from an earlier call, or traced now and stored.
+
+    Args:
+        folder: folder of a scenario of DeepMIMO; by default ``traced-floor-receivers-csi/``, as for
+            `traced_floor_strengths`.
+        floor: parameters.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        A record with ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
+    """
+
+    def write(folder: Path, traced: TraceResult, extra: dict[str, str | bytes]) -> None:
+        ofdm = {"bandwidth": floor.bandwidth_hz, "subcarriers": floor.subcarriers}
+        params = {"base_stations": "all", "ofdm": ofdm | {"selected_subcarriers": list(range(floor.subcarriers))}}
+        write_deepmimo(folder, traced, replace=True)
+        write_official(folder, (np.arange(floor.train), floor.train + np.arange(floor.test)), first=0)
+        # The recipe comes last: without it the data are made again.
+        write_extra(folder, {CHANNEL_PARAMS: yaml.safe_dump(params), **extra})
+
+    return _made(CHANNELS, folder, floor, progress, write, read_deepmimo)
+
+
+def _made(
+    name: str,
+    folder: str | Path | None,
+    floor: FloorReceivers,
+    progress: bool,
+    write: Callable[[Path, TraceResult, dict[str, str | bytes]], None],
+    read: Callable[[Path, str], Record],
+) -> Record:
+    """The record of a folder, after tracing and writing it unless it is there.
+
+    ``write`` takes the folder, the trace and the content of further files, of which the recipe is the last.
+    """
+    if folder is None:
+        if (found := provided(name)) is not None:
+            return found
+        folder = user_cache() / name
+    folder, plan = Path(folder), floor_plans.office()
+    with tempfile.TemporaryDirectory() as work:
+        xml = write_scene(Path(work), plan.parts, "Office of several rooms", "wrf_mi_scenes.floor_plans")
+        facts = {
+            "format": FORMAT,
+            "scene_sha256": content_sha256(Path(work), xml.name),
+            **asdict(floor),
+            "frequency_hz": CARRIER_HZ,
+            "sionna_rt": version("sionna-rt"),
+        }
+        recipe = yaml.safe_dump(facts, sort_keys=False)
+        if not is_made(folder, recipe):
+            logger.info("tracing %s into %s", name, folder)
+            traced = trace_floor(Path(work), plan, floor, progress)
+            extra: dict[str, str | bytes] = {SCAN: scan_file(xml, floor.seed, SCANNER_M)}
+            bare = floor_plans.measured(plan, floor.mesh_error_m, floor.seed)
+            write(folder, traced, extra | scene_files(bare, MEASURED, "wrf_mi_scenes.floor_plans") | {RECIPE: recipe})
+    return read(folder, name)
+
+
+def trace_floor(scene_folder: Path, plan: FloorPlan, floor: FloorReceivers, progress: bool = False) -> TraceResult:
+    """Specular and scattered paths between all transmitters and receivers in the scene of a floor plan."""
+    scene = open_scene(scene_folder, CARRIER_HZ)
+    receivers, transmitters = floor_devices(scene, plan, floor)
+    set_scattering(scene, floor.scattering)
+    shared: dict[str, Any] = {"transmission": True, "max_depth": floor.depth, "seed": floor.seed}
+    shared["scattering_coefficient"] = floor.scattering
+    exact = TraceOptions(max_reflections=floor.reflections, rays=floor.rays, **shared)
+    rough = TraceOptions(scattering=True, rays=floor.scattered_rays, **shared)
+    parts = [trace_paths(scene, transmitters, receivers, options, progress) for options in (exact, rough)]
+    scattered = (parts[1].paths.interactions == SCATTERING).any(axis=1)
+    return _joined(parts[0], parts[1].select(scattered))
+
+
+def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[tuple[Receiver, ...], FloatArray]:
+    """Receivers named ``anchor1``, ... and positions [train + test, 3] of the transmitter, outside all bodies.
+
+    A receiver is at a random place around the middle of each cell of a grid over the floor.
+    """
+    bounds, rng = scene.mi_scene.bbox(), np.random.default_rng([floor.seed, 0])
+    (x0, y0), (x1, y1) = ([corner.x, corner.y] for corner in (bounds.min, bounds.max))
+
+    def free(low_m: float, high_m: float, count: int, *apart: Any) -> FloatArray:
+        """Free positions, twice as many as needed, but for those within a body."""
+        box = np.array([x0, y0, low_m]), np.array([x1, y1, high_m])
+        drawn = free_positions(scene, *box, 2 * count, floor.clear_m, rng, floor.seed, *apart)
+        # Large bodies, such as the core, count as rooms there.
+        closed = [mesh.triangles for _, mesh in plan.parts.values() if mesh.is_watertight]
+        inside = np.any([winding_number(triangles, drawn) > 0.5 for triangles in closed], axis=0)
+        return drawn[~inside][:count]
+
+    places = free(floor.mount_m, floor.mount_m, CANDIDATES)
+    y, x = np.divmod(np.arange(floor.rows * floor.columns), floor.columns)
+    cell = np.array([x1 - x0, y1 - y0]) / [floor.columns, floor.rows]
+    wanted = [x0, y0] + cell * (np.stack([x, y], axis=1) + rng.uniform(0.25, 0.75, (len(x), 2)))
+    receivers_m = places[cKDTree(places[:, :2]).query(wanted)[1]]
+    receivers = tuple(Receiver(f"anchor{k}", place, np.array(UPRIGHT)) for k, place in enumerate(receivers_m, start=1))
+    count = floor.train + floor.test
+    return receivers, free(floor.low_m, floor.high_m, count, receivers_m, floor.from_receiver_m)
+
+
+def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:
+    """Two traces of the same devices, scene and depth as one, with the options of the second."""
+    parts, traces = (specular.paths, scattered.paths), (specular, scattered)
+
+    def rows(of: Sequence[Any], name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in of])
+
+    order = np.lexsort([rows(parts, name) for name in ("length_m", "tx", "rx")])
+    names = [field.name for field in fields(Paths) if field.name not in ("object_names", "n_tx", "n_rx")]
+    arrays: dict[str, Any] = {name: rows(parts, name)[order] for name in names}
+    primitives, probability = (rows(traces, name)[order] for name in ("primitives", "probability"))
+    return replace(scattered, paths=replace(parts[0], **arrays), primitives=primitives, probability=probability)
+
+
+def _strengths(traced: TraceResult, floor: FloorReceivers) -> Record:
+    rng = np.random.default_rng([floor.seed, 2])
+    strength = rssi_dbm(traced.paths) + floor.power_dbm
+    strength += rng.normal(0, floor.offset_db, (len(strength), 1)) + rng.normal(0, floor.noise_db, strength.shape)
+    strength[strength < floor.sensitivity_dbm] = np.nan
+    return Record(
+        name=NAME,
+        task="rssi",
+        tx_pos_m=traced.tx_pos_m,
+        receivers=traced.receivers,
+        observation=strength.astype(np.float32),
+        official=(np.arange(floor.train), floor.train + np.arange(floor.test)),
+        frequencies_hz=np.array([CARRIER_HZ]),
+    )
