@@ -16,6 +16,7 @@ logarithm of the unit in which each receiver sees the learned side, and of the t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -40,7 +41,7 @@ from ..tracing.solve import Prepared
 from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
 from .evaluations import evaluation_of
-from .receivers import RECEIVERS, Form, ReceiverModel
+from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
 Field = WrfGs | WrfGsPlus | Factorised
@@ -90,7 +91,6 @@ class Graph:
         traced: options of tracing, and learning rates.
         tx_antenna: antenna of the transmitters.
         evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
-        stated_hz: carrier relative to which networks see the carriers of rows; None: `Form.carrier_hz`.
 
     Attributes:
         surface: Gaussians on the scene's surfaces, which change its paths; None: none (`cover`).
@@ -110,7 +110,6 @@ class Graph:
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
         evaluation: str = SPLATTED,
-        stated_hz: float | None = None,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
         array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
@@ -125,27 +124,29 @@ class Graph:
         if field is None and scene is None:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
-        self.form, self.tx_antenna = form, tx_antenna
+        self.tx_antenna = tx_antenna
         self.surface: SurfaceGaussians | None = None
-        self.evaluation, self._evaluation = evaluation_of(evaluation, scene, traced), evaluation
-        self.stated_hz = form.carrier_hz if stated_hz is None else stated_hz
-        at = form.of_ports
-        self.carriers = len(at)
-        self.models: tuple[ReceiverModel, ...] = tuple(self.kind.make(f, r) for r in receivers for f in at)
+        self.evaluation = evaluation_of(evaluation, scene, traced)
+        self._stated_hz = form.carrier_hz
+        self._take(form)
 
     def at_carrier(self, carrier_hz: float) -> Graph:
         """The same graph for rows of another carrier."""
-        form = replace(self.form, carriers_hz=np.array([carrier_hz]))
-        evaluation = self._evaluation, self.stated_hz
-        found = Graph(self.field, self.receivers, form, self.scene, self.traced, self.tx_antenna, *evaluation)
-        found.surface = self.surface
+        found = copy(self)
+        found._take(replace(self.form, carriers_hz=np.array([carrier_hz])))
         return found
 
+    def _take(self, form: Form) -> None:
+        """Take a form, with the models of its ports."""
+        at = form.of_ports
+        self.form, self.carriers = form, len(at)
+        self.models = tuple(self.kind.make(one, receiver) for receiver in self.receivers for one in at)
+
     def log_carrier(self, number: int) -> float | None:
-        """Logarithm of a port's carrier over that at which the scene is stated; None: rows have a single carrier."""
+        """Logarithm of a port's carrier over the middle one of training; None: rows have a single carrier."""
         if self.form.carriers_hz is None:
             return None
-        return float(np.log(self.form.carriers_hz[number % self.carriers] / self.stated_hz))
+        return float(np.log(self.form.carriers_hz[number % self.carriers] / self._stated_hz))
 
     @property
     def sphere(self) -> bool:
@@ -184,8 +185,8 @@ class Graph:
         t = self.traced
         trace = TraceOptions(transmission=t.transmission, max_depth=t.depth, max_reflections=t.reflections, rays=t.rays)
         antenna, receiver = self.tx_antenna, self.receivers[number // self.carriers]
-        carrier = self.form.of_ports[number % self.carriers]
-        carrier_hz = None if self.form.carriers_hz is None else carrier.carrier_hz
+        carriers = self.form.carriers_hz
+        carrier_hz = None if carriers is None else float(carriers[number % self.carriers])
         options = TracedOptions(trace, t.pattern_degree, 1.0, antenna, t.materials, t.moves_planes, t.faint)
         given = tx_pos_m, receiver, options, tx_heading_rad
         side = TracedField(self.scene, *given, prepared=self._prepared, frequency_hz=carrier_hz)

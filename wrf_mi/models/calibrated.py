@@ -43,7 +43,7 @@ class FittedWithIntervals(Fitted):
 
     def __init__(self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals) -> None:
         self.fitted, self._record, self._rows, self._intervals = fitted, record, rows, intervals
-        self.receivers, self.uses_heading = fitted.receivers, fitted.uses_heading
+        self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
     def _stated(self, found: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance = distance_to_rows(self._record, self._rows, tx_pos_m, receiver)

@@ -161,11 +161,13 @@ class Fitted(ABC):
         train_seconds: duration of the fit over all sittings; None: that of the last call of `Model.fit`.
         receivers: receivers whose observations it predicts; None: those of the record.
         uses_heading: whether `predict` takes headings; None: as `Model.headings`.
+        carriers_hz: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record.
     """
 
     train_seconds: float | None = None
     receivers: tuple[Receiver, ...] | None = None
     uses_heading: bool | None = None
+    carriers_hz: FloatArray | None = None
 
     @abstractmethod
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:

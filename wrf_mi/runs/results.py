@@ -160,7 +160,8 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     references = stored if isinstance(stored, dict) else {}
     blocks = [metrics.get(task.block), *(references[key] for key in task.references if key in references)]
     if len(blocks) == 1 or any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        text = f"no {task.block} or no reference {' or '.join(sorted(task.references))} with a median"
+        names = [task.reference, *sorted(set(task.references) - {task.reference})]
+        text = f"no {task.block} or no reference {' or '.join(names)} with a median"
         raise InputError(f"{path}: {text}; {REMEDY}")
     return dict(metrics)
 

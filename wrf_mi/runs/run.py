@@ -161,7 +161,8 @@ class Run:
                 raise InputError(f"{self.folder}: {UNUSED_HEADING}")
             self._check_numbers(inputs, inputs.tx_heading_rad, "headings", "finite heading")
         if inputs.carriers_hz is not None or model.several_carriers:
-            known = self.problem.record.carriers_hz
+            stated = self.fitted.carriers_hz
+            known = self.problem.record.carriers_hz if stated is None else stated if stated.size else None
             if known is None and inputs.carriers_hz is not None:
                 raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
             if known is not None and inputs.carriers_hz is None:

@@ -62,6 +62,7 @@ class FittedField(Fitted):
         self.field = field_of(config, self.form)
         self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
         self.uses_heading = self.form.headings
+        self.carriers_hz = np.zeros(0) if self.form.carriers_hz is None else self.form.carriers_hz
 
     @cached_property
     def predictor(self) -> Predictor:
