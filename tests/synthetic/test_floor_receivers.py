@@ -14,7 +14,14 @@ from wrf_mi.core import Record
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.receivers.channel import csi, rssi_dbm
 from wrf_mi.synthetic import load_record, traced_floor_channels, traced_floor_strengths
-from wrf_mi.synthetic.floor_receivers import CARRIER_HZ, DEFAULT, FloorReceivers, floor_devices, trace_floor
+from wrf_mi.synthetic.floor_receivers import (
+    CARRIER_HZ,
+    DEFAULT,
+    FloorReceivers,
+    floor_devices,
+    strengths_of,
+    trace_floor,
+)
 from wrf_mi.synthetic.laboratory import SCAN
 from wrf_mi.tracing import TraceOptions, TraceResult, open_scene, trace_paths
 
@@ -96,20 +103,20 @@ def test_strengths_are_the_power_of_all_paths(traced: TraceResult, folder: Path)
     assert 8 not in kinds
 
 
-def test_offsets_and_noise_have_the_stated_deviations(folder: Path) -> None:
-    quiet = traced_floor_strengths(folder / "quiet", QUIET).observation
-    offset = traced_floor_strengths(folder / "offset", replace(QUIET, offset_db=3.0)).observation - quiet
+def test_offsets_and_noise_have_the_stated_deviations(traced: TraceResult) -> None:
+    quiet = strengths_of(traced, QUIET).observation
+    offset = strengths_of(traced, replace(QUIET, offset_db=3.0)).observation - quiet
     assert (np.nanmax(offset, axis=1) - np.nanmin(offset, axis=1)).max() < FLOAT32_DB
     assert 1 < np.nanmedian(offset, axis=1).std() < 6
-    noise = traced_floor_strengths(folder / "noise", replace(QUIET, noise_db=2.0)).observation - quiet
+    noise = strengths_of(traced, replace(QUIET, noise_db=2.0)).observation - quiet
     assert np.nanstd(noise) == pytest.approx(2, rel=0.3)  # three standard deviations of the estimate from 70 values
 
 
-def test_strengths_below_the_sensitivity_are_not_received(record: Record, folder: Path) -> None:
-    all_received = traced_floor_strengths(folder / "sensitive", replace(SMALL, sensitivity_dbm=-500.0)).observation
+def test_strengths_below_the_sensitivity_are_not_received(traced: TraceResult) -> None:
+    all_received = strengths_of(traced, replace(SMALL, sensitivity_dbm=-500.0)).observation
     ordered = np.sort(all_received[np.isfinite(all_received)])
     limit = float(ordered[len(ordered) // 2 :][:2].mean())
-    some = traced_floor_strengths(folder / "deaf", replace(SMALL, sensitivity_dbm=limit)).observation
+    some = strengths_of(traced, replace(SMALL, sensitivity_dbm=limit)).observation
     np.testing.assert_array_equal(some, np.where(all_received < limit, np.nan, all_received))
 
 

@@ -135,7 +135,7 @@ def traced_floor_strengths(
     """
 
     def write(folder: Path, traced: TraceResult, extra: dict[str, str | bytes]) -> None:
-        write_ble_folder(folder, _strengths(traced, floor), replace=True, extra=extra)
+        write_ble_folder(folder, strengths_of(traced, floor), replace=True, extra=extra)
 
     return _made(NAME, folder, floor, progress, write, read_ble_folder)
 
@@ -257,7 +257,8 @@ def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:
     return replace(scattered, paths=replace(parts[0], **arrays), primitives=primitives, probability=probability)
 
 
-def _strengths(traced: TraceResult, floor: FloorReceivers) -> Record:
+def strengths_of(traced: TraceResult, floor: FloorReceivers) -> Record:
+    """Signal strengths of traced paths, with offsets, noise and sensitivity."""
     rng = np.random.default_rng([floor.seed, 2])
     strength = rssi_dbm(traced.paths) + floor.power_dbm
     strength += rng.normal(0, floor.offset_db, (len(strength), 1)) + rng.normal(0, floor.noise_db, strength.shape)
