@@ -20,6 +20,8 @@ from wrf_mi.cli.main import build_parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.gaussians import FIELDS
+from wrf_mi.models import MODELS
 from wrf_mi.training.config import TrainConfig
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -98,7 +100,9 @@ def test_commands_parse(path: Path) -> None:
             parsed: argparse.Namespace = build_parser().parse_args(arguments)
         except SystemExit:
             pytest.fail(f"{path.name}: {line}")
-        with_settings(TrainConfig(), getattr(parsed, "set", []))
+        if given := getattr(parsed, "set", []):
+            entry = MODELS[parsed.model or "wrf-gs+"]
+            with_settings(TrainConfig() if entry.name in FIELDS else entry.settings(), given)
         for name in getattr(parsed, "names", []):
             assert name in {*CASES, *CHECKS, TABLES}, line
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import make_splits, write_ble_folder
 from wrf_mi.models import MODELS
-from wrf_mi.models.held_out import hold_out_folds
+from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out_folds
+from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
@@ -89,6 +91,24 @@ def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path:
     np.testing.assert_allclose(again.mean, found.prediction[1], atol=ROUNDING_DB)
     folds = hold_out_folds(law, make_splits(law, "receiver:1")[0])
     assert sorted(fold.held_receivers for fold in folds) == [(1, 0), (1, 2), (1, 3)]
+
+
+def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
+    """Two receivers a fold, in an order of its own: a prediction stands beside what its receiver observed."""
+    places = np.concatenate([[one.position_m for one in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])
+    receivers = tuple(replace(law.receivers[0], name=f"anchor{k}", position_m=place) for k, place in enumerate(places))
+    distance = np.linalg.norm(law.tx_pos_m - places[:, None], axis=2)
+    observed = (LAW_DBM - 10 * EXPONENT * np.log10(distance)).astype(np.float32)
+    record = replace(law, receivers=receivers, observation=observed)
+    entry, split = MODELS["mri"], make_splits(record, "receiver:0")[0]
+    problem = Problem(record, default_settings(entry, (), {})).seen(split)
+    folds = hold_out_folds(problem.record, split)
+    assert any(list(fold.held_receivers) != sorted(fold.held_receivers) for fold in folds)
+    held = HeldOut.of(problem.record, folds, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(Path(folder), Path(folder))
+        found = held_out_predictions(entry, problem, folds, held, session, "mri").mean
+    np.testing.assert_allclose(found, held.observed(record), atol=0.05)  # one law without noise; dB
 
 
 def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:

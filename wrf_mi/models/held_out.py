@@ -237,9 +237,11 @@ def held_out_predictions(
                 for receiver in range(len(record.receivers))
                 if (wanted.receiver == receiver).any()
             ]
-            arrays = {"mean": np.concatenate([one.mean for one in found])}
+            # Found receiver by receiver, while a fold may hold receivers out in any order.
+            place = np.argsort(np.argsort(wanted.receiver, kind="stable"), kind="stable")
+            arrays = {"mean": np.concatenate([one.mean for one in found])[place]}
             if found[0].std is not None:
-                arrays["std"] = np.concatenate([one.stated_std for one in found])
+                arrays["std"] = np.concatenate([one.stated_std for one in found])[place]
             write_arrays(kept, arrays)
         arrays = stored_arrays(kept)
         means.append(arrays["mean"])
