@@ -134,6 +134,18 @@ def test_strengths_correct_materials_by_a_bounded_number_of_rows(tmp_path: Path)
     np.testing.assert_allclose(again.scores[again.kept], found.scores[found.kept], atol=0.05)
 
 
+def test_receivers_that_a_split_holds_out_are_not_used(tmp_path: Path) -> None:
+    record = strengths(channels(stated_scene(tmp_path / "true", TRUE_MATERIALS), 60))
+    second = replace(record.receivers[0], name="second", position_m=np.array([5.0, 3.5, 2.0]))
+    both = replace(record, receivers=(*record.receivers, second), observation=np.tile(record.observation, (2, 1)))
+    broken = replace(both, observation=both.observation + np.array([[0.0], [1e3]], np.float32))
+    scene, split = stated_scene(tmp_path / "scene"), make_splits(both, "receiver:1")[0]
+    options = replace(default_options(both), rays=4096, depth=2)
+    found, other = (correct_scene(scene, data, split, options) for data in (both, broken))
+    np.testing.assert_array_equal(other.vector, found.vector)
+    assert np.isfinite(found.vector).all()
+
+
 def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
     """A record of a task, the scene it is from, and a number of rows."""
     if task == "spectrum":

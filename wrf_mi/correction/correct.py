@@ -91,7 +91,7 @@ def correct_scene(
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
         record: measurements of any task, positions known.
-        split: its training and validation rows are used, its test rows are not.
+        split: its training and validation rows are used, its test rows and receivers that it holds out are not.
         options: parts that may change, and the prior knowledge of them; None: `default_options`.
         material: radio material of a bare mesh.
         on_stage: called as the correction goes on.
@@ -100,6 +100,7 @@ def correct_scene(
         InputError: data or a scene that cannot be used, or no path to any receiver.
     """
     begun = time.perf_counter()
+    record = record.without(split.held_receivers)
     task, name = task_of(record), record.name
     if not task.receiver_with_scene:
         raise InputError(f"{name}: no receiver model reports {task.name} from paths")
