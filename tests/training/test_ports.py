@@ -107,7 +107,7 @@ def test_networks_learn_from_the_carrier(xml: Path, tmp_path: Path) -> None:
     record = Record("falling", "rssi", positions, (receiver(),), observed, carriers_hz=carriers)
     settings = (*QUICK, "steps=400", "optimiser.network=0.003")
     run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", split="random", settings=settings)
-    assert run.metrics["abs_error_db"]["median"] < 2  # 5.7 dB for the mean of all carriers
+    assert run.metrics["abs_error_db"]["median"] < 2  # 6 dB for the middle carrier's strength, the median
 
 
 def test_paths_are_calibrated_at_several_carriers(xml: Path, tmp_path: Path) -> None:

@@ -26,9 +26,14 @@ def by_carrier(
         of_carrier: ``of_carrier(carrier_hz, rows)``: values of the rows with these numbers.
         axis: axis of the values that counts rows.
     """
-    every = [(carrier, np.flatnonzero(carriers_hz == carrier)) for carrier in np.unique(carriers_hz)]
-    found = np.concatenate([of_carrier(float(carrier), rows) for carrier, rows in every], axis=axis)
+    every = rows_of_carriers(carriers_hz)
+    found = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)
     return np.take(found, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
+
+
+def rows_of_carriers(carriers_hz: FloatArray) -> list[tuple[float, IntArray]]:
+    """Carriers of rows [m], ascending, Hz, and the numbers of the rows at each."""
+    return [(float(carrier), np.flatnonzero(carriers_hz == carrier)) for carrier in np.unique(carriers_hz)]
 
 
 def middle_carrier(carriers_hz: FloatArray) -> float:

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
-from ..core.carriers import middle_carrier
 from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..scene.folder import read_scene_folder
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.surfaces import KINDS, Kind
-from ..tasks import instrument_of, task_of
+from ..tasks import task_of
+from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
 from ..tracing.solve import Prepared
@@ -109,7 +109,7 @@ def correct_scene(
     if task.in_decibel and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
     split = _at_most(split, options.rows)
-    opened = open_scene(scene, _carrier(record, split), material=material)
+    opened = open_scene(scene, scene_carrier(record, split.all_train), material=material)
     check_materials(opened)
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
@@ -157,13 +157,6 @@ def correct_scene(
         time.perf_counter() - begun,
         {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
     )
-
-
-def _carrier(record: Record, split: Split) -> float:
-    """Carrier in Hz at which parameters of materials hold: of several training carriers the one in the middle."""
-    if record.carriers_hz is None:
-        return instrument_of(record).carrier_hz
-    return middle_carrier(record.carriers_hz[split.all_train])
 
 
 def _at_most(split: Split, count: int) -> Split:

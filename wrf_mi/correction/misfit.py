@@ -20,6 +20,7 @@ from ..backend.device import to_tensor
 from ..backend.recorded import Recorded
 from ..core import Record
 from ..core.angles import FloatArray
+from ..core.carriers import rows_of_carriers
 from ..core.types import IntArray
 from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
@@ -243,8 +244,7 @@ def _by_carrier(record: Record, rows: IntArray) -> list[tuple[float | None, IntA
     """Carriers and the entries of ``rows`` at each; (None, all) for records of one carrier."""
     if record.carriers_hz is None:
         return [(None, np.arange(len(rows)))]
-    carriers = record.carriers_hz[rows]
-    return [(float(carrier), np.flatnonzero(carriers == carrier)) for carrier in np.unique(carriers)]
+    return list(rows_of_carriers(record.carriers_hz[rows]))
 
 
 def _stride(length: int, most: int) -> int:

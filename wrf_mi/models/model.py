@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.carriers import middle_carrier
 from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..parallel import Scheduler
@@ -111,12 +110,9 @@ class Problem:
         Raises:
             InputError: it cannot be opened, or the carrier is unknown.
         """
-        from ..tasks import instrument_of
+        from ..tasks.conditions import scene_carrier
 
-        if self.scene is None:
-            return None
-        carriers = self.record.carriers_hz
-        return self.open_scene(instrument_of(self.record).carrier_hz if carriers is None else middle_carrier(carriers))
+        return None if self.scene is None else self.open_scene(scene_carrier(self.record))
 
     def open_scene(self, frequency_hz: float) -> Any | None:
         """The scene at another frequency, Hz, or None.

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from ..core.carriers import middle_carrier
 from ..core.types import IntArray
-from . import task_of
+from . import instrument_of, task_of
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
@@ -97,6 +98,13 @@ def outputs_of(record: Record) -> Outputs:
     if len(record.receivers) != 1:
         raise InputError(f"{record.name}: has one uplink for {len(record.receivers)} receivers; give one each")
     return Outputs(True, antennas, known)
+
+
+def scene_carrier(record: Record, rows: IntArray | slice = slice(None)) -> float:
+    """Carrier in Hz at which a scene is opened for a record: its own, or the middle one of some rows."""
+    if record.carriers_hz is None:
+        return instrument_of(record).carrier_hz
+    return middle_carrier(record.carriers_hz[rows])
 
 
 def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:

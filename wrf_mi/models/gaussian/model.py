@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
-from ...core.carriers import middle_carrier
 from ...graph.graph import Graph
 from ...graph.receivers import Form
 from ...tasks import TASKS
-from ...tasks.conditions import placed_receivers
+from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
 from ...training.fields import field_of
@@ -149,10 +148,9 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
 
 def _scene(problem: Problem, split: Split) -> Any | None:
     """The scene at the carrier, or at the middle one of the training rows."""
-    carriers = problem.record.carriers_hz
-    if problem.scene is None or carriers is None:
+    if problem.scene is None or problem.record.carriers_hz is None:
         return problem.opened_scene
-    return problem.open_scene(middle_carrier(carriers[split.all_train]))
+    return problem.open_scene(scene_carrier(problem.record, split.all_train))
 
 
 def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
