@@ -161,6 +161,36 @@ def test_a_split_keeps_its_held_receivers(tmp_path: Path):
     assert load_split(tmp_path / "split.npz").held_receivers == (2,)
 
 
+def test_rows_are_left_to_held_out_receivers(tmp_path: Path):
+    record = several_receivers(3)
+    (few,), (more,), (none,) = (make_splits(record, f"receiver{left}:1", seed=3) for left in ("+5", "+20", ""))
+    for split, count in ((few, 5), (more, 20)):
+        assert split.held_receivers == (1,)
+        np.testing.assert_array_equal(split.left[:, 0], np.ones(count))
+        assert np.isin(split.left[:, 1], split.all_train).all()
+        np.testing.assert_array_equal(split.all_train, none.all_train)
+        seen = record.seen(split).observation
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(seen[1])), split.left[:, 1])
+        np.testing.assert_array_equal(seen[[0, 2]], record.observation[[0, 2]])
+    assert set(few.left[:, 1]) < set(more.left[:, 1])
+    save_split(tmp_path / "split.npz", few)
+    np.testing.assert_array_equal(load_split(tmp_path / "split.npz").left, few.left)
+    with pytest.raises(
+        InputError, match=r"gateway2 received 14 of the training rows, and split receiver\+30:2 leaves it 30"
+    ):
+        make_splits(record, "receiver+30:2")
+    for wrong in ("receiver+0", "receiver+", "receiver+x:1", "blocked+5", "receiver+-1"):
+        with pytest.raises(InputError, match=r"unknown; choose .*receiver\+20"):
+            make_splits(record, wrong)
+
+
+def test_a_split_that_leaves_other_receivers_rows_is_refused(tmp_path: Path):
+    (split,) = make_splits(several_receivers(3), "receiver+5:1")
+    save_split(tmp_path / "split.npz", replace(split, left=split.left - [1, 0]))
+    with pytest.raises(InputError, match="leaves rows that no held-out receiver trains on"):
+        load_split(tmp_path / "split.npz")
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_rows_that_no_receiver_received_are_left_out(rule: str):
     record = make_record()

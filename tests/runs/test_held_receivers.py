@@ -93,6 +93,45 @@ def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path:
     assert sorted(fold.held_receivers for fold in folds) == [(1, 0), (1, 2), (1, 3)]
 
 
+def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path) -> None:
+    """Five rows: the offset of 9 dB is known; the distances, from the rows of the others."""
+    none, few = (train(law, tmp_path / name, "physics", split=name).metrics for name in ("receiver:3", "receiver+5:3"))
+    assert few["abs_error_db"]["median"] < 1 < 5 < none["abs_error_db"]["median"]
+    assert few["receivers"]["anchor3"]["n_test"] == 20
+    hybrid = train(law, tmp_path / "hybrid", "hybrid", split="receiver+5:3").metrics
+    assert hybrid["abs_error_db"]["median"] < 1
+    assert {"kriging", "physics-no-mesh"} < set(hybrid["held_out"])  # kriging serves a receiver with rows of its own
+
+
+def test_rows_left_to_new_receivers_are_held_out_in_turn(law: Record) -> None:
+    (split,) = make_splits(law, "receiver+12:3")
+    record = law.seen(split)
+    folds = hold_out_folds(record, split)
+    held = HeldOut.of(record, folds, 0)
+    for number, fold in enumerate(folds):
+        (other,) = (one for one in fold.held_receivers if one != 3)
+        assert (fold.left[:, 0] == other).sum() == 12
+        of_fold = held.chosen(held.fold == number)
+        kept = {tuple(pair) for pair in fold.left.tolist()}
+        assert not kept & set(zip(of_fold.receiver.tolist(), of_fold.row.tolist(), strict=True))
+        assert set(of_fold.receiver.tolist()) == {3, other}
+    own = held.row[held.receiver == 3]
+    assert sorted(own) == sorted(split.left[:, 1])  # each of them once
+
+
+@pytest.mark.parametrize("name", ["kriging", "mri", "physics", "hybrid"])
+def test_rows_that_are_not_left_change_no_fit(name: str, law: Record, tmp_path: Path) -> None:
+    split = make_splits(law, "receiver+12:3")[0]
+    broken = law.observation.copy()
+    broken[3, np.setdiff1d(np.arange(40), split.left[:, 1])] = 1e6
+    runs = [
+        train(record, tmp_path / data, name, split=split)
+        for data, record in (("as-is", law), ("broken", replace(law, observation=broken)))
+    ]
+    found = [read_run(run.folder) for run in runs]
+    np.testing.assert_array_equal(found[0].prediction, found[1].prediction)
+
+
 def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
     """Two receivers a fold, in an order of its own: a prediction stands beside what its receiver observed."""
     places = np.concatenate([[one.position_m for one in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])

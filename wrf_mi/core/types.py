@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -110,16 +109,18 @@ class Record:
         """The record with the same array, elements [m, 3] in metres or None, at every receiver."""
         return replace(self, receivers=tuple(replace(receiver, array_m=array_m) for receiver in self.receivers))
 
-    def without(self, receivers: Sequence[int]) -> Record:
-        """The record as if some receivers, by their numbers, had received nothing; the uplink is kept."""
-        if not receivers:
+    def seen(self, split: Split) -> Record:
+        """The record as if the receivers that a split holds out had received nothing but the rows it leaves them."""
+        if not split.held_receivers:
             return self
         hidden: dict[str, Any] = {}
+        receiver, row = split.left.T
         for name, nothing in (("observation", np.nan), ("truth", np.nan), ("std", np.nan), ("n_readings", 0)):
             values = getattr(self, name)
             if values is not None:
                 hidden[name] = values.copy()
-                hidden[name][list(receivers)] = nothing
+                hidden[name][list(split.held_receivers)] = nothing
+                hidden[name][receiver, row] = values[receiver, row]
         return replace(self, **hidden)
 
     def at_carrier(self, carrier_hz: float) -> Record:
@@ -161,7 +162,8 @@ class Record:
 class Split:
     """Rows for training, for the choice of settings and for scores; rows count from 0.
 
-    With ``held_receivers``, numbers of receivers, models see no observation of these, and scores are of these alone.
+    With ``held_receivers``, numbers of receivers, models see no observation of these but those of ``left``, pairs of
+    such a receiver and a training row [q, 2], and scores are of these receivers alone.
     ``validation`` rows are training data, kept apart from ``train`` while settings are chosen; the final fit uses both
     (``all_train``).
     """
@@ -172,6 +174,7 @@ class Split:
     validation: IntArray
     test: IntArray
     held_receivers: tuple[int, ...] = ()
+    left: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     @property
     def all_train(self) -> IntArray:

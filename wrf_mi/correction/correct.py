@@ -100,7 +100,7 @@ def correct_scene(
         InputError: data or a scene that cannot be used, or no path to any receiver.
     """
     begun = time.perf_counter()
-    record = record.without(split.held_receivers)
+    record = record.seen(split)
     task, name = task_of(record), record.name
     if not task.receiver_with_scene:
         raise InputError(f"{name}: no receiver model reports {task.name} from paths")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -49,7 +50,8 @@ def make_splits(
     - ``frequency-known``: the same test rows; all rows of the other carriers train, at the held-out positions, too.
     - ``receiver``: a split per receiver, or per fold of four of more than eight receivers (seeded), whose test set is
       what these receive in the test rows; the other receivers' training rows train. Rows are those of the official
-      split, or else of the random one.
+      split, or else of the random one. ``receiver+20``: 20 training rows of each held-out receiver train, too, a seeded
+      draw, nested for equal seeds.
     - ``other-run``: a split per run of the measurement, in the order of first appearance, whose test set are its rows;
       the rows of all other runs train.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
@@ -82,7 +84,7 @@ def make_splits(
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0")
     splits = []
-    for label, train, test, held in _train_and_test(record, name, seed):
+    for label, train, test, held, left in _train_and_test(record, name, seed):
         what = f"{record.name}, split {label}"
         for verb, part in (("trains", train), ("scores", test)):
             if len(part) == 0:
@@ -102,19 +104,36 @@ def make_splits(
         counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
         validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
         parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)
-        splits.append(Split(label, seed, *parts, held))
+        pairs = rows_left(record, np.sort(order), held, left, seed)
+        for receiver in held:
+            if (has := int((pairs[:, 0] == receiver).sum())) < left:
+                who = f"{record.name}: {record.receivers[receiver].name} received {has} of the training rows"
+                raise InputError(f"{who}, and split {label} leaves it {left}; leave fewer")
+        splits.append(Split(label, seed, *parts, held, pairs))
     return splits
+
+
+def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: int, seed: int) -> IntArray:
+    """Pairs [q, 2] of each of some receivers and up to ``count`` of the ``rows`` that it received, a seeded draw."""
+    received = np.asarray(np.isfinite(record.observation[:, rows]).reshape(len(record.receivers), len(rows), -1).all(2))
+    found = [np.zeros((0, 2), np.int64)]
+    for receiver in receivers:
+        order = np.random.default_rng([seed, 7, receiver]).permutation(rows[received[receiver]])
+        chosen = np.sort(order[:count])
+        found.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
+    return np.concatenate(found)
 
 
 def save_split(path: str | Path, split: Split) -> None:
     """Write a split as an npz file of plain arrays (no pickle), atomically.
 
     Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0), and of splits that hold out
-    receivers ``held_receivers`` (numbers from 0).
+    receivers ``held_receivers`` (numbers from 0) and ``left`` (pairs of such a receiver and a row that trains).
     """
     parts = {"train": split.train, "validation": split.validation, "test": split.test}
     if split.held_receivers:
         parts["held_receivers"] = np.asarray(split.held_receivers, np.int64)
+        parts["left"] = split.left
     facts = {"format": np.int64(SPLIT_FORMAT), "name": np.str_(split.name), "seed": np.int64(split.seed)}
     write_arrays(Path(path), {**facts, **parts})
 
@@ -130,16 +149,20 @@ def load_split(path: str | Path) -> Split:
         arrays = stored_arrays(Path(path))
         content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
     held = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
+    left = arrays.get("left", np.zeros((0, 2), np.int64))
     if content["format"] != SPLIT_FORMAT:
         raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
     parts = [content[key] for key in ("train", "validation", "test")]
     rows = np.concatenate([part.ravel() for part in parts])
-    if any(part.ndim != 1 or part.dtype.kind != "i" for part in parts) or rows.min(initial=0) < 0:
+    lists = all(part.ndim == 1 and part.dtype.kind == "i" for part in parts) and rows.min(initial=0) >= 0
+    if not lists or left.ndim != 2 or left.shape[1] != 2 or left.dtype.kind != "i":
         raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
     if len(np.unique(rows)) != len(rows):
         raise InputError(f"{path}: a row is in the split twice; make the split again")
     train, validation, test = (part.astype(np.int64) for part in parts)
-    return Split(str(content["name"]), int(content["seed"]), train, validation, test, held)
+    if not (np.isin(left[:, 0], held).all() and np.isin(left[:, 1], np.concatenate([train, validation])).all()):
+        raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
+    return Split(str(content["name"]), int(content["seed"]), train, validation, test, held, left.astype(np.int64))
 
 
 def position_folds(record: Record) -> IntArray:
@@ -172,21 +195,24 @@ def position_folds(record: Record) -> IntArray:
 
 
 class _Rows(NamedTuple):
-    """Name, training and test rows of a split, and the receivers that it holds out."""
+    """Name, training and test rows of a split, the receivers that it holds out, and how many rows it leaves each."""
 
     name: str
     train: IntArray
     test: IntArray
     held_receivers: tuple[int, ...] = ()
+    left: int = 0
 
 
 def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
     received = np.asarray(~missing.all(axis=(0, 2)))
     rows = np.flatnonzero(received)
-    kind, *_ = name.partition(":")
-    if kind not in SPLIT_NAMES or (":" in name and kind not in FOLDED):
-        known = f"{', '.join(SPLIT_NAMES)}, or a fold such as blocked:0"
+    whole, colon, _ = name.partition(":")
+    kind, plus, left = whole.partition("+")
+    leaves = kind == "receiver" and left.isascii() and left.isdecimal() and int(left) > 0
+    if kind not in SPLIT_NAMES or (colon and kind not in FOLDED) or (plus and not leaves):
+        known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
         raise InputError(f"split {name!r}: unknown; choose {known}")
     if kind == "official":
         if record.official is None:
@@ -194,7 +220,7 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
         train, test = (part[received[part]] for part in record.official)
         return [_Rows(name, train, test)]
     if kind == "receiver":
-        return _receivers_held_out(record, name, seed)
+        return _receivers_held_out(record, name, seed, int(left or 0))
     if kind in FOLDED:
         found = {"blocked": position_folds, "other-run": _run_numbers}.get(kind, partial(_carrier_numbers, kind=kind))
         of_row = found(record)[rows]
@@ -254,7 +280,7 @@ def _folds(record: Record, name: str, count: int) -> range:
     return range(int(fold), int(fold) + 1)
 
 
-def _receivers_held_out(record: Record, name: str, seed: int) -> list[_Rows]:
+def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list[_Rows]:
     """A split for each receiver, or for each fold of many, with rows that the trained and the held-out receive."""
     count = len(record.receivers)
     if count < 2:
@@ -271,5 +297,5 @@ def _receivers_held_out(record: Record, name: str, seed: int) -> list[_Rows]:
         train, test = (
             part[received[who][:, part].any(axis=0)] for who, part in ((~held, rows.train), (held, rows.test))
         )
-        found.append(_Rows(f"receiver:{k}", train, test, tuple(np.flatnonzero(held).tolist())))
+        found.append(_Rows(f"{name.partition(':')[0]}:{k}", train, test, tuple(np.flatnonzero(held).tolist()), left))
     return found

@@ -16,6 +16,7 @@ from ..core import Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.files import stored_arrays, write_arrays
 from ..core.types import IntArray
+from ..datasets.splits import rows_left
 from ..training.loop import Progress
 from .model import Fitted, Model, Problem, Session, inputs_of
 
@@ -37,8 +38,9 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
     parts. A fold holds out a cluster, whose rows lie as far from the remaining ones as those of a blocked split, and a
     part, whose rows lie as near as those of a random split. Up to `FEW_ROWS` rows are held out one by one.
 
-    Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds; where
-    it holds out a carrier, the trained carriers are held out in turn, at held-out positions if the split's test
+    Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds, with
+    as many rows left to each as the split leaves, and those rows of its receivers are held out in turn, too; where it
+    holds out a carrier, the trained carriers are held out in turn, at held-out positions if the split's test
     positions are not among the training rows'.
 
     Args:
@@ -81,6 +83,9 @@ def _hold_out_receivers(record: Record, split: Split) -> list[Split]:
     if len(trained) < 2:
         return []
     order = np.random.default_rng([split.seed, 4]).permutation(trained)
+    groups = [group.tolist() for group in np.array_split(order, min(FOLDS, len(trained)))]
+    each = len(split.left) // len(split.held_receivers)
+    part = np.random.default_rng([split.seed, 8]).permutation(np.arange(len(split.left)) % len(groups))
     return [
         Split(
             f"fold {number}",
@@ -88,9 +93,10 @@ def _hold_out_receivers(record: Record, split: Split) -> list[Split]:
             split.train,
             split.validation,
             split.all_train,
-            (*split.held_receivers, *group.tolist()),
+            (*split.held_receivers, *group),
+            np.concatenate([split.left[part != number], rows_left(record, split.all_train, group, each, split.seed)]),
         )
-        for number, group in enumerate(np.array_split(order, min(FOLDS, len(trained))))
+        for number, group in enumerate(groups)
     ]
 
 
@@ -149,9 +155,9 @@ class HeldOut:
         """Held-out rows of folds, or as many of them, drawn with a seed, as `MOST_HELD_OUT` allows."""
         parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
         for number, fold in enumerate(folds):
-            known = record.without(fold.held_receivers)
+            known = record.seen(fold)
             for receiver in fold.held_receivers or range(len(record.receivers)):
-                rows = fold.test
+                rows = np.setdiff1d(fold.test, fold.left[fold.left[:, 0] == receiver, 1])
                 rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
                 away = distance_to_rows(known, fold.all_train, record.tx_pos_m[rows], receiver)
                 parts.append((np.full(len(rows), number), np.full(len(rows), receiver), rows, away))

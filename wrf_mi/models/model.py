@@ -125,10 +125,10 @@ class Problem:
         return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
 
     def seen(self, split: Split) -> Problem:
-        """The problem with what a fit to a split may see: receivers that it holds out received nothing."""
+        """The problem with what a fit to a split may see (`wrf_mi.core.Record.seen`)."""
         if not split.held_receivers:
             return self
-        return replace(self, dataset=self.record.without(split.held_receivers), antennas=AS_STATED)
+        return replace(self, dataset=self.record.seen(split), antennas=AS_STATED)
 
     def rows(self, split: Split) -> IntArray:
         """Rows that a fit may use."""

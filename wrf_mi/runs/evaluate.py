@@ -252,7 +252,7 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
     """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] of the test rows by key.
 
     Inverse-distance weighting (IDW) needs positions of training and test rows; the copy of the uplink needs an uplink.
-    At receivers that the split holds out, the path-loss law of the others' training rows takes their place. Where test
+    At receivers without training rows, the path-loss law of the others' training rows takes their place. Where test
     rows have carriers without training rows, IDW interpolates between carriers, and a further reference is IDW at the
     nearest carrier with training rows.
 
@@ -265,7 +265,8 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
     if record.uplink is not None and task.from_uplink:
         found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
     if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
-        key, entry = (LAW, MRI) if split.held_receivers else (task.reference, IDW)
+        alone = split.held_receivers and not len(split.left)
+        key, entry = (LAW, MRI) if alone else (task.reference, IDW)
         plain = replace(split, train=split.all_train, validation=split.validation[:0])
         problem = Problem(record, default_settings(entry, (), {})).seen(split)
         fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
