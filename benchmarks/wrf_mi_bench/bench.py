@@ -114,6 +114,8 @@ _OWN: Mapping[str, Check] = {
         table="ingredients:table",
     ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
+    "new-carriers": _here("carriers without measurements", "unmeasured:carriers", resumes=True),
+    "new-receivers": _here("receivers without measurements, and with few", "unmeasured:receivers", FLAT, resumes=True),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "sentinels": _here(
         "figures kept",

@@ -1,0 +1,228 @@
+"""Carriers and receivers without measurements: the hybrid beside ray tracing and interpolation, three seeds.
+
+Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are compared
+in pairs, pooled over folds and seeds; intervals are 95 % bootstrap intervals over rows.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import Record, Split
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
+from wrf_mi.datasets import make_splits
+from wrf_mi.models.hybrid.ingredients import TRANSMISSION
+from wrf_mi.runs.api import train
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.timing import bootstrap
+from wrf_mi.synthetic import load_record
+from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
+from wrf_mi.synthetic.room_bands import NAME as BANDS
+from wrf_mi.tasks import TASKS
+
+from .bench import FLAT
+from .comparison import data_folder, kept, line
+from .table_plan import PARTS, SEEDS
+from .tables import meshed_scan, scene_of
+
+RUNS = Path("runs/bench/unmeasured")
+LEFT = (0, 5, 20, 100)
+"""Numbers of rows at each receiver that is held out."""
+HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected scene"
+KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
+OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
+AT_CARRIERS = "kriging,idw,ray-tracing"
+AT_RECEIVERS = "physics,mri,ray-tracing"
+"""Ingredients of the hybrid at a new carrier, and at a receiver without any row."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A data set, and the split whose folds are held out.
+
+    Attributes:
+        dataset: name.
+        kind: ``frequency`` or ``receiver``.
+        n_train: number of training rows; None: all.
+        parts: what is corrected; None: the default of the task.
+        folds: number of folds.
+    """
+
+    dataset: str
+    kind: str
+    n_train: int | None
+    parts: tuple[str, ...] | None
+    folds: int
+
+
+CARRIERS = (Held(BANDS, "frequency", None, ("materials",), 5),)
+RECEIVERS = (Held(FLOOR, "receiver", None, None, 4), Held(FLAT, "receiver", 400, None, 6))
+
+
+def corrected(held: Held, scene: str, record: Record, split: Split, folder: Path) -> str:
+    """Scene in ``folder`` that is corrected by a split's training rows, made where needed."""
+    if not folder.exists():
+        options: CorrectionOptions = default_options(record)
+        options = options if held.parts is None else replace(options, parts=held.parts)
+        write_page(correct_scene(scene, record, split, options), folder, False)
+    return str(folder)
+
+
+def _run(place: Path, record: str | Record, split: Split | str, seed: int, model: str, **more: Any) -> Results:
+    """Run of a model, whose folder is removed once it is read."""
+    shutil.rmtree(place, ignore_errors=True)
+    try:
+        train(record, place, model, split=split, seed=seed, **more)
+        return read_run(place)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _scores(run: Results, prediction: FloatArray | None = None) -> list[float]:
+    """Scores of a run, or of another prediction of its rows, receiver by receiver where the truth is known."""
+    if prediction is None:
+        found = run.score
+    else:
+        found = TASKS[run.task].of_rows(prediction, run.truth)
+    found = np.asarray(found, float)[:, np.argsort(run.row)]
+    return [float(one) for one in found[np.isfinite(found)]]
+
+
+def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Scores of the methods at a carrier that is held out, by name; ``inside_90`` and ``crps`` of the hybrid."""
+    scene, record = _scene(held, folder.parent), load_record(held.dataset)
+    split = f"{held.kind}:{fold}"
+    (rows,) = make_splits(record, split, seed, held.n_train)
+    better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
+    given: dict[str, Any] = {"n_train": held.n_train}
+    ingredients = {"settings": (f"ingredients={AT_CARRIERS}",)}
+    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=better, **ingredients, **given)
+    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **given)
+    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **given)
+    kriging = _run(folder, held.dataset, split, seed, "kriging", **given)
+    return {
+        HYBRID: _scores(hybrid),
+        TRACED: _scores(traced),
+        CORRECTED: _scores(again),
+        KRIGING: _scores(kriging),
+        IDW: _scores(hybrid, hybrid.references[TASKS[hybrid.task].reference]),
+        CARRIER: _scores(hybrid, hybrid.references["carrier"]),
+        **{key: hybrid.metrics[key] for key in ("inside_90", "crps", "task")},
+    }
+
+
+def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Scores of the methods at receivers that are held out but for ``left`` rows each, as `at_carrier`.
+
+    The scene is corrected without any of their rows.
+    """
+    scene, record = _scene(held, folder.parent), load_record(held.dataset)
+    (none,) = make_splits(record, f"{held.kind}:{fold}", seed, held.n_train)
+    name = f"corrected-{held.dataset}-{fold}-{seed}"
+    better = corrected(held, scene, record, none, folder.parent / name)
+    split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
+    (rows,) = make_splits(record, split, seed, held.n_train)
+    ingredients = () if left else (f"ingredients={AT_RECEIVERS}",)
+    hybrid = _run(folder, record, rows, seed, "hybrid", scene=better, settings=ingredients)
+    traced = _run(folder, record, rows, seed, "ray-tracing", scene=scene, settings=TRANSMISSION)
+    again = _run(folder, record, rows, seed, "ray-tracing", scene=better, settings=TRANSMISSION)
+    found: dict[str, Any] = {HYBRID: _scores(hybrid), TRACED: _scores(traced), CORRECTED: _scores(again)}
+    if left:
+        alone, these = only(record, rows)
+        found[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
+        found[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
+        found[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
+    else:
+        found[LAW] = _scores(hybrid, hybrid.references["law"])
+    return found | {key: hybrid.metrics[key] for key in ("inside_90", "crps", "task")}
+
+
+def only(record: Record, split: Split) -> tuple[Record, Split]:
+    """The receivers that a split holds out by themselves, with the rows that it leaves them."""
+    held = list(split.held_receivers)
+    seen = record.seen(split)
+    hidden = {name: getattr(seen, name) for name in ("observation", "std", "n_readings")}
+    for name, values in hidden.items():
+        whole = getattr(record, name)
+        if values is not None:
+            values = values.copy()
+            values[:, split.test] = whole[:, split.test]
+            hidden[name] = values[held]
+    receivers = tuple(record.receivers[number] for number in held)
+    train = np.unique(split.left[:, 1])
+    alone = replace(record, receivers=receivers, truth=None, official=None, **hidden)
+    return alone, Split(f"{split.name}-alone", split.seed, train, train[:0], split.test)
+
+
+def _scene(held: Held, folder: Path) -> str:
+    if held.dataset == FLAT:
+        return scene_of(next(part for part in PARTS if part.dataset == FLAT), folder)[1]
+    return str(meshed_scan(held.dataset, folder))
+
+
+def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
+    """Median and mean of each method, pooled, and the hybrid's mean gain over it with its interval, by name."""
+    task = TASKS[found[0]["task"]]
+    sign = 1 if task.higher_is_better else -1
+    names = [name for name in found[0] if name not in ("inside_90", "crps", "task")]
+    pooled = {name: np.clip(np.concatenate([one[name] for one in found]), *task.limits) for name in names}
+    return {
+        name: (
+            float(np.median(scores)),
+            float(scores.mean()),
+            None if name == HYBRID else bootstrap(sign * (pooled[HYBRID] - scores), np.mean),
+        )
+        for name, scores in pooled.items()
+    }
+
+
+def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    digits = TASKS[found[0]["task"]].digits
+    inside = np.mean([one["inside_90"] for one in found])
+    lines = []
+    for name, (median, mean, gain) in gains(found).items():
+        value = f"median {median:.{digits}f}, mean {mean:.{digits}f}"
+        asked = f"{inside:.0%} inside (80 to 97 %)" if gain is None else f"hybrid better by {gain}"
+        lines.append(line(f"{what}: {name}", value, asked))
+    return lines
+
+
+def carriers() -> dict[str, Any]:
+    """Measure every carrier held out in turn, three seeds; what this code has measured before is read."""
+    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, str]](), list[dict[str, Any]]()
+    for held in CARRIERS:
+        hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
+        for fold in range(held.folds):
+            found = []
+            for seed in SEEDS:
+                name = f"{held.dataset}-{fold}-{seed}"
+                found.append(kept(place / f"{name}.json", partial(at_carrier, held, fold, seed, place / name)))
+                every.append({"dataset": held.dataset, "fold": fold, "seed": seed, **found[-1]})
+            rows += _rows(f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz", found)
+    return {"rows": rows, "scores": every}
+
+
+def receivers() -> dict[str, Any]:
+    """Measure receivers held out in turn, without and with few rows of their own, three seeds, as `carriers`."""
+    data_folder(FLAT)
+    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, str]](), list[dict[str, Any]]()
+    for held in RECEIVERS:
+        for left in LEFT:
+            found = []
+            for seed in SEEDS:
+                for fold in range(held.folds):
+                    name = f"{held.dataset}-{left}-{fold}-{seed}"
+                    how = partial(at_receivers, held, left, fold, seed, place / name)
+                    found.append(kept(place / f"{name}.json", how))
+                    every.append({"dataset": held.dataset, "left": left, "fold": fold, "seed": seed, **found[-1]})
+            rows += _rows(f"{held.dataset}, {left} rows at new receivers", found)
+    return {"rows": rows, "scores": every}
