@@ -1,7 +1,7 @@
 """Carriers and receivers without measurements: the hybrid beside ray tracing and interpolation, three seeds.
 
-Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are compared
-in pairs, pooled over folds and seeds; intervals are 95 % bootstrap intervals over rows.
+Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are
+compared in pairs, pooled over folds and seeds; intervals are 95 % bootstrap intervals over rows.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from wrf_mi.core import Record, Split
-from wrf_mi.core.angles import FloatArray
 from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.models.hybrid.ingredients import TRANSMISSION
 from wrf_mi.runs.api import train
 from wrf_mi.runs.fit_key import fit_key, source_files
-from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.results import Observations, Results, read_run
 from wrf_mi.runs.timing import bootstrap
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
@@ -87,12 +86,9 @@ def _run(place: Path, record: str | Record, split: Split | str, seed: int, model
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _scores(run: Results, prediction: FloatArray | None = None) -> list[float]:
+def _scores(run: Results, prediction: Observations | None = None) -> list[float]:
     """Scores of a run, or of another prediction of its rows, receiver by receiver where the truth is known."""
-    if prediction is None:
-        found = run.score
-    else:
-        found = TASKS[run.task].of_rows(prediction, run.truth)
+    found = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
     found = np.asarray(found, float)[:, np.argsort(run.row)]
     return [float(one) for one in found[np.isfinite(found)]]
 
