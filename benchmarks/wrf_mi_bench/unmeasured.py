@@ -144,18 +144,10 @@ def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> d
 
 def only(record: Record, split: Split) -> tuple[Record, Split]:
     """The receivers that a split holds out by themselves, with the rows that it leaves them."""
-    held = list(split.held_receivers)
-    seen = record.seen(split)
-    hidden = {name: getattr(seen, name) for name in ("observation", "std", "n_readings")}
-    for name, values in hidden.items():
-        whole = getattr(record, name)
-        if values is not None:
-            values = values.copy()
-            values[:, split.test] = whole[:, split.test]
-            hidden[name] = values[held]
-    receivers = tuple(record.receivers[number] for number in held)
+    # Rows to be scored are left, too: they are no training rows.
+    scored = np.stack(np.meshgrid(split.held_receivers, split.test, indexing="ij"), axis=-1).reshape(-1, 2)
+    alone = record.seen(replace(split, left=np.concatenate([split.left, scored]))).at_receivers(split.held_receivers)
     train = np.unique(split.left[:, 1])
-    alone = replace(record, receivers=receivers, truth=None, official=None, **hidden)
     return alone, Split(f"{split.name}-alone", split.seed, train, train[:0], split.test)
 
 

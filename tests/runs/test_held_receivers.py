@@ -167,11 +167,43 @@ def test_a_stopped_run_goes_on_without_the_held_out_receivers(law: Record, tmp_p
     assert resume(run.folder, record=law).metrics["abs_error_db"] == before["abs_error_db"]
 
 
-def test_traced_strengths_take_the_mean_offset(law: Record, tmp_path: Path) -> None:
+@pytest.fixture
+def hall(tmp_path: Path) -> str:
+    """Scene of a hall around the receivers."""
     layout = tmp_path / "layout.csv"
     layout.write_text("x,y\n-3,-3\n9,-3\n9,9\n-3,9\n-3,-3\n", encoding="utf-8")
-    scene = make_scene(layout, tmp_path / "scene", height_m=8.0).folder
-    run = train(law, tmp_path / "run", "ray-tracing", scene=str(scene), split="receiver:2", settings=["max_depth=1"])
+    return str(make_scene(layout, tmp_path / "scene", height_m=8.0).folder)
+
+
+def test_calibrated_strengths_take_the_mean_gain(law: Record, hall: str, tmp_path: Path) -> None:
+    settings = ["max_depth=1", "calibration=gain", "steps=40", "validate_every=20"]
+    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=settings)
+    gain = {k: np.load(run.folder / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)}
+    np.testing.assert_allclose(gain[2], np.mean([gain[0], gain[1], gain[3]], axis=0), rtol=1e-6)
+    assert np.isfinite(read_run(run.folder).prediction[2]).all()
+    assert np.ptp([gain[k][0] for k in (0, 1, 3)]) > 0.3  # offsets of -3, 1 and 9 dB
+
+
+@pytest.mark.parametrize("name", ["wrf-gs+", "wrf-gs"])
+def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Record, tmp_path: Path) -> None:
+    """A copy of a trained receiver, held out: the same Gaussians from the same place, with the mean level of all."""
+    receivers = (*law.receivers, replace(law.receivers[1], name="copy"))
+    record = replace(law, receivers=receivers, observation=np.concatenate([law.observation, law.observation[1:2]]))
+    split = replace(make_splits(law, "official")[0], held_receivers=(4,))
+    settings = ["steps=60", "validate_every=30", "initial.gaussians=40"]
+    run = train(record, tmp_path / "run", name, split=split, settings=settings)
+    level = np.load(run.folder / "model.npz")["param/level"][0]
+    assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)
+    model = open_run(run.folder, record)
+    copied, known = (model.predict(law.tx_pos_m[40:], who).mean for who in ("copy", "anchor1"))
+    np.testing.assert_allclose(copied - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
+    broken = np.where(np.arange(5)[:, None] == 4, 1e6, record.observation).astype(np.float32)
+    again = train(replace(record, observation=broken), tmp_path / "broken", name, split=split, settings=settings)
+    np.testing.assert_allclose(np.load(again.folder / "model.npz")["param/level"][0], level, rtol=1e-3)
+
+
+def test_traced_strengths_take_the_mean_offset(law: Record, hall: str, tmp_path: Path) -> None:
+    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=["max_depth=1"])
     offset_db = np.load(run.folder / "model.npz")["offset_db"]
     assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -122,6 +123,13 @@ class Record:
                 hidden[name][list(split.held_receivers)] = nothing
                 hidden[name][receiver, row] = values[receiver, row]
         return replace(self, **hidden)
+
+    def at_receivers(self, receivers: Sequence[int] | IntArray) -> Record:
+        """The record with some receivers alone, by their numbers."""
+        names = ("observation", "truth", "std", "n_readings")
+        parts: dict[str, Any] = {name: getattr(self, name) for name in names}
+        parts = {name: None if values is None else values[list(receivers)] for name, values in parts.items()}
+        return replace(self, receivers=tuple(self.receivers[number] for number in receivers), **parts)
 
     def at_carrier(self, carrier_hz: float) -> Record:
         """The record with one carrier in Hz for every row."""

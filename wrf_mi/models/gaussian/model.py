@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
 from ...graph.graph import Graph
@@ -32,12 +31,11 @@ from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
 from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, keyed, under
+from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
 PARAM = "param/"
 """Prefix of a parameter's array in ``model.npz``."""
-
-Params = dict[str, NDArray[np.float32]]
 
 
 class FittedField(Fitted):
@@ -124,7 +122,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     folder, record, config = session.folder, problem.record, problem.settings
     stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
     state = None if stored is None else FitState.from_arrays(stored)
-    trainer = Trainer(record, split, config, state=state, scene=_scene(problem, split))
+    trainer = Trainer(*trained_part(record, split), config, state=state, scene=_scene(problem, split))
     trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
     cut_log(folder, trainer.state.step)
 
@@ -134,12 +132,14 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
 
     if not trainer.run(on_progress, lambda: write_checkpoint(folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
+    receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
+    params, reach = of_all_receivers(trainer.state.mean_params(), trainer.reach(), receivers, without_rows(split))
     arrays: Arrays = {
-        **keyed(PARAM, trainer.state.mean_params()),
+        **keyed(PARAM, params),
         **trainer.graph.form.arrays(),
         "tx_antenna": np.asarray(astuple(record.tx_antenna)),
-        **receiver_arrays(trainer.graph.receivers),
-        **_reach_arrays(trainer.reach()),
+        **receiver_arrays(receivers),
+        **_reach_arrays(reach),
     }
     fitted = load(arrays, problem, folder)
     fitted.train_seconds = trainer.seconds
@@ -161,8 +161,8 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trai
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse settings, files and scenes that a training would refuse."""
-    record = problem.record
-    for rows in splits:
+    for split in splits:
+        record, rows = trained_part(problem.record, split)
         known, scene = rows.all_train, _scene(problem, rows)
         config = problem.settings.resolved(record.tx_pos_m[known])
         targets = targets_of(record, known, scene is not None)
@@ -193,6 +193,7 @@ def _entry(name: str) -> Model:
         scene="optional",
         uplink="optional",
         several_carriers=True,
+        new_receivers=True,
         given=("model", "seed", "deterministic", "receiver", "evaluation"),
         presets=PRESETS,
         check=check,
