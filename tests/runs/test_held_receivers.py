@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from spectrum_records import make_record
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import make_splits, write_ble_folder
@@ -223,6 +224,12 @@ def test_models_of_trained_receivers_refuse(name: str, law: Record, tmp_path: Pa
         with pytest.raises(InputError, match=f"receiver:0: {name.replace('+', '.')} predicts for the receivers it is"):
             train(law, tmp_path / "run", name, split="receiver")
         assert not (tmp_path / "run").exists()
+
+
+def test_receivers_of_spectra_are_not_held_out(tmp_path: Path) -> None:
+    record = make_record(gateways=2)
+    with pytest.raises(InputError, match="holds spectrum; split receiver:0 serves signal strengths, so choose another"):
+        train(record, tmp_path / "run", "kriging", split="receiver")
 
 
 def test_all_receivers_held_out_are_refused(law: Record, tmp_path: Path) -> None:

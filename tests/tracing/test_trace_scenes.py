@@ -140,6 +140,16 @@ def test_number_of_rays_for_an_antenna_behind_its_wall_converges_before_it(tmp_p
     assert found == wanted
 
 
+def test_antennas_outside_the_scene_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    surfaces = in_a_room(tmp_path, box((-0.2, -0.2, -0.2), (6.2, 5.2, 3.2)))
+    with caplog.at_level(logging.WARNING):
+        check_devices(surfaces, np.array([[1.0, 1, 1], [7, 1, 1]]), ["a", "b"])  # behind a wall
+    assert not caplog.text
+    with caplog.at_level(logging.WARNING):
+        check_devices(surfaces, np.array([[1.0, 1, 1], [1, -40, 1], [1000, 1, 1]]), ["a", "b", "c"])
+    assert "2 of 3 antennas lie outside the scene (first: b, by 39.8 m): check its frame and the unit" in caplog.text
+
+
 def test_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """A room is closed, too, but not solid."""
     shell = in_a_room(tmp_path / "a", box((-0.2, -0.2, -0.2), (6.2, 5.2, 3.2)))

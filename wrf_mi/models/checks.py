@@ -61,10 +61,13 @@ def check_held_receivers(record: Record, split: Split, method: Model, others: It
         numbers = ", ".join(map(str, split.held_receivers))
         text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
         raise InputError(f"{place_of(record)}: {text}; leave some to train on")
-    if not (method.new_receivers or len(split.left)) or not task_of(record).in_decibel:
+    if not task_of(record).in_decibel:
+        text = f"holds {record.task}; split {split.name} serves signal strengths"
+        raise InputError(f"{place_of(record)}: {text}, so choose another split")
+    if not (method.new_receivers or len(split.left)):
         able = [other.name for other in others if other.new_receivers and other.serves(record.task)]
-        remedy = f"choose {' or '.join(able)}" if task_of(record).in_decibel else "it serves signal strengths"
-        raise InputError(f"split {split.name}: {method.name} predicts for the receivers it is trained on; {remedy}")
+        text = f"{method.name} predicts for the receivers it is trained on; choose {' or '.join(able)}"
+        raise InputError(f"split {split.name}: {text}, or leave them rows, as receiver+20 does")
 
 
 def check_parts(record: Record) -> None:

@@ -1,4 +1,4 @@
-"""Checks of antenna positions: inside solids, near surfaces, behind outer walls."""
+"""Checks of antenna positions: outside the scene, inside solids, near surfaces, behind outer walls."""
 
 from __future__ import annotations
 
@@ -27,11 +27,14 @@ INSIDE_M = 1e-4
 """Distance before a wall from which an antenna is traced that lies behind the wall on which it is mounted."""
 ON_M = 1e-6
 """Distance from a plane within which float32 does not resolve its sides; Sionna RT then takes the right one."""
+OUTSIDE_M = 1.0
+"""Distance beyond the box around the scene from which an antenna is named: a scan may leave out what is nearer."""
 PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Refuse antennas inside a solid object; warn of those so close to a surface that paths are lost.
+    """Refuse antennas inside a solid object; warn of those outside the scene or so close to a surface that paths are
+    lost.
 
     Args:
         surfaces: surfaces of the scene.
@@ -47,6 +50,12 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
         what = surfaces.called(int(thing[first]))
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
+    corners = surfaces.triangles.reshape(-1, 3)
+    beyond = np.maximum(corners.min(axis=0) - positions_m, positions_m - corners.max(axis=0)).max(axis=1, initial=0)
+    outside = np.flatnonzero(beyond > OUTSIDE_M)
+    if len(outside):
+        text = "%d of %d antennas lie outside the scene (first: %s, by %.1f m): check its frame and the unit, metres"
+        logger.warning(text, len(outside), len(positions_m), names[outside[0]], beyond[outside[0]])
     near = np.flatnonzero(_near(surfaces, positions_m))
     if len(near):
         text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
