@@ -55,6 +55,8 @@ def write_tables(place: Path, quick: bool = False) -> None:
 OVERVIEWS = {
     "spectrum": TASKS["spectrum"].heading,
     "rssi": TASKS["rssi"].heading,
+    "carriers": "spectra at carriers that are held out",
+    "receivers": "signal strengths at receivers that are held out",
     "uplink": "downlink channels from the uplink",
     "positions": "channels from positions",
 }

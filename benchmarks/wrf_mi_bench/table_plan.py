@@ -145,6 +145,24 @@ UPLINK: Mapping[str, Entry] = {
         "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
     ),
 }
+NEW_CARRIERS: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT),
+    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
+    "hybrid": Entry("hybrid, knows the scan", _model("hybrid", "--scene", NAMED)),
+    "ray-tracing": Entry("ray tracing in the scan", _model("ray-tracing", "--scene", NAMED, *THROUGH_WALLS)),
+    "kriging": Entry("kriging, over position and log frequency", _model("kriging")),
+    "idw": Entry("IDW, over position and log frequency", _model("idw")),
+}
+NEW_RECEIVERS: Mapping[str, Entry] = {
+    "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
+    "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),
+    "physics": Entry("physics, knows walls", _model("physics", "--scene", NAMED)),
+    "physics-no-mesh": Entry("physics without a mesh", _model("physics")),
+    "ray-tracing": Entry(
+        "ray tracing, mean offset of the receivers", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
+    ),
+    "mri": Entry("one path-loss law (MRI)", _model("mri")),
+}
 CHEAP = ("physics", "ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
 FEW = ("wrf-gs+", "physics", "nerf2", "linear", "kriging", "idw", "ray-tracing")
@@ -189,6 +207,9 @@ PARTS = (
         once=("wrf-gs+", "wrf-gs", "physics"),
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
+    Part("spectrum", "carriers", "traced-room-bands", "frequency", NEW_CARRIERS, scene="lidar"),
+    Part("rssi", "receivers", "traced-floor-receivers", "receiver", NEW_RECEIVERS, scene="lidar"),
+    Part("rssi", "receivers", "flat-ble", "receiver", NEW_RECEIVERS, scene="flat"),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
     Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),

@@ -50,8 +50,8 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
         what = surfaces.called(int(thing[first]))
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
-    corners = surfaces.triangles.reshape(-1, 3)
-    beyond = np.maximum(corners.min(axis=0) - positions_m, positions_m - corners.max(axis=0)).max(axis=1, initial=0)
+    corners = surfaces.triangles.reshape(-1, 3) if len(surfaces.triangles) else positions_m
+    beyond = np.maximum(corners.min(axis=0) - positions_m, positions_m - corners.max(axis=0)).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
         text = "%d of %d antennas lie outside the scene (first: %s, by %.1f m): check its frame and the unit, metres"
