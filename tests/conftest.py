@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 # Before NumPy is loaded, and for child processes: threads of OpenBLAS wait for each other by spinning, and where
 # another process has one of the cores, small products take twenty times as long.
@@ -41,6 +41,21 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
         workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
         set_threads(max(2, CORES) if item.get_closest_marker("all_threads") else max(1, CORES // workers))
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Numbers of targets, transmitters where rays leave the receivers, of each search for paths in a test."""
+    from wrf_mi.tracing import solve
+
+    counts, search = list[int](), solve._search
+
+    def counted(scene: Any, shared: Any, sources: Any, targets: Any, *rest: Any) -> Any:
+        counts.append(len(targets))
+        return search(scene, shared, sources, targets, *rest)
+
+    monkeypatch.setattr(solve, "_search", counted)
+    return counts
 
 
 @pytest.fixture(scope="session")

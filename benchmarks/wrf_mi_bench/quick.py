@@ -151,7 +151,7 @@ def _paths_alone() -> tuple[Call, Call]:
     config = with_settings(calibration_config(["gain", "materials"], images=True), ["steps=100000", *ONLY_STEPS])
     trainer = Trainer(known, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
     graph, targets, batch = trainer.graph, trainer.targets, trainer.schedule.rows[0]
-    side = graph.trace(known.tx_pos_m, 0)
+    side = graph.trace(known.tx_pos_m, 0)[0]
     assert side is not None
     adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
     names, model, size = list(adam), graph.models[0], targets.truth.shape[2:]

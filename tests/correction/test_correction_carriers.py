@@ -82,6 +82,18 @@ def test_residuals_are_those_of_each_carrier_alone(tmp_path: Path) -> None:
         np.testing.assert_allclose(residual[which], single.residual(single.start), atol=ROUNDING_DB)
 
 
+def test_paths_are_searched_once_for_all_carriers(tmp_path: Path, searches: list[int]) -> None:
+    """Of positions that are partly the same at all carriers."""
+    scene = stated_scene(tmp_path / "scene", TRUE_MATERIALS)
+    record = strengths(scene, 30)
+    record = replace(record, tx_pos_m=record.tx_pos_m[np.arange(len(record)) % 14])
+    opened = open_scene(scene, 2.4e9)
+    searches.clear()
+    misfit = Misfit(record, np.arange(len(record)), opened, search_options(OPTIONS), lambda name: True)
+    assert len(misfit.sides) == len(CARRIERS_HZ)
+    assert searches == [14]
+
+
 def test_derivatives_by_exponents_are_those_of_finite_differences(tmp_path: Path) -> None:
     """To 1 % of the largest, or the rounding of float32 reports over the step."""
     scene, step = stated_scene(tmp_path / "scene", TRUE_MATERIALS), 0.02

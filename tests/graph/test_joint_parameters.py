@@ -99,7 +99,7 @@ def test_gain_starts_at_the_level_of_the_observations(task: str, tmp_path: Path)
     record = record_of(task, scene, (receiver(),), transmitters(8))
     record = record if task == "spectrum" else replace(record, observation=record.observation + 32)
     trainer = Trainer(record, all_of(record), paths_alone("gain"), scene=scene)
-    side, params = trainer.graph.trace(record.tx_pos_m, 0), dict(trainer.state.adam.items())
+    side, params = trainer.graph.trace(record.tx_pos_m, 0)[0], dict(trainer.state.adam.items())
     assert side is not None
     if task == "rssi":
         assert float(params["receiver.array.gain"].array[0]) == pytest.approx(np.log(10) * 32 / 20, abs=1e-3)

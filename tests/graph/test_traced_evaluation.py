@@ -263,7 +263,7 @@ def test_slab_attenuates_traced_gaussians_behind_it(tmp_path: Path) -> None:
 def test_traced_derivative_by_wall_materials(tmp_path: Path, materials: str) -> None:
     """Of parameters that the paths have, too: against central differences."""
     graph, values = behind_the_ceiling(tmp_path, materials=materials)
-    side = graph.trace(TX, 0)
+    side = graph.trace(TX, 0)[0]
     assert side is not None
     own = side.parameters()
     names = [name for name in own if name.startswith("material.")]

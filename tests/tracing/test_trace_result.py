@@ -56,6 +56,21 @@ def test_stored_traces_are_read_back(traced: TraceResult, tmp_path: Path):
     assert {path.name for path in tmp_path.iterdir()} == {"paths.npz"}
 
 
+def test_selected_transmitters_have_the_paths_of_their_own_trace(traced: TraceResult, scene: Any):
+    """In the order asked for, repeatedly, at all receivers, of one carrier or several."""
+    which = np.array([3, 1, 3])
+    found = replace(traced, carriers_hz=np.arange(5.0)).of_transmitters(which)
+    expected = trace_paths(scene, inside(5)[which], traced.receivers, OPTIONS)
+    for name in ("tx", "rx", "interactions", "objects", "n_tx", "n_rx"):
+        np.testing.assert_array_equal(getattr(found.paths, name), getattr(expected.paths, name))
+    np.testing.assert_array_equal(found.primitives, expected.primitives)
+    np.testing.assert_array_equal(found.tx_pos_m, inside(5)[which])
+    np.testing.assert_array_equal(found.carriers_hz, [3, 1, 3])
+    close(found.paths.gain, expected.paths.gain)
+    close(found.paths.length_m, expected.paths.length_m)
+    assert len(traced.of_transmitters(which[:0]).paths) == 0
+
+
 def test_wrong_files_are_refused(traced: TraceResult, tmp_path: Path, scene: Any):
     with pytest.raises(InputError, match="missing; trace"):
         load_trace(tmp_path / "none.npz")

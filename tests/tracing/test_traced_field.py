@@ -324,6 +324,18 @@ def test_transmitter_without_a_path_has_no_gain_and_finite_derivatives(tmp_path:
     assert all(np.isfinite(dr.grad(p).numpy()).all() for p in parameters.values())
 
 
+def test_known_paths_of_antennas_behind_outer_walls_are_taken(scene: Any) -> None:
+    """The tracer moves such antennas before the wall; lengths are those of the stated positions."""
+    behind, array = np.array([[-0.003, 2.0, 1.0], [2.0, 2.0, 1.0]]), receiver(position=(4.2, 5.004, 0.4))
+    found = trace_paths(scene, behind, array, OPTIONS)
+    assert (found.tx_pos_m != behind).any()
+    assert (found.receivers[0].position_m != array.position_m).any()
+    known = TracedField(scene, behind, array, TracedOptions(OPTIONS), traced=found)
+    searched = TracedField(scene, behind, array, TracedOptions(OPTIONS))
+    for ours, theirs in zip(existing(known, {}), existing(searched, {}), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_wrong_arguments_are_refused(scene: Any) -> None:
     with pytest.raises(InputError, match="no derivative"):
         TracedOptions(TraceOptions(diffraction=True))

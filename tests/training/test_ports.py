@@ -12,15 +12,18 @@ from box_room import CEILING, PARTITION, WALLS, receiver, transmitters
 from traced_rooms import write_xml
 
 import wrf_mi
-from wrf_mi.core import Receiver, Record
+from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.graph.graph import Graph
 from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.receivers.instruments import PowerInstrument, SpectrumInstrument
+from wrf_mi.tasks.conditions import scene_carrier
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.config import calibration_config, with_settings
 from wrf_mi.training.predictor import Predictor
+from wrf_mi.training.trainer import Trainer
 
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
 BETWEEN_HZ = 3.5e9
@@ -70,6 +73,44 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(task: str, tolerance:
         alone = Predictor(None, {}, receivers, *SIZE, graph=single)
         for number in range(2):
             np.testing.assert_allclose(found[number][at], alone(transmitters(12)[at], number), atol=tolerance)
+
+
+def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml: Path) -> None:
+    """Of rows whose positions are partly the same, some of them repeated, at two trained carriers and another one."""
+    form = Form("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+    graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), replace(CONFIG, faint=0.05))
+    predict = Predictor(None, {}, (array(),), *SIZE, graph=graph)
+    tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]
+    carriers = np.array([CARRIERS_HZ[0], CARRIERS_HZ[2], BETWEEN_HZ]).repeat(4)
+    found = predict(tx, 0, carriers_hz=carriers)
+    for hz in np.unique(carriers):
+        at = carriers == hz
+        np.testing.assert_allclose(found[at], predict(tx[at], 0, carriers_hz=carriers[at]), rtol=0, atol=SINGLE)
+    assert np.abs(found[0] - found[7]).max() > 0.01  # the same position at two carriers
+    assert predict(tx[:0], 0, carriers_hz=carriers[:0]).shape == (0, *SIZE)
+
+
+def test_paths_are_searched_once_for_all_carriers(xml: Path, searches: list[int]) -> None:
+    """For the training rows of each receiver, at each validation, and in a prediction that asks for several."""
+    record = spectra(xml, 10)
+    second = replace(array(), name="second", position_m=np.array([4.0, 2.2, 0.7]))
+    observed = np.concatenate([record.observation, record.observation[:, ::-1]])
+    record = replace(record, receivers=(array(), second), observation=observed)
+    split = Split("own", 0, np.r_[0:8, 12:18, 23:28], np.array([8, 18, 28]), np.array([9, 19, 29]))
+    trained = np.unique(record.tx_pos_m[split.all_train], axis=0)
+    settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=20"
+    config = with_settings(calibration_config(["gain"], images=True), settings)
+    scene = open_scene(xml, scene_carrier(record, split.all_train))
+    searches.clear()
+    trainer = Trainer(record, split, config, scene=scene)
+    checked = len(split.all_train)  # by the warning of orthogonal polarisations
+    assert searches == [len(trained), len(trained), checked]
+    searches.clear()
+    trainer.validate()
+    assert searches == [1] * 2
+    searches.clear()
+    trainer.predictor()(np.tile(transmitters(5), (4, 1)), 1, carriers_hz=np.repeat([*CARRIERS_HZ, BETWEEN_HZ], 5))
+    assert searches == [5]
 
 
 def test_strengths_at_ports_are_those_of_the_tracer(xml: Path) -> None:

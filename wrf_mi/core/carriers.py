@@ -36,6 +36,11 @@ def rows_of_carriers(carriers_hz: FloatArray) -> list[tuple[float, IntArray]]:
     return [(float(carrier), np.flatnonzero(carriers_hz == carrier)) for carrier in np.unique(carriers_hz)]
 
 
+def rows_by_carrier(carriers_hz: FloatArray | None, count: int) -> list[tuple[float | None, IntArray]]:
+    """`rows_of_carriers` of ``count`` rows; (None, all) for rows of a single carrier that are given none."""
+    return [(None, np.arange(count))] if carriers_hz is None else list(rows_of_carriers(carriers_hz))
+
+
 def middle_carrier(carriers_hz: FloatArray) -> float:
     """The carrier in the middle of those of rows [m], Hz, at which parameters of materials are stated."""
     distinct = np.unique(carriers_hz)

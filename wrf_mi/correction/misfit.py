@@ -20,7 +20,7 @@ from ..backend.device import to_tensor
 from ..backend.recorded import Recorded
 from ..core import Record
 from ..core.angles import FloatArray
-from ..core.carriers import rows_of_carriers
+from ..core.carriers import rows_by_carrier
 from ..core.types import IntArray
 from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
@@ -29,6 +29,7 @@ from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
+from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions
 from .options import PATTERNS, CorrectionOptions
 
@@ -84,12 +85,10 @@ class Misfit:
         form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
         self.sides, self.places = list[TracedField](), list[IntArray]()
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
+        heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in enumerate(self.receivers):
-            for carrier_hz, which in _by_carrier(record, rows):
-                at = rows[which]
-                heading = None if record.tx_heading_rad is None else record.tx_heading_rad[at]
-                given = record.tx_pos_m[at], receiver, options, heading
-                self.sides.append(TracedField(scene, *given, prepared=shared, frequency_hz=carrier_hz))
+            self.sides += traced_fields(scene, record.tx_pos_m[rows], receiver, options, shared, heading, carriers)
+            for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))
                 self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
@@ -238,13 +237,6 @@ def _recorded_gain(side: TracedField) -> Recorded:
         return found
 
     return Recorded(gain, lambda: side.arrays)
-
-
-def _by_carrier(record: Record, rows: IntArray) -> list[tuple[float | None, IntArray]]:
-    """Carriers and the entries of ``rows`` at each; (None, all) for records of one carrier."""
-    if record.carriers_hz is None:
-        return [(None, np.arange(len(rows)))]
-    return list(rows_of_carriers(record.carriers_hz[rows]))
 
 
 def _stride(length: int, most: int) -> int:

@@ -39,6 +39,7 @@ from ..tracing.polarization import check_polarization
 from ..tracing.pose import receiver_pose
 from ..tracing.solve import Prepared
 from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
+from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
 from .evaluations import evaluation_of
 from .receivers import RECEIVERS, Form
@@ -178,21 +179,38 @@ class Graph:
         if self.scene is not None:
             check_polarization(self.scene, tx_pos_m, self.receivers, self.tx_antenna)
 
-    def trace(self, tx_pos_m: ArrayLike, number: int, tx_heading_rad: ArrayLike | None = None) -> TracedField | None:
-        """The traced side of transmitters [n, 3], turned by [n], at one port; None without a scene."""
+    def trace(
+        self,
+        tx_pos_m: ArrayLike,
+        receiver: int,
+        tx_heading_rad: ArrayLike | None = None,
+        carriers_hz: FloatArray | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> Sequence[TracedField | None]:
+        """The traced sides of a receiver, one for each carrier of the transmitters, from one search for paths.
+
+        Args:
+            tx_pos_m: transmitters [n, 3], world frame, metres.
+            receiver: number of the receiver.
+            tx_heading_rad: yaw of each transmitter's frame [n], rad; None: 0.
+            carriers_hz: carrier of each transmitter [n], Hz, of training or not; None: all have that of the scene.
+            params: values by name, with which paths are those that `TracedField.refresh` finds; None: stated values.
+
+        Returns:
+            Traced sides in ascending order of carriers, each of the transmitters at its carrier; without a scene None
+            in their place.
+        """
         if self.scene is None:
-            return None
+            return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
         t = self.traced
         trace = TraceOptions(transmission=t.transmission, max_depth=t.depth, max_reflections=t.reflections, rays=t.rays)
-        antenna, receiver = self.tx_antenna, self.receivers[number // self.carriers]
-        carriers = self.form.carriers_hz
-        carrier_hz = None if carriers is None else float(carriers[number % self.carriers])
-        options = TracedOptions(trace, t.pattern_degree, 1.0, antenna, t.materials, t.moves_planes, t.faint)
-        given = tx_pos_m, receiver, options, tx_heading_rad
-        side = TracedField(self.scene, *given, prepared=self._prepared, frequency_hz=carrier_hz)
+        options = TracedOptions(trace, t.pattern_degree, 1.0, self.tx_antenna, t.materials, t.moves_planes, t.faint)
+        given = tx_pos_m, self.receivers[receiver], options, self._prepared, tx_heading_rad, carriers_hz, params
+        sides = traced_fields(self.scene, *given)
         if self.surface:
-            side.attach(self.surface)
-        return side
+            for side in sides:
+                side.attach(self.surface)
+        return sides
 
     def cover(
         self, sides: Sequence[TracedField | None], given: Mapping[str, NDArray[Any]] | None = None

@@ -15,6 +15,7 @@ from ..core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.paths import read_paths_file, save_paths
+from ..core.types import IntArray
 from .buffer import Legs
 from .fields import Devices, Ends, path_gains, scattering_materials
 from .options import TraceOptions
@@ -58,6 +59,19 @@ class TraceResult:
         wedge = {name: values[which] for name, values in self.wedge.items()}
         kept = self.primitives[which], self.probability[which]
         return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
+
+    def of_transmitters(self, which: IntArray) -> TraceResult:
+        """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""
+        paths = self.paths
+        pair = paths.n_tx * paths.rx + paths.tx  # ascending
+        wanted = (paths.n_tx * np.arange(paths.n_rx)[:, None] + which).ravel()
+        first, end = (np.searchsorted(pair, wanted, side) for side in ("left", "right"))
+        count = end - first
+        row = np.repeat(np.arange(len(wanted)), count)
+        found = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
+        carriers = None if self.carriers_hz is None else self.carriers_hz[which]
+        paths = replace(found.paths, tx=row % len(which), n_tx=len(which))
+        return replace(found, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
 
     def without_faint(self, share: float) -> TraceResult:
         """Drop the weakest paths of each transmitter at each receiver.

@@ -33,6 +33,7 @@ from ..gaussians.footprint import Pose
 from ..gaussians.recurrence import times
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
+from .devices import NEAREST_M
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .material_parameters import MaterialGrouping, slabs_of_faces
 from .options import FACTOR
@@ -120,13 +121,14 @@ class TracedField:
         prepared: shared state of the scene for several fields in it: rays of a receiver are then shot once, and the
             caller checks the antennas (`wrf_mi.tracing.solve.Prepared.check`).
         frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
+        searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
 
     Attributes:
         frequency_hz: carrier of the paths.
         chains: surfaces that each path meets, planes as stated.
         slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
         surfaces: surfaces of the scene, with the planes of the parameters.
-        searches: number of searches so far.
+        searches: number of searches so far, without that of ``traced``.
         searched_at_m: receiver position [3] of the last search, metres.
 
     Raises:
@@ -144,6 +146,7 @@ class TracedField:
         traced: TraceResult | None = None,
         prepared: Prepared | None = None,
         frequency_hz: float | None = None,
+        searched_at_m: FloatArray | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
         if self.tx_pos_m.ndim != 2 or self.tx_pos_m.shape[1] != 3 or not np.isfinite(self.tx_pos_m).all():
@@ -151,14 +154,6 @@ class TracedField:
         heading = np.zeros(len(self.tx_pos_m)) if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
         if heading.shape != (len(self.tx_pos_m),) or not np.isfinite(heading).all():
             raise ValueError(f"TracedField: tx_heading_rad has shape {heading.shape}; give finite [n]")
-        if traced is not None and not (
-            np.array_equal(traced.tx_pos_m, self.tx_pos_m)
-            and len(traced.receivers) == 1
-            and np.array_equal(traced.receivers[0].position_m, receiver.position_m)
-        ):
-            n, m = len(traced.tx_pos_m), len(traced.receivers)
-            text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
-            raise InputError(f"{text}; trace these")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
         self._prepared = prepared
         self._gaussians: SurfaceGaussians | None = None
@@ -167,13 +162,21 @@ class TracedField:
         self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
         self.searches = 0
         self.surfaces: Surfaces = prepared.surfaces if prepared else scene_surfaces(scene)
+        here = receiver.position_m if searched_at_m is None else searched_at_m
+        if traced is not None and not (
+            _placed_as(self.tx_pos_m, traced.tx_pos_m)
+            and _placed_as(here[None], np.stack([device.position_m for device in traced.receivers]))
+        ):
+            n, m = len(traced.tx_pos_m), len(traced.receivers)
+            text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
+            raise InputError(f"{text}; trace these")
         self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
         self._constants = self.slabs.constants(Float64)
         self._planes = PlaneTables.of(self.surfaces)
         if traced is None:
-            self.search(receiver.position_m)
+            self.search(here)
         else:
-            self._take(traced, receiver.position_m)
+            self._take(traced, here)
 
     def __len__(self) -> int:
         """Number of transmitters."""
@@ -224,7 +227,7 @@ class TracedField:
             Whether paths were searched.
         """
         here = moved_m(self.receiver, parameters)
-        if np.linalg.norm(here - self.searched_at_m) <= speed_of_light / self.frequency_hz / 4:
+        if not needs_search(here, self.searched_at_m, self.frequency_hz):
             return False
         self.search(here)
         return True
@@ -353,6 +356,16 @@ class TracedField:
             kind = self.scene.objects[name].radio_material.name
             raise InputError(f"object {name}: material {kind} is not a slab; give it one of ITU-R P.2040")
         return number
+
+
+def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
+    """Whether a receiver is further than a quarter of a wavelength from where paths were searched, both [3], metres."""
+    return bool(np.linalg.norm(here_m - searched_at_m) > speed_of_light / frequency_hz / 4)
+
+
+def _placed_as(stated_m: FloatArray, traced_m: FloatArray) -> bool:
+    """Whether positions of a trace [n, 3] are those of stated antennas, which `before_walls` may have moved by 1 cm."""
+    return stated_m.shape == traced_m.shape and np.allclose(stated_m, traced_m, rtol=0, atol=2 * NEAREST_M)
 
 
 def _spread(pose: Pose, count: int) -> Pose:

@@ -18,7 +18,7 @@ from ..backend.device import to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
-from ..core.carriers import by_carrier, carriers_text
+from ..core.carriers import carriers_text, rows_by_carrier
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.chunks import CHUNK_SIZE
@@ -40,7 +40,7 @@ TOGETHER = 16
 TRACED_NUMBERS = 512
 """With paths, numbers in a batch of small observations."""
 SEARCHED = 512
-"""Transmitters whose paths are searched together: a search has a fixed cost."""
+"""Transmitters of a carrier whose paths are searched together: a search has a fixed cost."""
 
 
 class Predictor:
@@ -120,27 +120,46 @@ class Predictor:
         parts = (None if part is None else part[rows] for part in (record.uplink, turned, record.carriers_hz))
         return self(record.tx_pos_m[rows], receiver, *parts)
 
-    def _at_carriers(
-        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: ArrayLike
-    ) -> NDArray[Any]:
-        """Reports of rows at their carriers [m], Hz: of ports, or of the graph at another carrier."""
+    def _at_carrier(self, carrier_hz: float | None, receiver: int) -> tuple[Predictor, int]:
+        """Predictor and port of a receiver's reports at a carrier, that of training or another one."""
         known = self.graph.form.carriers_hz
-        assert known is not None
+        if known is None or carrier_hz is None:
+            return self, receiver
+        if carrier_hz in known:
+            return self, receiver * self.graph.carriers + int(np.searchsorted(known, carrier_hz))
+        if carrier_hz not in self._others:
+            graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
+            made = Predictor(self._field, {}, self.receivers, *size, graph=graph)
+            made.update(self._params)
+            self._others[carrier_hz] = made
+        self._others[carrier_hz].reach = self.reach
+        return self._others[carrier_hz], receiver
 
-        def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
-            turned = None if heading_rad is None else heading_rad[rows]
-            if carrier_hz in known:
-                port = receiver * self.graph.carriers + int(np.searchsorted(known, carrier_hz))
-                return self._reported(tx_pos_m[rows], port, turned)
-            if carrier_hz not in self._others:
-                graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
-                made = Predictor(self._field, {}, self.receivers, *size, graph=graph)
-                made.update(self._params)
-                self._others[carrier_hz] = made
-            self._others[carrier_hz].reach = self.reach
-            return self._others[carrier_hz]._reported(tx_pos_m[rows], receiver, turned)
+    def _of_positions(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
+    ) -> NDArray[Any]:
+        """Reports for positions [m, 3] at their carriers [m], Hz, each with paths of one search for all carriers."""
+        if not len(tx_pos_m):
+            return self._reported(tx_pos_m, receiver * self.graph.carriers)
+        found, order = list[NDArray[Any]](), list[IntArray]()
+        for rows in self._searched_together(tx_pos_m, carriers_hz):
+            turned, carriers = (None if part is None else part[rows] for part in (heading_rad, carriers_hz))
+            sides = self.graph.trace(tx_pos_m[rows], receiver, turned, carriers, self._params)
+            for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
+                predictor, port = self._at_carrier(carrier_hz, receiver)
+                found.append(predictor._reported(tx_pos_m[rows[which]], port, side))
+                order.append(rows[which])
+        return np.concatenate(found)[np.argsort(np.concatenate(order))]
 
-        return by_carrier(np.asarray(carriers_hz, float), of_carrier)
+    def _searched_together(self, tx_pos_m: FloatArray, carriers_hz: FloatArray | None) -> list[IntArray]:
+        """Rows of positions [m, 3] in groups, those of one position at several carriers in the same."""
+        if self.graph.scene is None:
+            return [np.arange(len(tx_pos_m))]
+        if carriers_hz is None:
+            order, size = np.arange(len(tx_pos_m)), SEARCHED
+        else:
+            order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
+        return [order[start : start + size] for start in range(0, len(order), size)]
 
     def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
         """Checked headings, or None where they are not used."""
@@ -233,14 +252,19 @@ class Predictor:
             return found
         return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // self._together)))
 
-    def _reported(self, given: FloatArray, receiver: int, heading_rad: FloatArray | None = None) -> NDArray[Any]:
-        """Reports for positions [m, 3] or features [m, features], complex numbers as such."""
+    def _reported(
+        self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
+    ) -> NDArray[Any]:
+        """Reports for positions [m, 3] or features [m, features], complex numbers as such.
+
+        ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
+        """
+        slots = np.arange(len(given)) if slots is None else slots
         weight = None if self.reach is None else self.reach.weight(given, receiver // self.graph.carriers)
         if weight is not None and weight.any() and not weight.all():
             # Gaussians of weight 0 are not evaluated.
             parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
-            headings = [None if heading_rad is None else heading_rad[part] for part in parts]
-            found = [self._reported(given[part], receiver, yaw) for part, yaw in zip(parts, headings, strict=True)]
+            found = [self._reported(given[part], receiver, side, slots[part]) for part in parts]
             return np.concatenate(found)[np.argsort(np.concatenate(parts))]
 
         if self.graph.scene is None and weight is not None and not weight.any():
@@ -253,15 +277,7 @@ class Predictor:
 
             return self._in_parts(len(given), receiver, recorded)
 
-        parts = []
-        for start in range(0, len(given), SEARCHED):
-            part = slice(start, start + SEARCHED)
-            side = self.graph.trace(given[part], receiver, None if heading_rad is None else heading_rad[part])
-            if side is not None:
-                side.refresh(self._params)
-            weights = None if weight is None else weight[part]
-            parts.append(self.of_side(given[part], receiver, side, np.arange(len(given[part])), weights))
-        return np.concatenate(parts)
+        return self.of_side(given, receiver, side, slots, weight)
 
     def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
         """Reports for all transmitters, from flat reports of batches."""
@@ -325,8 +341,8 @@ class Predictor:
         turned = self._headings(tx_heading_rad, len(given))
         self.graph.check(given)
         if self.graph.form.carriers_hz is None:
-            return self._reported(given, index, turned)
+            return self._of_positions(given, index, turned, None)
         if carriers_hz is None:
             known = carriers_text(self.graph.form.carriers_hz)
             raise InputError(f"trained with {known}; give the carrier of every transmitter")
-        return self._at_carriers(given, index, turned, carriers_hz)
+        return self._of_positions(given, index, turned, np.asarray(carriers_hz, float))

@@ -130,10 +130,10 @@ class Trainer(TrainingLoop):
         self._known = [self.targets.at(port, known) for port in range(self.targets.ports)]
         self.graph.check(record.tx_pos_m)
         turned = record.tx_heading_rad if form.headings else None
-        self._sides = [
-            self.graph.trace(record.tx_pos_m[rows], port, None if turned is None else turned[rows])
-            for port, rows in enumerate(self._known)
-        ]
+        carriers = None if form.carriers_hz is None else record.carriers_hz
+        heading, carrier = (None if part is None else part[known] for part in (turned, carriers))
+        sides = [self.graph.trace(record.tx_pos_m[known], r, heading, carrier) for r in range(len(receivers))]
+        self._sides = [side for of_receiver in sides for side in of_receiver]
         self._poses = [device_pose(receivers[port // self.graph.carriers]) for port in range(self.targets.ports)]
         self._plane = perception_plane(*form.size, mi.Float)
         self._data = TrainingData(
@@ -326,11 +326,9 @@ class Trainer(TrainingLoop):
         if not len(rows):
             return float("nan")
         predict = self.predictor()
-        parts = [(r, self.targets.at(port, rows)) for r in range(len(record.receivers)) for port in self._ports(r)]
         scores = [
-            self.task.training_score(predict.of_rows(record, part, r), record.observation[r, part])
-            for r, part in parts
-            if len(part)
+            self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
+            for r in range(len(record.receivers))
         ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
