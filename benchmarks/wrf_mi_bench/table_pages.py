@@ -61,6 +61,8 @@ OVERVIEWS = {
     "positions": "channels from positions",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
+IN_README = ("spectrum", "rssi", "uplink", "positions")
+"""Overviews that the project's README shows."""
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
     "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "

@@ -30,7 +30,16 @@ from wrf_mi.parallel import Scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-NEEDS_NO_DATA = ("traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "sentinels")
+NEEDS_NO_DATA = (
+    "traced-and-splatted",
+    "scaling",
+    "operator",
+    "stress",
+    "pareto",
+    "rooms",
+    "sentinels",
+    "new-carriers",
+)
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     "pareto": "speed.md",

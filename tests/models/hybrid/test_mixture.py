@@ -53,6 +53,18 @@ def test_equal_weights_hedge_where_few_rows_tell_predictions_apart_by_chance():
     assert np.mean(better) > 0.15  # 0.2; the mean of three has 0.34 less error than each
 
 
+def test_a_trusted_prediction_is_left_where_rows_show_a_gain():
+    """A common error hides in five rows that the trusted prediction is the best; two hundred show which is."""
+    common, own = np.random.default_rng(1).normal(size=(2, 3, ROWS))
+    errors = 3 * common[:1] + own * np.array([[0.1], [1.0], [1.0]])
+    few = [choose(errors_of(errors[:, k : k + 5]), np.zeros(5), np.arange(5), 3, lambda _: None, 0) for k in range(100)]
+    assert sum(form == "single" for form, _ in few) > 50
+    assert all(mixture(np.zeros(1))[0, 0] == 1 for form, mixture in few if form == "single")
+    form, mixture = choose(errors_of(errors), DISTANCE, FOLD, 3, lambda _: None, 1)
+    assert form != "single"
+    assert mixture(np.array([0.5]))[0, 1] < 0.2
+
+
 def test_weights_follow_the_distance():
     noise = RNG.normal(size=(2, ROWS))
     near, far = noise[0] * 5 * DISTANCE**2, noise[1]

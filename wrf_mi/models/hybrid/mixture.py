@@ -69,6 +69,8 @@ def by_distance(score: RowScores, distance_m: FloatArray, rows: IntArray, count:
 
 FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
 """Forms of the weights, in the order of their freedom."""
+SINGLE = "single"
+"""Form before these: one prediction alone, which is named beforehand."""
 
 
 def choose(
@@ -77,6 +79,7 @@ def choose(
     fold: IntArray,
     count: int,
     on_fold: Callable[[float], None],
+    trusted: int | None = None,
 ) -> tuple[str, Mixture]:
     """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
 
@@ -89,20 +92,26 @@ def choose(
         fold: their folds [q].
         count: number k of predictions.
         on_fold: called with the share of the folds that is done.
+        trusted: number of the prediction that is used alone unless a mixture gains; None: mixtures only.
     """
+
+    def single(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+        return constant(np.eye(count)[trusted])
+
+    forms = FORMS if trusted is None else {SINGLE: single, **FORMS}
     folds, every = np.unique(fold), np.arange(len(fold))
-    found = {name: np.full(len(fold), np.nan) for name in FORMS}
+    found = {name: np.full(len(fold), np.nan) for name in forms}
     for done, number in enumerate(folds):
         out = fold == number
-        for name, form in FORMS.items():
+        for name, form in forms.items():
             chosen = form(score, distance_m, every[~out] if len(folds) > 1 else every, count)
             found[name][out] = score(chosen(distance_m[out]), every[out])
         on_fold((done + 1) / len(folds))
-    best = next(iter(FORMS))
-    for name in FORMS:
+    best = next(iter(forms))
+    for name in forms:
         if improves(found[name], found[best], True):
             best = name
-    return best, FORMS[best](score, distance_m, every, count)
+    return best, forms[best](score, distance_m, every, count)
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:

@@ -48,7 +48,7 @@ from ..model import (
     known_positions,
     under,
 )
-from .ingredients import from_uplink, problems, serving
+from .ingredients import from_uplink, most_trusted, problems, serving
 from .mixture import Mixture, choose, constant
 
 logger = logging.getLogger(__name__)
@@ -203,7 +203,12 @@ def _weights(
     score = task.mixtures(means, observed)
     every = np.arange(len(held))
     form, mixture = choose(
-        score, held.distance_m, held.fold, len(means), lambda share: session.report("choosing weights", share)
+        score,
+        held.distance_m,
+        held.fold,
+        len(means),
+        lambda share: session.report("choosing weights", share),
+        None if task.image else most_trusted(list(predictions)),
     )
     mean = np.einsum("qk,kq...->q...", mixture(held.distance_m), means)
     size = expected_size(task, Prediction(mean))
