@@ -77,6 +77,7 @@ def choose(
     score: RowScores,
     distance_m: FloatArray,
     fold: IntArray,
+    unit: IntArray,
     count: int,
     on_fold: Callable[[float], None],
     trusted: int | None = None,
@@ -84,12 +85,14 @@ def choose(
     """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
 
     Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
-    its mean score is better by more than the standard error of the difference.
+    its mean score is better by more than the standard error of the difference over independent units: the receivers of
+    one transmitter have errors in common.
 
     Args:
         score: scores of all held-out observations by their weights.
         distance_m: their distances [q], metres.
         fold: their folds [q].
+        unit: number of the unit that each belongs to [q].
         count: number k of predictions.
         on_fold: called with the share of the folds that is done.
         trusted: number of the prediction that is used alone unless a mixture gains; None: mixtures only.
@@ -109,9 +112,15 @@ def choose(
         on_fold((done + 1) / len(folds))
     best = next(iter(forms))
     for name in forms:
-        if improves(found[name], found[best], True):
+        if improves(_means(found[name], unit), _means(found[best], unit), True):
             best = name
     return best, forms[best](score, distance_m, every, count)
+
+
+def _means(values: FloatArray, unit: IntArray) -> FloatArray:
+    """Mean value of each unit."""
+    _, number = np.unique(unit, return_inverse=True)
+    return np.asarray(np.bincount(number, values) / np.bincount(number))
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:

@@ -170,7 +170,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
                     raise
                 logger.info("hybrid without %s: %s", name, error)
                 del found[name]
-    form, mixture, intervals, scores = _weights(record, predictions, held, session)
+    form, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
     if held is None:
         mixture = constant(np.eye(len(found))[0])
     names = [name for name, most in zip(found, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
@@ -193,9 +193,12 @@ def _names(settings: HybridSettings) -> list[str] | None:
 
 
 def _weights(
-    record: Record, predictions: Mapping[str, Prediction], held: HeldOut | None, session: Session
+    record: Record, predictions: Mapping[str, Prediction], held: HeldOut | None, by_receiver: bool, session: Session
 ) -> tuple[str, Mixture, Intervals | None, dict[str, float]]:
-    """Form of the weights, weights, intervals, and mean held-out scores of the ingredients."""
+    """Form of the weights, weights, intervals, and mean held-out scores of the ingredients.
+
+    Errors are independent between rows; ``by_receiver``: between receivers, which are held out.
+    """
     if held is None or not len(held):
         return "alone", constant(np.ones(1)), None, {}
     task, observed = task_of(record), held.observed(record)
@@ -206,6 +209,7 @@ def _weights(
         score,
         held.distance_m,
         held.fold,
+        held.receiver if by_receiver else held.row,
         len(means),
         lambda share: session.report("choosing weights", share),
         None if task.image else most_trusted(list(predictions)),
