@@ -153,6 +153,8 @@ NEW_CARRIERS: Mapping[str, Entry] = {
     "kriging": Entry("kriging, over position and log frequency", _model("kriging")),
     "idw": Entry("IDW, over position and log frequency", _model("idw")),
 }
+KNOWN_POSITIONS = {name: entry for name, entry in NEW_CARRIERS.items() if not name.startswith("wrf-gs")}
+"""Methods of a minute or two, where the positions of the test rows were measured at other carriers."""
 NEW_RECEIVERS: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
     "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),
@@ -208,6 +210,7 @@ PARTS = (
     ),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
     Part("spectrum", "carriers", "traced-room-bands", "frequency", NEW_CARRIERS, scene="lidar"),
+    Part("spectrum", "carriers", "traced-room-bands", "frequency-known", KNOWN_POSITIONS, scene="lidar"),
     Part("rssi", "receivers", "traced-floor-receivers", "receiver", NEW_RECEIVERS, scene="lidar"),
     Part("rssi", "receivers", "flat-ble", "receiver", NEW_RECEIVERS, scene="flat"),
     Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
