@@ -278,7 +278,7 @@ def test_bad_calls_are_refused(
         ([*train, "--scene", tmp_path / "none.xml"], "none.xml"),
         (
             [*train, "--depth", 2],
-            "--paths, --depth, --reflections, --rays and --calibrate belong to --model ray-tracing",
+            "--paths, --depth, --reflections, --rays, --phase-error and --calibrate belong to --model ray-tracing",
         ),
         (["train", "--resume", run, "--scene", "x"], "omit data set and settings"),
         (["train", "--resume", run, "--set", "lengths=2"], "omit data set and settings"),

@@ -17,7 +17,7 @@ from .options import Arguments, add_command, add_training
 from .output import Watch, show_metrics
 
 RAY_TRACING = "ray-tracing"
-TRACING = ("paths", "depth", "reflections", "rays", "calibrate")
+TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
 BESIDE_RESUME = ("resume", "json", "help_settings", "call")
 """Arguments that ``--resume`` does not refuse."""
@@ -89,7 +89,9 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
     if model == RAY_TRACING:
         settings = [*_tracing_settings(a), *settings]
     elif any(getattr(a, name) is not None for name in TRACING):
-        raise InputError(f"--paths, --depth, --reflections, --rays and --calibrate belong to --model {RAY_TRACING}")
+        raise InputError(
+            f"--paths, --depth, --reflections, --rays, --phase-error and --calibrate belong to --model {RAY_TRACING}"
+        )
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
     return {
@@ -126,6 +128,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
     # Trained paths are searched with the default seed; --seed is that of training and split.
     seed = None if a.calibrate is not None else a.seed
     numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": seed}
+    numbers["phase_error"] = a.phase_error
     stated: dict[str, Any] = {key: given for key, given in numbers.items() if given is not None}
     if a.rays is not None and a.rays != "auto":
         if not a.rays.isdecimal():

@@ -96,6 +96,7 @@ class FittedTracing(Fitted):
     def __init__(self, problem: Problem, arrays: Arrays, paths: Path) -> None:
         self._problem, self._arrays, self._paths = problem, arrays, paths
         self._last: tuple[Inputs, NDArray[Any], set[int]] | None = None
+        self._of_rows: tuple[IntArray, NDArray[Any]] | None = None
         self._offsets: Offsets | None = None
         if "offset_db" in arrays:
             self._offsets = Offsets(arrays["offset_db"], arrays["floor_dbm"])
@@ -113,12 +114,15 @@ class FittedTracing(Fitted):
         return observed if self._offsets is None else self._offsets(observed)
 
     @cached_property
-    def _of_rows(self) -> NDArray[Any]:
-        return self._reported(load_trace(self._paths))
+    def _stored(self) -> TraceResult:
+        return load_trace(self._paths)
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions from the stored paths."""
-        return Prediction(self._of_rows[receiver, rows])
+        # Receivers are predicted in turn.
+        if self._of_rows is None or not np.array_equal(self._of_rows[0], rows):
+            self._of_rows = rows, self._reported(self._stored.of_transmitters(rows))
+        return Prediction(self._of_rows[1][receiver])
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predictions of a receiver; positions are traced for all receivers together.
@@ -170,6 +174,8 @@ def _graph_problem(problem: Problem) -> Problem:
     if not options.line_of_sight or options.seed != TraceOptions().seed:
         what = f"seed={options.seed}" if options.line_of_sight else "paths without line-of-sight"
         raise InputError(f"calibration: {what} cannot be chosen there; omit it")
+    if options.phase_error:
+        raise InputError(f"calibration: phase_error={options.phase_error:g} belongs to a trace; omit it")
     reflections = options.max_depth if options.max_reflections is None else options.max_reflections
     given = [
         f"seed={problem.seed}",

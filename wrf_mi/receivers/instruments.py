@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from ..core import Antenna, Paths, Receiver
 from ..core.angles import FloatArray
@@ -19,6 +20,10 @@ from .channel import antenna_csi, csi, rssi_dbm
 
 CHUNK_SIZE = 64
 """Transmitters whose spectra are computed together."""
+DRAWS = 16
+"""Draws of uncertain phases: their mean differs from that of 512 by 0.005 of grey in a furnished room."""
+TRANSMISSION = 4
+"""Kind of interaction (`wrf_mi.core.Paths`) that adds no uncertain phase."""
 
 
 @dataclass(frozen=True)
@@ -94,21 +99,43 @@ class ChannelInstrument(Instrument):
 class SpectrumInstrument(Instrument):
     """Bartlett spectra [n_rx, n_tx, height, width], each scaled by its minimum and maximum as instruments do.
 
+    With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a mesh that is off by
+    centimetres knows the powers of paths, but not how they interfere, and a spectrum of wrong phases has maxima and
+    zeros at wrong places. Draws of a path are the same in every call.
+
     Attributes:
         size: height and width of a spectrum.
+        phase_error: standard deviation of the phase that each interaction but transmission adds, rad, independently.
     """
 
     size: tuple[int, int] = (90, 360)
+    phase_error: float = 0.0
 
     def observe(self, paths: Paths) -> NDArray[np.float32]:
         """Spectra in 0..1, see `wrf_mi.receivers.bartlett_spectrum`; all 0 where no path arrives."""
-        images = np.empty((len(self.receivers), paths.n_tx, *self.size), np.float32)
+        images = np.zeros((len(self.receivers), paths.n_tx, *self.size), np.float32)
         for index, (receiver, some) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
-            signals = antenna_csi(some, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
-            # Float64 spectra of all would take several times the memory of the result.
-            for start in range(0, len(signals), CHUNK_SIZE):
-                rows = slice(start, start + CHUNK_SIZE)
-                spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
-                images[index, rows] = minmax_scale(spectra)
+            turned = _with_phases(some, self.phase_error) if self.phase_error else [some]
+            for one in turned:
+                signals = antenna_csi(one, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
+                # Float64 spectra of all would take several times the memory of the result.
+                for start in range(0, len(signals), CHUNK_SIZE):
+                    rows = slice(start, start + CHUNK_SIZE)
+                    spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
+                    images[index, rows] += minmax_scale(spectra) / len(turned)
         return images
+
+
+def _with_phases(paths: Paths, phase_error: float) -> list[Paths]:
+    """A receiver's paths with `DRAWS` draws of their uncertain phases.
+
+    The draws of a path are quantiles in random order, by its number among the paths of its transmitter, so that spectra
+    do not depend on others.
+    """
+    number = np.arange(len(paths)) - np.searchsorted(paths.tx, paths.tx)
+    order = np.random.default_rng(0).random((int(number.max(initial=0)) + 1, DRAWS)).argsort(axis=1)
+    drawn = ndtri((order + 0.5) / DRAWS)[number]
+    interactions = ((paths.interactions != 0) & (paths.interactions != TRANSMISSION)).sum(axis=1)
+    phase = phase_error * np.sqrt(interactions)[:, None] * drawn
+    return [replace(paths, gain=paths.gain * np.exp(1j * angle)) for angle in phase.T]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from ..core import InputError
 
 MAX_DEPTH = 12
@@ -33,6 +35,8 @@ class TraceOptions:
             of positions converge, see `wrf_mi.tracing.solve.converged_rays`.
         seed: seed of the rays' directions.
         scattering_coefficient: share of the reflected amplitude that is scattered, 0..1, if ``scattering`` is on.
+        phase_error: standard deviation of the phase that each reflection adds, rad, for errors of a mesh and of its
+            materials; spectra are then expectations (`wrf_mi.receivers.instruments.SpectrumInstrument`).
     """
 
     line_of_sight: bool = True
@@ -45,6 +49,7 @@ class TraceOptions:
     rays: int | Literal["auto"] = 1 << 17
     seed: int = 1
     scattering_coefficient: float = 0.3
+    phase_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -62,6 +67,8 @@ class TraceOptions:
             raise InputError(f"seed {self.seed}: give 0 or more")
         if not 0 < self.scattering_coefficient <= 1:
             raise InputError(f"scattering_coefficient {self.scattering_coefficient}: give a number in (0, 1]")
+        if not 0 <= self.phase_error < np.inf:
+            raise InputError(f"phase_error {self.phase_error}: give 0 or more, rad")
 
     @property
     def reflections(self) -> int:

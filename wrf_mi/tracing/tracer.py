@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.angles import FloatArray
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
-from ..receivers.instruments import Instrument
+from ..receivers.instruments import Instrument, SpectrumInstrument
 from .options import DEFAULTS, TraceOptions
 from .result import TraceResult, recompute
 from .scenes import open_scene
@@ -41,6 +41,8 @@ class RayTracer:
     def __init__(
         self, scene: str | Path, instrument: Instrument, options: TraceOptions = DEFAULTS, material: str | None = None
     ) -> None:
+        if options.phase_error and isinstance(instrument, SpectrumInstrument):
+            instrument = replace(instrument, phase_error=options.phase_error)
         self.instrument = instrument
         self.options = options
         self._at = cache(partial(open_scene, scene, material=material))

@@ -1,0 +1,54 @@
+"""Spectra of paths with uncertain phases: against plain Monte Carlo, in its limits, and row by row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from spectrum_paths import made_paths
+
+from wrf_mi.core import Receiver
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.receivers.instruments import SpectrumInstrument
+
+CARRIER_HZ, SIZE = 2.4e9, (12, 36)
+RX = Receiver("rx", np.zeros(3), np.array([0.0, 0, 0, 1]), array_m=planar_array(4, 4, 0.06))
+EXPECTATION = 0.03
+"""Mean difference of 16 draws from 4,096; greys of 0..1."""
+
+
+def instrument(phase_error: float) -> SpectrumInstrument:
+    return SpectrumInstrument((RX,), np.array([CARRIER_HZ]), size=SIZE, phase_error=phase_error)
+
+
+@pytest.mark.parametrize("phase_error", [0.3, 1.0, 2.5])
+def test_spectra_are_the_mean_over_random_phases(phase_error: float) -> None:
+    """Phases are independent and normal, of variance phase_error^2 for each reflection; transmissions add none."""
+    paths = made_paths(seed=1)
+    reflections = (paths.interactions == 1).sum(axis=1)
+    rng, plain = np.random.default_rng(3), instrument(0.0)
+    wanted = np.zeros((1, paths.n_tx, *SIZE))
+    for _ in range(4096):
+        phase = phase_error * np.sqrt(reflections) * rng.normal(size=len(paths))
+        wanted += plain.observe(replace(paths, gain=paths.gain * np.exp(1j * phase))) / 4096
+    found = instrument(phase_error).observe(paths)
+    assert np.abs(found - wanted).mean() < EXPECTATION
+    assert np.abs(plain.observe(paths) - wanted).mean() > 2 * np.abs(found - wanted).mean()
+
+
+def test_certain_phases_change_nothing() -> None:
+    paths = made_paths(seed=2)
+    direct = replace(paths, interactions=np.where(paths.interactions == 1, 4, paths.interactions).astype(np.uint8))
+    # 16 float32 means of the same spectrum.
+    np.testing.assert_allclose(instrument(1.0).observe(direct), instrument(0.0).observe(direct), atol=1e-6)
+    np.testing.assert_array_equal(instrument(1e-12).observe(paths)[0, -1], 0)  # reached by no path
+
+
+def test_a_spectrum_does_not_depend_on_the_other_transmitters() -> None:
+    paths = made_paths(seed=4)
+    every = instrument(1.0).observe(paths)
+    for row in range(paths.n_tx):
+        alone = replace(paths.select(paths.tx == row), n_tx=1)
+        alone = replace(alone, tx=np.zeros_like(alone.tx))
+        np.testing.assert_allclose(instrument(1.0).observe(alone)[:, 0], every[:, row], atol=1e-6)
