@@ -61,7 +61,7 @@ OVERVIEWS = {
     "positions": "channels from positions",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
-IN_README = ("spectrum", "rssi", "uplink", "positions")
+IN_README = ("spectrum", "rssi", "uplink")
 """Overviews that the project's README shows."""
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
