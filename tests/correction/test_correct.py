@@ -19,6 +19,7 @@ from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.correction.misfit import Misfit, search_options
 from wrf_mi.datasets import make_splits
+from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
@@ -144,6 +145,26 @@ def test_receivers_that_a_split_holds_out_are_not_used(tmp_path: Path) -> None:
     found, other = (correct_scene(scene, data, split, options) for data in (both, broken))
     np.testing.assert_array_equal(other.vector, found.vector)
     assert np.isfinite(found.vector).all()
+
+
+def test_new_receivers_decide_where_receivers_are_held_out(tmp_path: Path) -> None:
+    """Half of the trained receivers judge, with the mean gain of the others."""
+    true = stated_scene(tmp_path / "true", TRUE_MATERIALS)
+    one = strengths(channels(true, 80))
+    places = np.array([[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0]])
+    receivers = tuple(replace(one.receivers[0], name=f"rx{k}", position_m=place) for k, place in enumerate(places))
+    tracer = RayTracer(true, PowerInstrument(receivers, np.array([CARRIER_HZ])), TraceOptions(max_depth=2, rays=4096))
+    observed = tracer(one.tx_pos_m) - 40.0
+    record = replace(one, receivers=receivers, observation=observed.astype(np.float32))
+    scene, split = stated_scene(tmp_path / "scene"), make_splits(record, "receiver:0")[0]
+    found = correct_scene(scene, record, split, replace(default_options(record), rays=4096, depth=2))
+    for score in found.scores.values():
+        judged = np.isfinite(score.reshape(5, -1)).any(axis=1)
+        assert judged.sum() == 2
+        assert not judged[0]
+    assert found.kept == "materials+gain"
+    # The offset of -40 dB is that of the others; three receivers in the walls' near field leave some error.
+    assert np.nanmean(found.scores[found.kept]) < np.nanmean(found.scores[""]) < 3
 
 
 def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:

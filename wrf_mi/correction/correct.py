@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
 from .options import DEFAULTS, GAIN, STRENGTHS, CorrectionOptions, OnStage
+
+NONE = np.zeros((0, 2), np.int64)
+"""No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
 
 
 @dataclass
@@ -113,28 +116,25 @@ def correct_scene(
     check_materials(opened)
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
-    groups = hold_out_groups(split, record.tx_pos_m)
-    if groups is split:
-        raise InputError(f"{name}: {len(split.train)} training rows are too few to hold some out; give more")
-    held = np.setdiff1d(groups.validation, split.validation)
-    known = np.setdiff1d(split.all_train, held)
+    parts = _parts(record, split)
 
-    def misfit(rows: IntArray, what: str) -> Misfit:
-        on_stage(what, 0.0)
+    def misfit(record: Record, rows: IntArray) -> Misfit:
+        on_stage("tracing", 0.0)
         return Misfit(record, rows, opened, search_options(options), options.changes, prepared)
 
-    first = misfit(known, "tracing")
+    first = misfit(parts.known, parts.known_rows)
     if not any(side.exists.any() for side in first.sides):
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
-    others = misfit(held, "tracing")
+    others = misfit(parts.held, parts.held_rows)
     trial = Fit(first, options, on_stage)
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
     chosen = trial.all_parts()
     stages = {"": trial.stated, **{key: found.vector for key, found in chosen.items()}}
-    scores = {key: others.scores(vector) for key, vector in stages.items()}
-    kept = _kept(scores, task.higher_is_better)
-    whole = misfit(split.all_train, "tracing")
+    scores = {key: others.scores(parts.with_mean_gain(vector, first)) for key, vector in stages.items()}
+    judged = {key: parts.units(score) for key, score in scores.items()}
+    kept = _kept(judged, task.higher_is_better)
+    whole = misfit(record, split.all_train)
     final = Fit(whole, options, on_stage)
     vector, deviation = final.stated, np.zeros(len(final.stated))
     if kept:
@@ -155,8 +155,72 @@ def correct_scene(
         kinds,
         options,
         time.perf_counter() - begun,
-        {"rows": len(split.all_train), "held_out": len(held), "paths": sum(int(s.exists.sum()) for s in whole.sides)},
+        {
+            "rows": len(split.all_train),
+            "held_out": len(parts.held_rows),
+            "paths": sum(int(s.exists.sum()) for s in whole.sides),
+        },
     )
+
+
+class _Parts(NamedTuple):
+    """Observations that a correction is fitted to, and others that decide what is kept.
+
+    Attributes:
+        known, held: the record as each sees it.
+        known_rows, held_rows: rows of each.
+        out, fitted: names of the receivers of ``held``, which ``known`` has not seen, and of those that it has; empty
+            where rows are held out instead.
+    """
+
+    known: Record
+    known_rows: IntArray
+    held: Record
+    held_rows: IntArray
+    out: tuple[str, ...] = ()
+    fitted: tuple[str, ...] = ()
+
+    def units(self, score: FloatArray) -> FloatArray:
+        """Independent scores: those of rows, or the mean of each receiver that is held out."""
+        if not self.out:
+            return score
+        by_receiver = score.reshape(len(self.held.receivers), -1)
+        return np.array([np.nanmean(row) for row in by_receiver if np.isfinite(row).any()])
+
+    def with_mean_gain(self, vector: FloatArray, misfit: Misfit) -> FloatArray:
+        """A vector with the mean gain of the receivers that were fitted at those that were not."""
+        gains = {
+            receiver.name: side.gain_name
+            for receiver, side in zip(misfit.receivers, misfit.sides[:: misfit.carriers], strict=True)
+            if side.gain_name in misfit.parts
+        }
+        if not self.out or not gains:
+            return vector
+        found = vector.copy()
+        mean = np.mean([vector[misfit.parts[gains[receiver]]] for receiver in self.fitted], axis=0)
+        for receiver in self.out:
+            found[misfit.parts[gains[receiver]]] = mean
+        return found
+
+
+def _parts(record: Record, split: Split) -> _Parts:
+    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those.
+
+    Raises:
+        InputError: too few training rows.
+    """
+    trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
+    if split.held_receivers and len(trained) > 3:
+        out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])
+        others = np.setdiff1d(trained, out)
+        names = (tuple(record.receivers[number].name for number in part) for part in (out, others))
+        known, held = (record.seen(replace(split, held_receivers=tuple(hide), left=NONE)) for hide in (out, others))
+        return _Parts(known, split.all_train, held, split.all_train, *names)
+    groups = hold_out_groups(split, record.tx_pos_m)
+    if groups is split:
+        raise InputError(f"{record.name}: {len(split.train)} training rows are too few to hold some out; give more")
+    rows = np.setdiff1d(groups.validation, split.validation)
+    return _Parts(record, np.setdiff1d(split.all_train, rows), record, rows)
 
 
 def _at_most(split: Split, count: int) -> Split:

@@ -124,6 +124,11 @@ class Misfit:
         """Whether rows of several carriers tell how conductivities depend on the frequency."""
         return len({side.frequency_hz for side in self.sides}) > 1
 
+    @property
+    def carriers(self) -> int:
+        """Number of sides of each receiver."""
+        return len(self.sides) // len(self.receivers)
+
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
         return {

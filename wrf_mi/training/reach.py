@@ -102,11 +102,13 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     return replace(split, train=rows[~held], validation=np.sort(np.concatenate([split.validation, rows[held]])))
 
 
-def improves(score: FloatArray, before: FloatArray, higher_is_better: bool) -> bool:
-    """Whether the mean gain of paired scores [rows] exceeds its standard error; NaN where nothing was received."""
+def improves(score: FloatArray, before: FloatArray, higher_is_better: bool, errors: float = 1.0) -> bool:
+    """Whether the mean gain of paired scores [rows] exceeds ``errors`` of its standard errors; NaN where nothing was
+    received.
+    """
     gain = (score - before) * (1 if higher_is_better else -1)
     gain = gain[np.isfinite(gain)]
-    return len(gain) > 1 and float(gain.mean()) > float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    return len(gain) > 1 and float(gain.mean()) > errors * float(gain.std(ddof=1)) / np.sqrt(len(gain))
 
 
 def choose_reach(
