@@ -154,7 +154,7 @@ NEW_CARRIERS: Mapping[str, Entry] = {
     "idw": Entry("IDW, over position and log frequency", _model("idw")),
 }
 KNOWN_POSITIONS = {name: entry for name, entry in NEW_CARRIERS.items() if not name.startswith("wrf-gs")}
-"""Methods of a minute or two, where the positions of the test rows were measured at other carriers."""
+"""Methods without a field of Gaussians, where the positions of the test rows were measured at other carriers."""
 NEW_RECEIVERS: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
     "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),

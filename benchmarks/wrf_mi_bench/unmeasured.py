@@ -1,7 +1,7 @@
 """Carriers and receivers without measurements: the hybrid beside ray tracing and interpolation, three seeds.
 
 Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are
-compared in pairs, pooled over folds and seeds; intervals are 95 % bootstrap intervals over rows.
+compared in pairs, as means over seeds and pooled over folds; intervals are 95 % bootstrap intervals over rows.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ LEFT = (0, 5, 20, 100)
 HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected scene"
 KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
 OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
+PAIRS = "pairs"
+FACTS = (PAIRS, "inside_90", "crps", "task")
+"""Entries of a measurement beside the scores of the methods."""
 AT_CARRIERS = "kriging,idw,ray-tracing"
 AT_RECEIVERS = "physics,mri,ray-tracing"
 """Ingredients of the hybrid at a new carrier, and at a receiver without any row."""
@@ -93,6 +96,13 @@ def _scores(run: Results, prediction: Observations | None = None) -> list[float]
     return [float(one) for one in found[np.isfinite(found)]]
 
 
+def _facts(hybrid: Results) -> dict[str, Any]:
+    """Intervals and task of the hybrid; names of the receivers and rows of all scores, in their order."""
+    known = np.isfinite(np.asarray(hybrid.score, float)[:, np.argsort(hybrid.row)])
+    pairs = [[hybrid.receivers[r], int(np.sort(hybrid.row)[i])] for r, i in np.argwhere(known)]
+    return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:]}}
+
+
 def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
     """Scores of the methods at a carrier that is held out, by name; ``inside_90`` and ``crps`` of the hybrid."""
     scene, record = _scene(held, folder.parent), load_record(held.dataset)
@@ -112,7 +122,7 @@ def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
         KRIGING: _scores(kriging),
         IDW: _scores(hybrid, hybrid.references[TASKS[hybrid.task].reference]),
         CARRIER: _scores(hybrid, hybrid.references["carrier"]),
-        **{key: hybrid.metrics[key] for key in ("inside_90", "crps", "task")},
+        **_facts(hybrid),
     }
 
 
@@ -129,17 +139,17 @@ def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> d
     (rows,) = make_splits(record, split, seed, held.n_train)
     ingredients = () if left else (f"ingredients={AT_RECEIVERS}",)
     hybrid = _run(folder, record, rows, seed, "hybrid", scene=better, settings=ingredients)
-    traced = _run(folder, record, rows, seed, "ray-tracing", scene=scene, settings=TRANSMISSION)
-    again = _run(folder, record, rows, seed, "ray-tracing", scene=better, settings=TRANSMISSION)
-    found: dict[str, Any] = {HYBRID: _scores(hybrid), TRACED: _scores(traced), CORRECTED: _scores(again)}
+    found: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
         alone, these = only(record, rows)
         found[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
         found[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
         found[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
     else:
+        for name, given in ((TRACED, scene), (CORRECTED, better)):
+            found[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=given, settings=TRANSMISSION))
         found[LAW] = _scores(hybrid, hybrid.references["law"])
-    return found | {key: hybrid.metrics[key] for key in ("inside_90", "crps", "task")}
+    return found | _facts(hybrid)
 
 
 def only(record: Record, split: Split) -> tuple[Record, Split]:
@@ -158,11 +168,20 @@ def _scene(held: Held, folder: Path) -> str:
 
 
 def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
-    """Median and mean of each method, pooled, and the hybrid's mean gain over it with its interval, by name."""
+    """Median and mean of each method, pooled, and the hybrid's mean gain over it with its interval, by name.
+
+    Seeds score the same pairs of receiver and row, whose mean counts once.
+    """
     task = TASKS[found[0]["task"]]
     sign = 1 if task.higher_is_better else -1
-    names = [name for name in found[0] if name not in ("inside_90", "crps", "task")]
-    pooled = {name: np.clip(np.concatenate([one[name] for one in found]), *task.limits) for name in names}
+    names = [name for name in found[0] if name not in FACTS]
+    pairs = [tuple(pair) for one in found for pair in one[PAIRS]]
+    place = {pair: k for k, pair in enumerate(dict.fromkeys(pairs))}
+    number = np.array([place[pair] for pair in pairs])
+    pooled = {}
+    for name in names:
+        scores = np.clip(np.concatenate([one[name] for one in found]), *task.limits)
+        pooled[name] = np.bincount(number, scores) / np.bincount(number)
     return {
         name: (
             float(np.median(scores)),

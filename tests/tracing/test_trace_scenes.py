@@ -148,6 +148,7 @@ def test_antennas_outside_the_scene_are_named(tmp_path: Path, caplog: pytest.Log
     with caplog.at_level(logging.WARNING):
         check_devices(surfaces, np.array([[1.0, 1, 1], [1, -40, 1], [1000, 1, 1]]), ["a", "b", "c"])
     assert "2 of 3 antennas lie outside the scene (first: b, by 39.8 m): check its frame and the unit" in caplog.text
+    check_devices(surfaces, np.zeros((0, 3)), [])  # every position was checked before
 
 
 def test_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture):

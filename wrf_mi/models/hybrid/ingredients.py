@@ -34,7 +34,7 @@ class Ingredient:
 TRANSMISSION = ("transmission=true",)
 """Waves pass the slabs of a scene, furniture among them."""
 PHASE_ERROR = "phase_error=1.25"
-"""Meshes of scans are off by a share of the wavelength; chosen on random rooms (docs/physics.md)."""
+"""Meshes of scans are off by a share of the wavelength; docs/physics.md has the choice."""
 INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
