@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
@@ -34,6 +35,8 @@ from .options import DEFAULTS, GAIN, STRENGTHS, CorrectionOptions, OnStage
 
 NONE = np.zeros((0, 2), np.int64)
 """No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
+CONFIDENCE = 0.95
+"""One-sided confidence in the gain at receivers: two agree by chance too often to move walls for a third."""
 
 
 @dataclass
@@ -133,7 +136,7 @@ def correct_scene(
     stages = {"": trial.stated, **{key: found.vector for key, found in chosen.items()}}
     scores = {key: others.scores(parts.with_mean_gain(vector, first)) for key, vector in stages.items()}
     judged = {key: parts.units(score) for key, score in scores.items()}
-    kept = _kept(judged, task.higher_is_better)
+    kept = _kept(judged, task.higher_is_better, bool(parts.out))
     whole = misfit(record, split.all_train)
     final = Fit(whole, options, on_stage)
     vector, deviation = final.stated, np.zeros(len(final.stated))
@@ -229,14 +232,17 @@ def _at_most(split: Split, count: int) -> Split:
     return replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
 
 
-def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
+def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool, of_receivers: bool) -> str:
     """The last stage that improves on the one kept before by more than the standard error of the mean gain.
+
+    Receivers are few; their gain has to exceed the quantile of Student's t distribution.
 
     Fits with more freedom also fit what no surface explains; a gain within its error does not justify moving walls.
     """
     kept = ""
     for stage, score in scores.items():
-        if improves(score, scores[kept], higher_is_better):
+        errors = float(stdtrit(len(score) - 1, CONFIDENCE)) if of_receivers else 1.0
+        if improves(score, scores[kept], higher_is_better, errors):
             kept = stage
     return kept
 
