@@ -37,6 +37,7 @@ NEEDS_NO_DATA = (
     "stress",
     "pareto",
     "rooms",
+    "phase-error",
     "sentinels",
     "new-carriers",
 )
@@ -49,6 +50,7 @@ ON_PAGE = {
     "training": "speed.md",
     "stress": "numerics.md",
     "rooms": "correction.md",
+    "phase-error": "physics.md",
     "sentinels": "results.md",
 }
 """Pages that show a check's table; all others are in `docs/results.md`."""
