@@ -163,6 +163,13 @@ def test_new_receivers_decide_where_receivers_are_held_out(tmp_path: Path) -> No
         assert judged.sum() == 2
         assert not judged[0]
     assert found.kept == "materials+gain"
+    names = found.facts["held_out_receivers"]
+    assert len(names) == 2
+    assert "rx0" not in names
+    write_page(found, tmp_path / "page", False)
+    page = (tmp_path / "page" / "correction.md").read_text()
+    stated = f"{len(split.all_train)} training rows at the receivers {', '.join(names)}, which were held out"
+    assert f"{stated} while choosing" in page
     # The offset of -40 dB is that of the others; three receivers in the walls' near field leave some error.
     assert np.nanmean(found.scores[found.kept]) < np.nanmean(found.scores[""]) < 3
 

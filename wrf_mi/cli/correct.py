@@ -63,7 +63,8 @@ def correct_command(a: Arguments) -> int:
     if a.json:
         print_json({"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}})
         return 0
-    print(f"{facts['score']} of {facts['held_out']} held-out rows   median    mean")
+    what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
+    print(f"{facts['score']} of {facts['held_out']} {what}   median    mean")
     for stage, score in facts["held_out_scores"].items():
         print(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{'  kept' if stage == facts['kept'] else ''}")
     print(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")

@@ -161,6 +161,7 @@ def correct_scene(
         {
             "rows": len(split.all_train),
             "held_out": len(parts.held_rows),
+            "held_out_receivers": list(parts.out),
             "paths": sum(int(s.exists.sum()) for s in whole.sides),
         },
     )

@@ -191,13 +191,15 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
 def _text(correction: Correction, facts: dict[str, Any]) -> str:
     """The page as Markdown."""
     task = task_of(correction.misfit.record)
+    receivers = ", ".join(facts["held_out_receivers"])
+    held = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
     lines = [
         "# A scene corrected by measurements",
         "",
         f"Data: {correction.misfit.record.name}, {facts['rows']} training rows, {facts['paths']} paths. "
         f"Kept: {facts['kept']}. Duration: {facts['seconds']:.0f} s.",
         "",
-        f"{task.label} of {facts['held_out']} training rows that were held out in clusters while choosing:",
+        f"{task.label} of {facts['held_out']} training rows {held} while choosing:",
         "",
         "| scene | median | mean |",
         "| --- | ---: | ---: |",
