@@ -1,0 +1,1 @@
+"""Maps of what a fitted model predicts over an area."""
