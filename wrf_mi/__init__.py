@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .runs.compare import compare
     from .runs.figures import spectrum_table
     from .runs.scene_view import scene_view
+    from .scene.edit import edit_scene
     from .scene.make import make_scene
     from .synthetic import load_record as load
     from .tracing import TraceOptions
@@ -38,6 +39,7 @@ _HOME = {
     "Trainer": "training.trainer",
     "check_data": "checking",
     "compare": "runs.compare",
+    "edit_scene": "scene.edit",
     "evaluate_run": "runs.api",
     "fetch": "datasets",
     "load": "synthetic:load_record",
@@ -64,6 +66,7 @@ __all__ = [
     "Trainer",
     "check_data",
     "compare",
+    "edit_scene",
     "evaluate_run",
     "fetch",
     "load",

@@ -57,6 +57,7 @@ def test_commands_are_complete() -> None:
         "data",
         "mesh",
         "correct",
+        "edit",
         "train",
         "trace",
         "sweep",

@@ -1,0 +1,148 @@
+"""Scenes with parts moved or removed: what would be measured after a cabinet is moved, without measuring anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from .folder import read_scene_folder, write_scene
+from .materials import Materials
+from .surfaces import KINDS, Kind, Surface, mesh_parts, moved
+
+
+@dataclass(frozen=True)
+class Move:
+    """A rigid motion of some parts of a scene together.
+
+    Attributes:
+        parts: names of surfaces; ``*`` and ``?`` are wildcards.
+        shift_m: displacement [3], metres.
+        turn_deg: rotation about the vertical axis through the middle of the parts' common box, degrees, from +x
+            towards +y; before the displacement.
+    """
+
+    parts: tuple[str, ...]
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not finite.
+
+        Raises:
+            InputError: naming the parts.
+        """
+        if len(self.shift_m) != 3 or not np.isfinite([*self.shift_m, self.turn_deg]).all():
+            raise InputError(f"move {','.join(self.parts)}: give three finite numbers of metres, and of degrees")
+
+    def matrix(self, box_m: FloatArray) -> FloatArray:
+        """Matrix [4, 4] of the motion of parts whose common box has the corners [2, 3], metres."""
+        middle = box_m.mean(axis=0)
+        turn = trimesh.transformations.rotation_matrix(np.radians(self.turn_deg), [0, 0, 1], middle)
+        return np.asarray(trimesh.transformations.translation_matrix(self.shift_m) @ turn)
+
+
+def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
+    """Surfaces of a scene folder in the order of ``materials.yml``, and its materials.
+
+    Raises:
+        InputError: not a scene folder, or a damaged one.
+    """
+    scene = read_scene_folder(folder)
+    surfaces = []
+    for name, entry in scene.materials.surfaces.items():
+        parts = mesh_parts(scene.folder / "meshes" / f"{name}.ply")
+        mesh = cast(Any, trimesh.util.concatenate(parts))
+        # A corrected scene states a material in place of the kind, which the name still begins with.
+        kind = next((kind for kind in KINDS if entry == kind or name.startswith(kind)), "other")
+        surfaces.append(Surface(name, cast(Kind, kind), np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+    return surfaces, scene.materials
+
+
+def box_of(surfaces: Sequence[Surface]) -> FloatArray:
+    """Lower and upper corner [2, 3] of the box around surfaces, metres."""
+    corners = np.concatenate([surface.vertices_m for surface in surfaces])
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def parts_within(folder: str | Path, low_m: ArrayLike, high_m: ArrayLike) -> tuple[str, ...]:
+    """Names of the surfaces of a scene folder that lie in a box, such as the sides of a cabinet.
+
+    Args:
+        folder: scene folder.
+        low_m: lower corner of the box [3], metres.
+        high_m: upper corner, likewise.
+
+    Raises:
+        InputError: not a scene folder.
+    """
+    low, high = np.asarray(low_m, float), np.asarray(high_m, float)
+    surfaces, _ = read_surfaces(folder)
+    inside = [((one.vertices_m >= low) & (one.vertices_m <= high)).all() for one in surfaces]
+    return tuple(surface.name for surface, within in zip(surfaces, inside, strict=True) if within)
+
+
+def edit_scene(
+    folder: str | Path,
+    out: str | Path,
+    moves: Sequence[Move] = (),
+    remove: Sequence[str] = (),
+    replace_folder: bool = False,
+) -> Path:
+    """Write a scene with parts moved or removed; materials stay.
+
+    Args:
+        folder: scene folder.
+        out: scene folder to make.
+        moves: motions, in their order; a part may move more than once.
+        remove: names of surfaces to leave out; ``*`` and ``?`` are wildcards.
+        replace_folder: replace an existing folder.
+
+    Returns:
+        The new folder.
+
+    Raises:
+        InputError: not a scene folder, a name that no surface has, nothing to change, no surface left, or an existing
+            folder.
+    """
+    surfaces, materials = read_surfaces(folder)
+    if not moves and not remove:
+        raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
+    for move in moves:
+        names = _chosen(folder, surfaces, move.parts)
+        matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
+        surfaces = [moved([one], matrix)[0] if one.name in names else one for one in surfaces]
+    gone = _chosen(folder, surfaces, remove)
+    left = [surface for surface in surfaces if surface.name not in gone]
+    kept = {surface.name: materials.surfaces[surface.name] for surface in left}
+    changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
+    changes += [f"{name} removed" for name in remove]
+    return write_scene(
+        out,
+        left,
+        frame=f"that of {folder}",
+        source=str(folder),
+        materials=replace(materials, surfaces=kept),
+        description=f"An edited scene: {'; '.join(changes)}",
+        replace=replace_folder,
+    )
+
+
+def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[str]) -> set[str]:
+    """Names of the surfaces that match some patterns; every pattern has to match one."""
+    found: set[str] = set()
+    for pattern in patterns:
+        names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
+        if not names:
+            known = ", ".join(surface.name for surface in surfaces)
+            raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
+        found |= names
+    return found
