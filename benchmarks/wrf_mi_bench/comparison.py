@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,11 @@ from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.datasets.registry import locate
 
+from .bench import provenance
+
 Row = dict[str, str]
+STORED = Path("benchmarks/results")
+"""Stored results, in a checkout."""
 
 
 def line(what: str, value: str, asked: str = "") -> Row:
@@ -24,6 +28,21 @@ def kept(file: Path, measure: Callable[[], Any]) -> Any:
     if not file.exists():
         write_atomically(file, json.dumps(measure(), indent=1))
     return json.loads(file.read_text(encoding="utf-8"))
+
+
+def stored_part(benchmark: str, name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Part of a long benchmark, from ``benchmarks/results/<benchmark>/<name>.json`` where it was measured before.
+
+    Parts are stored when they are done, with machine, versions and date, so that a measurement of many hours goes on,
+    on another machine too. A part is measured again where its file is deleted.
+    """
+    return dict(kept(STORED / benchmark / f"{name}.json", lambda: {**provenance(), **measure()}))
+
+
+def measured_on(parts: Iterable[Mapping[str, Any]]) -> str:
+    """First and last date of the parts of a benchmark."""
+    dates = sorted({part["date"] for part in parts})
+    return dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
 
 
 def data_folder(name: str) -> Path:

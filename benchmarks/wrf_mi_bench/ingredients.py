@@ -1,7 +1,8 @@
 """The hybrid beside each of its ingredients, and intervals of both, over data sets, splits and numbers of rows.
 
 Each cell is a run of the hybrid and one of each ingredient on the same rows. Scores are compared row by row; an
-ingredient is *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero.
+ingredient is *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is
+stored when it is measured (`wrf_mi_bench.comparison.stored_part`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, RFID
-from .comparison import data_folder, kept
+from .comparison import data_folder, measured_on, stored_part
 from .table_plan import PARTS
 from .tables import meshed_scan, scene_of
 
@@ -132,6 +133,11 @@ def measure(cell: Cell, folder: Path) -> list[dict[str, Any]]:
     return compared(hybrid, others)
 
 
+def measured(cell: Cell, folder: Path) -> dict[str, Any]:
+    """``models``: a cell as it is stored."""
+    return {"models": measure(cell, folder)}
+
+
 def rows_of(cell: Cell, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the table: the hybrid, then each ingredient with the hybrid's gain over it."""
     rows = []
@@ -149,7 +155,7 @@ def rows_of(cell: Cell, found: Sequence[Mapping[str, Any]]) -> list[dict[str, An
 
 
 def main() -> dict[str, Any]:
-    """Measure all cells, unless this code was measured before; `InputError` where data are not on this machine.
+    """Measure all cells that are not stored; `InputError` where data are not on this machine.
 
     Returns:
         ``rows``; ``worse``: number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside``:
@@ -160,14 +166,15 @@ def main() -> dict[str, Any]:
         data_folder(name)
     place = RUNS / fit_key(source_files())
     place.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
     for count, cell in enumerate(CELLS, 1):
         print(f"ingredients: {count} of {len(CELLS)}: {cell.title}", file=sys.stderr, flush=True)
-        found = rows_of(cell, kept(place / f"{cell.name}.json", partial(measure, cell, place / cell.name)))
+        parts.append(stored_part("ingredients", cell.name, partial(measured, cell, place / cell.name)))
+        found = rows_of(cell, parts[-1]["models"])
         rows += found
         for row in found:
             print(f"ingredients: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
-    return {"rows": rows, **_verdict(rows)}
+    return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

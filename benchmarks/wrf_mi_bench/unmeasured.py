@@ -1,7 +1,8 @@
 """Carriers and receivers without measurements: the hybrid beside ray tracing and interpolation, three seeds.
 
 Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are
-compared in pairs, as means over seeds and pooled over folds; intervals are 95 % bootstrap intervals over rows.
+compared in pairs, as means over seeds and pooled over folds; intervals are 95 % bootstrap intervals over rows. Each
+fold of each seed is stored when it is measured (`wrf_mi_bench.comparison.stored_part`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from wrf_mi.synthetic.room_bands import NAME as BANDS
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT
-from .comparison import data_folder, kept, line
+from .comparison import data_folder, line, measured_on, stored_part
 from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
 
@@ -39,9 +40,12 @@ LEFT = (0, 5, 20, 100)
 HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected scene"
 KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
 OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
+SCORE_DIGITS = 4
+"""Decimals of stored scores: finer than any difference that is reported."""
 PAIRS = "pairs"
 FACTS = (PAIRS, "inside_90", "crps", "task")
-"""Entries of a measurement beside the scores of the methods."""
+"""What is known of a measurement beside the scores of the methods."""
+PROVENANCE = ("date", "machine", "versions", "worker_threads")
 AT_CARRIERS = "kriging,idw,ray-tracing"
 AT_RECEIVERS = "physics,mri,ray-tracing"
 """Ingredients of the hybrid at a new carrier, and at a receiver without any row."""
@@ -93,7 +97,7 @@ def _scores(run: Results, prediction: Observations | None = None) -> list[float]
     """Scores of a run, or of another prediction of its rows, receiver by receiver where the truth is known."""
     found = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
     found = np.asarray(found, float)[:, np.argsort(run.row)]
-    return [float(one) for one in found[np.isfinite(found)]]
+    return [round(float(one), SCORE_DIGITS) for one in found[np.isfinite(found)]]
 
 
 def _facts(hybrid: Results) -> dict[str, Any]:
@@ -174,7 +178,7 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
     """
     task = TASKS[found[0]["task"]]
     sign = 1 if task.higher_is_better else -1
-    names = [name for name in found[0] if name not in FACTS]
+    names = [name for name in found[0] if name not in (*FACTS, *PROVENANCE)]
     pairs = [tuple(pair) for one in found for pair in one[PAIRS]]
     place = {pair: k for k, pair in enumerate(dict.fromkeys(pairs))}
     number = np.array([place[pair] for pair in pairs])
@@ -204,7 +208,7 @@ def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]
 
 
 def carriers() -> dict[str, Any]:
-    """Measure every carrier held out in turn, three seeds; what this code has measured before is read."""
+    """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
     place, rows, every = RUNS / fit_key(source_files()), list[dict[str, str]](), list[dict[str, Any]]()
     for held in CARRIERS:
         hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
@@ -212,10 +216,11 @@ def carriers() -> dict[str, Any]:
             found = []
             for seed in SEEDS:
                 name = f"{held.dataset}-{fold}-{seed}"
-                found.append(kept(place / f"{name}.json", partial(at_carrier, held, fold, seed, place / name)))
-                every.append({"dataset": held.dataset, "fold": fold, "seed": seed, **found[-1]})
+                how = partial(at_carrier, held, fold, seed, place / name)
+                found.append(stored_part("new-carriers", name, how))
+            every += found
             rows += _rows(f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz", found)
-    return {"rows": rows, "scores": every}
+    return {"rows": rows, "measured": measured_on(every)}
 
 
 def receivers() -> dict[str, Any]:
@@ -229,7 +234,7 @@ def receivers() -> dict[str, Any]:
                 for fold in range(held.folds):
                     name = f"{held.dataset}-{left}-{fold}-{seed}"
                     how = partial(at_receivers, held, left, fold, seed, place / name)
-                    found.append(kept(place / f"{name}.json", how))
-                    every.append({"dataset": held.dataset, "left": left, "fold": fold, "seed": seed, **found[-1]})
+                    found.append(stored_part("new-receivers", name, how))
+            every += found
             rows += _rows(f"{held.dataset}, {left} rows at new receivers", found)
-    return {"rows": rows, "scores": every}
+    return {"rows": rows, "measured": measured_on(every)}

@@ -1,0 +1,32 @@
+"""Parts of long benchmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from wrf_mi_bench.comparison import STORED, measured_on, stored_part
+
+
+def test_part_is_measured_once_and_stored_with_machine_and_date(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    calls: list[int] = []
+
+    def measure() -> dict[str, object]:
+        calls.append(1)
+        return {"score": 0.5}
+
+    first, second = stored_part("check", "part", measure), stored_part("check", "part", measure)
+    assert (len(calls), first) == (1, second)
+    assert first["score"] == 0.5
+    assert {"date", "machine", "versions"} <= set(first)
+    (STORED / "check" / "part.json").unlink()
+    stored_part("check", "part", measure)
+    assert len(calls) == 2
+
+
+def test_dates_of_parts() -> None:
+    assert measured_on([{"date": "2026-01-02"}]) == "2026-01-02"
+    assert measured_on([{"date": "2026-01-02"}, {"date": "2025-12-31"}]) == "2025-12-31 to 2026-01-02"
