@@ -33,6 +33,8 @@ from .results import Results
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
 CONSTANT = ("dataset", "metric")
 """Columns that are equal in a section, whose heading states them."""
+FIRST = ("run", "median", "mean", "common_mean")
+"""Columns that narrow screens show without scrolling."""
 
 STYLE = """
 :root { color-scheme: light; --line: #d5d9de; --soft: #f4f6f8; --ink: #1c2430; }
@@ -133,7 +135,7 @@ def page(sections: Sequence[Section], folder: Path) -> str:
 
 def _section(section: Section) -> str:
     task = TASKS[section.runs[0].task]
-    shown = {key: title for key, title in COLUMNS.items() if key not in CONSTANT}
+    shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in CONSTANT}
     scores = _table(shown, section.scores, NUMERIC)
     gains = difference_rows(section.differences)
     numeric = frozenset(("rows", "difference", "low", "high"))

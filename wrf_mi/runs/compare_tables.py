@@ -39,11 +39,11 @@ COLUMNS = {
 DIFFERENCES = {
     "run": "run",
     "against": "against",
-    "rows": "common rows",
+    "verdict": "verdict",
     "difference": "difference",
     "low": "95 % from",
     "high": "to",
-    "verdict": "verdict",
+    "rows": "common rows",
 }
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
