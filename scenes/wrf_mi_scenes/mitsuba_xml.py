@@ -73,7 +73,12 @@ PERFECT_CONSTANTS = {
 }
 
 
-def scene_xml(materials: Mapping[str, str], constants: Constants = MappingProxyType({})) -> str:
+def scene_xml(
+    materials: Mapping[str, str],
+    constants: Constants = MappingProxyType({}),
+    thickness_m: Mapping[str, float] = MappingProxyType({}),
+    looks: bool = False,
+) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
 
     Sionna RT replaces the BSDFs ``mat-itu_*`` by its ITU radio materials; Mitsuba uses plain two-sided diffuse BSDFs.
@@ -83,8 +88,11 @@ def scene_xml(materials: Mapping[str, str], constants: Constants = MappingProxyT
     Args:
         materials: radio material (``itu_*``, `PERFECT` or a key of ``constants``) of each part, by the part's name.
         constants: constants of further materials.
+        thickness_m: slab thickness of ITU materials (``itu_*``); those with one are radio materials of Sionna RT with
+            that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
+        looks: write the colours of all materials and no radio material, for pictures by Mitsuba alone.
     """
-    known = {PERFECT: PERFECT_CONSTANTS, **constants}
+    known = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
     lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
     for material in dict.fromkeys(materials.values()):
         colour = COLOURS.get(material, OTHER_COLOUR)
@@ -93,6 +101,15 @@ def scene_xml(materials: Mapping[str, str], constants: Constants = MappingProxyT
             stated = [(name, value) for name, value in known[material].items() if name in PERFECT_CONSTANTS]
             lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in stated]
             lines.append("    </bsdf>")
+            continue
+        if material in thickness_m:
+            lines += [
+                f'    <bsdf type="itu-radio-material" id="mat-{material}">',
+                f'        <string name="type" value="{material.removeprefix("itu_")}"/>',
+                f'        <float name="thickness" value="{thickness_m[material]:.9g}"/>',
+                f'        <rgb name="color" value="{colour}"/>',
+                "    </bsdf>",
+            ]
             continue
         lines += [
             f'    <bsdf type="twosided" id="mat-{material}">',

@@ -66,7 +66,7 @@ def test_commands_are_complete() -> None:
         "compress",
         "compare",
     }
-    expected |= {"bench", "demo"}
+    expected |= {"export", "import", "bench", "demo"}
     assert {name[0] for name in commands(build_parser()) if name} == expected
 
 
@@ -82,7 +82,7 @@ def test_help_and_bad_arguments_import_no_tracer() -> None:
     code = """
 import sys
 from wrf_mi.cli.main import main
-for arguments in (["--help"], ["train", "--help"], ["train", "--seed", "x"]):
+for arguments in (["--help"], ["train", "--help"], ["export", "--help"], ["train", "--seed", "x"]):
     try:
         main(arguments)
     except SystemExit:

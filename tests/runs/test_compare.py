@@ -16,7 +16,8 @@ from PIL import Image
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_figure
 from wrf_mi.runs import figures
-from wrf_mi.runs.compare import COLUMNS, compare
+from wrf_mi.runs.compare import compare
+from wrf_mi.runs.compare_tables import COLUMNS
 from wrf_mi.runs.results import read_run
 from wrf_mi.tasks.scores import ssim, summary
 
@@ -100,7 +101,7 @@ def test_page_shows_every_picture_that_was_written(tmp_path):
     page = compare([tmp_path / "a<b"], tmp_path / "out").read_text()
     assert "a&lt;b" in page
     assert "a<b" not in page
-    names = ["room-cdf.png", "room-samples.png", "room-training.png"]
+    names = [f"room-{what}.png" for what in ("cdf", "samples", "time", "errors", "training")]
     shown = re.findall(r'src="([^"]+)"', page)
     assert len(shown) == len(names)
     for source, name in zip(shown, names, strict=True):
@@ -110,7 +111,9 @@ def test_page_shows_every_picture_that_was_written(tmp_path):
         assert base64.b64decode(data) == (tmp_path / "out" / name).read_bytes()
         with Image.open(tmp_path / "out" / name) as picture:
             assert np.ptp(np.asarray(picture.convert("L"))) > 100
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted([*names, "compare.csv", "index.html"])
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
+        [*names, "compare.csv", "differences.csv", "index.html"]
+    )
 
 
 def test_untrained_runs_have_no_training_picture(tmp_path):

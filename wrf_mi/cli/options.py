@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 from typing import Any, NoReturn, get_args
 
@@ -16,7 +17,11 @@ DATASET = "name of a data set (`wrf-mi data list`) or a folder"
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser that reports an error in one line."""
+    """Parser that reports an error in one line, and takes ``-1,2,3`` for a value instead of an option."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"^-\.?\d[\d.,eE+-]*$")
 
     def error(self, message: str) -> NoReturn:
         """End the process with status 2."""

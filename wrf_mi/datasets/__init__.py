@@ -7,6 +7,7 @@ from .fetch import fetch
 from .nerf2_ble import read_nerf2_ble
 from .nerf2_csi import read_nerf2_csi, write_nerf2_csi
 from .newrf import read_newrf
+from .record_file import read_record_file, write_record_file
 from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
 from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
 from .splits import SPLIT_NAMES, load_split, make_splits, save_split
@@ -27,10 +28,12 @@ __all__ = [
     "read_nerf2_ble",
     "read_nerf2_csi",
     "read_newrf",
+    "read_record_file",
     "read_spectrum_folder",
     "save_split",
     "user_cache",
     "write_ble_folder",
     "write_nerf2_csi",
+    "write_record_file",
     "write_spectrum_folder",
 ]

@@ -5,6 +5,7 @@ Other packages add a `Layout` by an entry point of the group ``wrf_mi.layouts``.
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from .deepmimo import OLD_PARAMS, PARAMS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
 from .nerf2_ble import POWERS
 from .nerf2_csi import CHANNELS, STATION
+from .record_file import VERSION
 from .spectrum_folder import GATEWAYS
 
 ENTRY_POINTS = "wrf_mi.layouts"
@@ -30,10 +32,11 @@ class Layout:
 
     Attributes:
         name: name of the layout.
-        task: task of its records (`wrf_mi.core.Record`).
+        task: task of its records (`wrf_mi.core.Record`); "": that of each file.
         reader: ``module:function`` of type `Read`, or the function.
         files: names of files; a folder with any of them has this layout.
         suffixes: endings of files that are data sets, alone or in a folder without any layout's ``files``.
+        array: name of an array that an ``.npz`` file of this layout holds, or "".
     """
 
     name: str
@@ -41,6 +44,11 @@ class Layout:
     reader: str | Read
     files: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()
+    array: str = ""
+
+    def reads(self, file: Path) -> bool:
+        """Whether a file has the ending and the array of this layout."""
+        return file.suffix in self.suffixes and (not self.array or self.array in array_names(file))
 
     @property
     def read(self) -> Read:
@@ -57,6 +65,7 @@ BUILT_IN = (
     Layout("nerf2-csi", "csi", "wrf_mi.datasets.nerf2_csi:read_nerf2_csi", (CHANNELS, STATION)),
     Layout("ble", "rssi", "wrf_mi.datasets.ble_folder:read_ble_folder", (ANCHORS,)),
     Layout("deepmimo", "csi", "wrf_mi.datasets.deepmimo:read_deepmimo", (PARAMS, OLD_PARAMS)),
+    Layout("npz", "", "wrf_mi.datasets.record_file:read_record_file", suffixes=(".npz",), array=VERSION),
     Layout("newrf", "csi", "wrf_mi.datasets.newrf:read_newrf", suffixes=(".npz",)),
     Layout("argos", "csi", "wrf_mi.datasets.argos:read_argos", suffixes=SUFFIXES),
 )
@@ -74,12 +83,21 @@ def layouts() -> list[Layout]:
 def layout_of(path: Path) -> Layout:
     """The layout of a folder or a file."""
     if path.is_file():
-        found = [layout for layout in layouts() if path.suffix in layout.suffixes]
+        found = [layout for layout in layouts() if layout.reads(path)]
     else:
-        present = {file.suffix for file in path.iterdir()}
+        present = list(path.iterdir())
         found = [layout for layout in layouts() if any((path / file).exists() for file in layout.files)]
-        found += [layout for layout in layouts() if present & set(layout.suffixes)]
+        found += [layout for layout in layouts() if any(map(layout.reads, present))]
     return next(iter(found), SPECTRA)
+
+
+def array_names(file: Path) -> set[str]:
+    """Names of the arrays in an ``.npz`` file; empty where it is none, whose reader says so."""
+    try:
+        with zipfile.ZipFile(file) as stored:
+            return {name.removesuffix(".npy") for name in stored.namelist()}
+    except (OSError, zipfile.BadZipFile):
+        return set()
 
 
 def is_data(path: Path) -> bool:

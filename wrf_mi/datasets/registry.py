@@ -187,8 +187,9 @@ def find(name_or_folder: str | Path) -> tuple[Path, DataSet | None]:
 
 
 def stated_task(name_or_folder: str | Path) -> str | None:
-    """The task of a data set by its layout or name, without reading it; None if it is not known."""
+    """The task of a data set by its layout or name, read only if its layout has several; None if it is not known."""
     path = Path(name_or_folder)
     if path.exists():
-        return layout_of(path).task
+        layout = layout_of(path)
+        return layout.task or layout.read(path, None).task
     return next((dataset.task for dataset in KNOWN if dataset.name == str(name_or_folder)), None)

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
@@ -22,6 +23,10 @@ OUTLINE_POINTS = 64
 """Corners of the polygon of a footprint's outline."""
 COLOURS = 10
 """Number of colours in Matplotlib's cycle."""
+POINTS_AREA = 4000.0
+"""Area of all points of a map together, points squared: few positions are drawn larger."""
+MARKERS = "os^D"
+"""Markers of points, where colours repeat."""
 TAIL = 0.01
 """Fraction of each curve that may lie beyond either end of the axis, so that outliers do not compress the rest."""
 
@@ -100,7 +105,8 @@ def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, labe
             if values is None:
                 axes.set_axis_off()
                 continue
-            axes.scatter(x, y, c=np.asarray(values), s=6, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+            size = float(np.clip(POINTS_AREA / len(x), 6, 40))
+            axes.scatter(x, y, c=np.asarray(values), s=size, cmap="viridis", vmin=low, vmax=high, linewidths=0)
         colours = ScalarMappable(Normalize(low, high), cmap="viridis")
         bar = figure.colorbar(colours, ax=list(grid[r]), shrink=0.9)
         bar.set_label(label, fontsize=7)
@@ -205,6 +211,62 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
     axes.set_ylabel(f"{label} on held-out validation rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    return figure
+
+
+def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, float], label: str) -> Figure:
+    """Scores over times, a panel for each kind of time; runs without a time are left out of a panel.
+
+    Args:
+        times: times of each run by its name, by the words for the time.
+        scores: score of each run by its name.
+        label: name of the score.
+    """
+    figure = Figure(figsize=(3.4 * len(times) + 1.6, 3.6), layout="constrained")
+    panels = figure.subplots(1, len(times), squeeze=False, sharey=True)[0]
+    for axes, (words, of_runs) in zip(panels, times.items(), strict=True):
+        for number, (name, score) in enumerate(scores.items()):
+            if of_runs[name] > 0:
+                marker = MARKERS[number // COLOURS % len(MARKERS)]
+                axes.plot(of_runs[name], score, marker, color=f"C{number % COLOURS}", label=name)
+        if any(seconds > 0 for seconds in of_runs.values()):
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")  # the default is a formula, see `without_formulas`
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.set_xticks([])
+            axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")
+        axes.set_xlabel(words)
+        axes.margins(0.15)
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel(label)
+    entries = {text: line for axes in panels for line, text in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(entries.values(), entries.keys(), fontsize=8, loc="outside lower center", ncols=min(3, len(scores)))
+    return figure
+
+
+def choice_map(chosen: ArrayLike, names: Sequence[str], tx_pos_m: ArrayLike) -> Figure:
+    """Map of the name that is chosen at each transmitter position, seen from above.
+
+    Args:
+        chosen: number of the name at each position [m]; -1 leaves a position out.
+        names: names, each with its colour.
+        tx_pos_m: positions [m, 3], metres.
+    """
+    which = np.asarray(chosen)
+    x, y, _ = np.asarray(tx_pos_m, float).T
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for number, name in enumerate(names):
+        at = which == number
+        marker = MARKERS[number // COLOURS % len(MARKERS)]
+        label = f"{name}: {at.sum() / max((which >= 0).sum(), 1):.0%}"
+        axes.plot(x[at], y[at], marker, color=f"C{number % COLOURS}", markersize=4, label=label)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, loc="outside lower center", ncols=min(3, len(names)))
     return figure
 
 

@@ -75,6 +75,12 @@ class Results:
         return TASKS[self.task].of_rows(self.prediction, self.truth)
 
     @cached_property
+    def scored(self) -> dict[tuple[str, int], tuple[int, int]]:
+        """Receiver and column in `score` of each observation that is scored, by the receiver's name and the row."""
+        known = np.argwhere(np.isfinite(self.score))
+        return {(self.receivers[r], int(self.row[m])): (int(r), int(m)) for r, m in known}
+
+    @cached_property
     def reference_scores(self) -> dict[str, FloatArray]:
         """Scores of each reference by name."""
         return {key: TASKS[self.task].of_rows(values, self.truth) for key, values in self.references.items()}

@@ -47,6 +47,27 @@ def open_scene(
         InputError: an unknown name, a file that cannot be opened, no surface, coordinates in millimetres, or a
             material that is missing, unknown or superfluous.
     """
+    scene, stated_m, laws = load_scene(source, material)
+    set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})}, laws)
+    return scene
+
+
+def load_scene(
+    source: str | Path, material: str | None = None
+) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
+    """Load a scene in Sionna RT without setting its frequency.
+
+    Args:
+        source: see `open_scene`.
+        material: see `open_scene`.
+
+    Returns:
+        A ``sionna.rt.Scene``, thicknesses of its materials in metres, and laws of their conductivities, as
+        `set_frequency` takes them.
+
+    Raises:
+        InputError: as `open_scene`, but for materials that are not known at a frequency.
+    """
     backend.init()
     path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()
     if not path.exists() and (known := scenes().get(str(source))):
@@ -68,8 +89,7 @@ def open_scene(
     if (height := float(bounds.max.z - bounds.min.z)) > HIGHEST_M:
         text = f"{height:.0f} m high, as if in millimetres"
         raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
-    set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})}, laws)
-    return scene
+    return scene, stated_m, laws
 
 
 def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float, float]]]:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 
+PACKED = "packed_"
+"""Prefix of the arrays' names."""
 PRECISIONS = ("single", "half", "8bit")
 LEVELS = 255
 MOST_ROWS_IN_FULL = 4

@@ -24,7 +24,7 @@ from ...training.config import PRESETS, TrainConfig, task_settings
 from ...training.fields import field_of
 from ...training.initial import initial_gaussians
 from ...training.loop import Progress
-from ...training.packed import pack_params, unpack_params
+from ...training.packed import PACKED, pack_params, unpack_params
 from ...training.predictor import Predictor
 from ...training.reach import Reach
 from ...training.state import FitState
@@ -89,7 +89,7 @@ class FittedField(Fitted):
 
     def packed(self, params: Params, precision: str) -> Arrays:
         """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
-        kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, "packed_"))}
+        kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, PACKED))}
         return kept | pack_params(params, precision)
 
 

@@ -1,0 +1,209 @@
+"""Exported fields: PLY of 3D Gaussian splatting in other programs' readers, and files that give back the run."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+import trimesh
+from calling import call, refused
+from small_fits import settings
+
+from wrf_mi.core import InputError, Record
+from wrf_mi.core.angles import rotation_matrix
+from wrf_mi.exports import ExportOptions, export
+from wrf_mi.exports.field_file import import_field
+from wrf_mi.exports.gaussians import RANGE_DB
+from wrf_mi.runs.api import train
+from wrf_mi.runs.compressed import compress_run
+from wrf_mi.runs.run import open_run
+from wrf_mi.training.compress import Compression
+
+TX_M = np.array([[-0.3, 0.2, 0.5]])
+SINGLE = 1e-5
+"""Logarithms and logits are stored in single precision: 1e-7 of values up to 14."""
+COMPRESSED_M = 1e-2
+"""Compressed PLY stores positions of each 256 Gaussians in 11 or 10 bits of their box, here of some 8 m."""
+CHECKOUT = Path(__file__).resolve().parents[2]
+SPLAT_TRANSFORM = shutil.which("splat-transform") or shutil.which(
+    "splat-transform", path=CHECKOUT / "node_modules/.bin"
+)
+
+
+@pytest.fixture(scope="module")
+def runs(two_gateways: Record, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run of each field, after very few steps."""
+    out = tmp_path_factory.mktemp("runs")
+    steps = "steps=4"
+    return {
+        name: train(folder, out / name, name, settings=settings(steps, model=name)).folder
+        for name in ("wrf-gs", "wrf-gs+", "factorised")
+    }
+
+
+def gaussians(run: Path) -> Any:
+    with dr.suspend_grad():
+        return open_run(run).predictor().gaussians(TX_M)
+
+
+def exported(run: Path, out: Path) -> np.ndarray:
+    """Vertices of the exported file as trimesh reads them."""
+    export(run, "3dgs", out, ExportOptions(tx_pos_m=TX_M))
+    stored: np.ndarray = trimesh.load(out).metadata["_ply_raw"]["vertex"]["data"]
+    return stored
+
+
+@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
+def test_ply_has_the_properties_of_3dgs_and_the_gaussians_of_the_field(
+    runs: dict[str, Path], tmp_path: Path, model: str
+) -> None:
+    found, read = gaussians(runs[model]), exported(runs[model], tmp_path / "field.ply")
+    known = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    known += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert list(read.dtype.names)[: len(known)] == known
+    for k, axis in enumerate("xyz"):
+        np.testing.assert_array_equal(read[axis], found.position[k].numpy())
+        np.testing.assert_allclose(np.exp(read[f"scale_{k}"]), found.scale[k].numpy(), rtol=SINGLE)
+    np.testing.assert_array_equal(read["signal_re_0"], found.signal[0].numpy())
+    np.testing.assert_array_equal(read["signal_im_0"], found.signal[1].numpy())
+    alpha = 1 / (1 + np.exp(-read["opacity"].astype(float)))
+    if model == "wrf-gs":
+        delta = np.array(found.attenuation)
+        np.testing.assert_array_equal(np.stack([read["attenuation_re"], read["attenuation_im"]]), delta)
+        np.testing.assert_allclose(alpha, 1 - np.hypot(*delta), rtol=0, atol=SINGLE)
+    else:
+        np.testing.assert_allclose(alpha, found.opacity.numpy(), rtol=0, atol=SINGLE)
+    # Of the order w, x, y, z, normalised: the same rotations.
+    ours = rotation_matrix(np.stack([read[f"rot_{k}"] for k in (1, 2, 3, 0)], axis=-1))
+    np.testing.assert_allclose(ours, rotation_matrix(np.array(found.rotation).T), rtol=0, atol=SINGLE)
+    np.testing.assert_allclose(sum(np.square(read[f"rot_{k}"]) for k in range(4)), 1, atol=SINGLE)
+
+
+def test_strong_gaussians_are_bright(runs: dict[str, Path], tmp_path: Path) -> None:
+    """Viridis is the brighter the higher; the strongest Gaussian is yellow, those 40 dB below it dark."""
+    read = exported(runs["wrf-gs+"], tmp_path / "field.ply")
+    strength = np.hypot(read["signal_re_0"], read["signal_im_0"])
+    colour = 0.5 + 0.28209479177387814 * np.stack([read[f"f_dc_{k}"] for k in range(3)])
+    assert colour.min() >= -SINGLE
+    assert colour.max() <= 1 + SINGLE
+    luminance = np.array([0.2126, 0.7152, 0.0722]) @ colour
+    assert (np.diff(luminance[np.argsort(strength)]) >= -SINGLE).all()
+    assert colour[:, strength.argmax()] == pytest.approx([0.993, 0.906, 0.144], abs=1e-3)
+    assert RANGE_DB == 40
+
+
+def test_open3d_reads_the_attributes(runs: dict[str, Path], tmp_path: Path) -> None:
+    open3d = pytest.importorskip("open3d", reason="needs wrf-mi[lidar]")
+    read = exported(runs["wrf-gs"], tmp_path / "field.ply")
+    points = open3d.t.io.read_point_cloud(str(tmp_path / "field.ply")).point
+    np.testing.assert_array_equal(points.positions.numpy(), np.stack([read[axis] for axis in "xyz"], axis=-1))
+    np.testing.assert_array_equal(points.opacity.numpy().ravel(), read["opacity"])
+
+
+@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="needs npm's @playcanvas/splat-transform on the PATH")
+@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
+def test_splat_transform_converts_it_and_back(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
+    read = exported(runs[model], tmp_path / "field.ply")
+
+    def convert(source: str, out: str) -> Path:
+        asked = [str(SPLAT_TRANSFORM), "-q", "-w", str(tmp_path / source), str(tmp_path / out)]
+        done = subprocess.run(asked, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+        return tmp_path / out
+
+    # A PLY of theirs keeps every property and number.
+    again = trimesh.load(convert("field.ply", "again.ply")).metadata["_ply_raw"]["vertex"]["data"]
+    assert again.dtype.names == read.dtype.names
+    for name in read.dtype.names:
+        np.testing.assert_array_equal(again[name], read[name])
+    with convert("field.ply", "field.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    np.testing.assert_array_equal([np.float32(row["rot_3"]) for row in table], read["rot_3"])
+    # Through their compressed form positions and opacities come back rounded, in another order.
+    convert("field.ply", "field.compressed.ply")
+    rounded = trimesh.load(convert("field.compressed.ply", "rounded.ply")).metadata["_ply_raw"]["vertex"]["data"]
+    ours, theirs = (np.stack([part[axis] for axis in "xyz"], axis=-1) for part in (read, rounded))
+    nearest = np.linalg.norm(ours[:, None] - theirs, axis=-1)
+    assert nearest.min(axis=1).max() < COMPRESSED_M
+    alpha = [1 / (1 + np.exp(-part["opacity"].astype(float))) for part in (read, rounded)]
+    np.testing.assert_allclose(alpha[1][nearest.argmin(axis=1)], alpha[0], atol=1 / 255)
+
+
+@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
+def test_imported_field_predicts_the_same_bits(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
+    export(runs[model], "field", tmp_path / "field.npz")
+    run = import_field(tmp_path / "field.npz", tmp_path / "run")
+    before = open_run(runs[model])
+    assert run.config == before.config
+    assert run.metrics == before.metrics
+    expected = before.predict(TX_M).mean
+    assert np.ptp(expected) > 0
+    np.testing.assert_array_equal(run.predict(TX_M).mean, expected)
+    for name, values in before.field.params.items():
+        np.testing.assert_array_equal(run.field.params[name], values)
+    with np.load(tmp_path / "field.npz", allow_pickle=False) as stored:
+        assert stored["param/position"].shape == (3, 8)
+
+
+def test_field_in_half_precision_is_exported_in_single_precision(runs: dict[str, Path], tmp_path: Path) -> None:
+    compress_run(runs["wrf-gs"], tmp_path / "small", Compression(distil=0, precision="half"))
+    export(tmp_path / "small", "field", tmp_path / "small.npz")
+    run = import_field(tmp_path / "small.npz", tmp_path / "again")
+    np.testing.assert_array_equal(run.predict(TX_M).mean, open_run(tmp_path / "small").predict(TX_M).mean)
+    with np.load(tmp_path / "small.npz", allow_pickle=False) as stored:
+        assert not any(key.startswith("packed_") for key in stored)
+
+
+def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Path) -> None:
+    file = tmp_path / "field.npz"
+    export(runs["wrf-gs+"], "field", file)
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"export/format": np.array(9)}, "format 9, this version reads 1"),
+        ({"export/format": None}, "not written by export"),
+        ({"export/config": None}, "incomplete"),
+    ]
+    for change, message in changes:
+        np.savez(file, **{key: v for key, v in (arrays | change).items() if v is not None})
+        with pytest.raises(InputError, match=message):
+            import_field(file, tmp_path / "run")
+    file.write_bytes(b"no zip")
+    for path, message in ((file, "not readable"), (tmp_path / "none.npz", "missing")):
+        with pytest.raises(InputError, match=message):
+            import_field(path, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_command_exports_and_imports(runs: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+    run = runs["wrf-gs+"]
+    # A negative coordinate is no option.
+    status, out, _ = call(
+        ["export", run, "--format", "3dgs", "--tx", "-0.3,0.2,5e-1", "--out", tmp_path / "a.ply"], capsys
+    )
+    assert (status, out) == (0, f"Gaussians 8, properties 19: {tmp_path / 'a.ply'}\n")
+    stored = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(stored, exported(run, tmp_path / "b.ply"))
+    assert call(["export", run, "--format", "field", "--out", tmp_path / "f.npz"], capsys)[0] == 0
+    status, out, _ = call(["import", tmp_path / "f.npz", "--out", tmp_path / "run"], capsys)
+    assert (status, out.endswith(f": {tmp_path / 'run'}\n")) == (0, True)
+    status, _, _ = call(["evaluate", tmp_path / "run"], capsys)
+    assert status == 0
+    for arguments, message in (
+        (["--format", "3dgs", "--out", tmp_path / "c.ply"], "choose one by --tx X,Y,Z"),
+        (["--format", "3dgs", "--tx", "1,2", "--out", tmp_path / "c.ply"], "--tx 1,2: give three numbers"),
+        (["--format", "3dgs", "--tx", "1,2,3", "--frequency", "1e9", "--out", tmp_path / "c.ply"], "have one carrier"),
+        (["--format", "3dgs", "--tx", "1,2,3", "--out", tmp_path / "c.txt"], "format 3dgs is a file .ply"),
+        (["--format", "field", "--tx", "1,2,3", "--out", tmp_path / "c.npz"], "--tx does not belong to format field"),
+        (["--format", "paths", "--out", tmp_path / "c.csv"], "stores no paths"),
+        (["--format", "glb", "--out", tmp_path / "c.glb"], "without a scene"),
+        (["--format", "ble", "--out", tmp_path / "c"], "format ble takes a data set; choose from 3dgs, field, "),
+    ):
+        refused(["export", run, *arguments], message, capsys)
+    refused(["import", tmp_path / "f.npz", "--out", tmp_path / "run"], "exists and is not empty", capsys)

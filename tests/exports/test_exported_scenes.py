@@ -1,0 +1,187 @@
+"""Exported scenes: opened by plain Sionna RT, Mitsuba and trimesh."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from calling import refused
+from traced_rooms import SHOEBOX, write_xml
+
+from wrf_mi import backend
+from wrf_mi.core import InputError
+from wrf_mi.exports import ExportOptions, export
+from wrf_mi.runs.api import train
+from wrf_mi.scene.folder import write_scene
+from wrf_mi.scene.make import make_scene
+from wrf_mi.scene.materials import Materials
+from wrf_mi.scene.surfaces import Surface
+from wrf_mi.tracing import open_scene
+from wrf_mi.tracing.corrected_scene import write_corrected_scene
+from wrf_mi.tracing.material_parameters import name_of
+from wrf_mi.tracing.surfaces import scene_surfaces
+
+SINGLE = 1e-6
+"""Constants of materials are in single precision."""
+OWN = {"relative_permittivity": 2.9, "conductivity": 0.01, "thickness": 0.08}
+LAW = {"conductivity_exponent": 0.8, "carrier_hz": 2.4e9}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shoebox with a thickness of its own, a material of its own with a law, and a perfect conductor."""
+    parts = [
+        Surface(name, "other", np.asarray(mesh.vertices), np.asarray(mesh.faces)) for name, (_, mesh) in SHOEBOX.items()
+    ]
+    materials = Materials(
+        surfaces={
+            **{name: material for name, (material, _) in SHOEBOX.items()},
+            "east": "panel",
+            "west": "perfect",
+        },
+        thickness_m={"itu_concrete": 0.37},
+        constants={"panel": OWN | LAW},
+    )
+    return write_scene(tmp_path_factory.mktemp("scene") / "s", parts, frame="made", source="test", materials=materials)
+
+
+def constants(scene: Any) -> dict[str, list[float]]:
+    """Permittivity, conductivity and thickness of each object's material."""
+    found = {}
+    for name, thing in scene.objects.items():
+        material = thing.radio_material
+        numbers = (material.relative_permittivity, material.conductivity, material.thickness)
+        found[name] = [float(np.ravel(number)[0]) for number in numbers]
+    return found
+
+
+@pytest.mark.parametrize("frequency_hz", [915e6, 2.4e9, 5.8e9])
+def test_plain_sionna_has_the_same_materials_and_mesh(scene: Path, tmp_path: Path, frequency_hz: float) -> None:
+    backend.init()
+    from sionna import rt
+
+    export(scene, "sionna", tmp_path / "out", ExportOptions(frequency_hz=frequency_hz))
+    plain = rt.load_scene(str(tmp_path / "out" / "scene.xml"), merge_shapes=False)
+    plain.frequency = frequency_hz
+    ours = open_scene(scene, frequency_hz)
+    expected = constants(ours)
+    assert expected["floor"][2] == pytest.approx(0.37)
+    assert expected["east"][1] == pytest.approx(0.01 * (frequency_hz / 2.4e9) ** 0.8, rel=SINGLE)
+    for name, values in constants(plain).items():
+        assert values == pytest.approx(expected.pop(name), rel=SINGLE), name
+    assert not expected
+    theirs, known = scene_surfaces(plain), scene_surfaces(ours)
+    assert theirs.names == known.names
+    for index in range(len(known.names)):
+        faces = slice(known.first_face[index], known.first_face[index + 1])
+        np.testing.assert_array_equal(theirs.triangles[faces], known.triangles[faces])
+    facts = json.loads((tmp_path / "out" / "materials.json").read_text())["materials"]
+    assert facts["panel"]["conductivity_exponent"] == 0.8
+    assert facts["panel"]["follows_frequency"] is False
+    if frequency_hz > 1e9:  # within their range materials of ITU-R P.2040 follow a new frequency
+        plain.frequency = 10e9
+        again = constants(open_scene(scene, 10e9))
+        for name in ("floor", "ceiling"):
+            assert constants(plain)[name] == pytest.approx(again[name], rel=SINGLE)
+
+
+def test_default_merging_of_sionna_opens_it(scene: Path, tmp_path: Path) -> None:
+    from sionna import rt
+
+    export(scene, "sionna", tmp_path / "out", ExportOptions(frequency_hz=2.4e9))
+    assert rt.load_scene(str(tmp_path / "out" / "scene.xml")).objects
+
+
+def test_mitsuba_opens_it_without_sionna(scene: Path, tmp_path: Path) -> None:
+    backend.init()
+    import mitsuba as mi
+
+    export(scene, "sionna", tmp_path / "out", ExportOptions(frequency_hz=2.4e9))
+    text = (tmp_path / "out" / "mitsuba.xml").read_text()
+    assert "radio-material" not in text
+    box = mi.load_file(str(tmp_path / "out" / "mitsuba.xml")).bbox()
+    np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[0, 0, 0], [6, 5, 3]])
+    # After the import of Sionna RT, the scene file, too.
+    shapes = mi.load_file(str(tmp_path / "out" / "scene.xml")).shapes()
+    assert sum(shape.face_count() for shape in shapes) == 2 * len(SHOEBOX)
+
+
+def turned_back(vertices: np.ndarray) -> np.ndarray:
+    """From glTF's y up to z up."""
+    x, y, z = vertices.T
+    return np.stack([x, -z, y], axis=-1)
+
+
+def corners(triangles: np.ndarray) -> np.ndarray:
+    """Triangles [f, 3, 3] in an order that does not depend on the file's."""
+    flat = np.round(np.sort(triangles.reshape(len(triangles), 9), axis=1), 5)
+    return flat[np.lexsort(flat.T)]
+
+
+def test_glb_has_named_surfaces_and_materials(scene: Path, tmp_path: Path) -> None:
+    export(scene, "glb", tmp_path / "scene.glb")
+    read = trimesh.load_scene(tmp_path / "scene.glb")
+    known = open_scene(scene, 2.4e9)
+    assert set(read.geometry) == set(known.objects)
+    surfaces = scene_surfaces(known)
+    for index, name in enumerate(surfaces.names):
+        mesh = read.geometry[name]
+        assert mesh.visual.material.name == known.objects[name].radio_material.name
+        theirs = turned_back(mesh.vertices)[mesh.faces]
+        ours = surfaces.triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]]
+        np.testing.assert_array_equal(corners(theirs), corners(ours))
+
+
+def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: Path) -> None:
+    facts = export(scene, "ply", tmp_path / "scene.ply")
+    assert facts == {"surfaces": 6, "faces": 12, "materials": 4}
+    mesh = trimesh.load(tmp_path / "scene.ply", process=False)
+    head = (tmp_path / "scene.ply").read_bytes().partition(b"end_header")[0].decode()
+    names = {
+        kind: [line.split()[3] for line in head.splitlines() if f"comment {kind}" in line]
+        for kind in ("material", "surface")
+    }
+    stored = mesh.metadata["_ply_raw"]["face"]["data"]
+    known = open_scene(scene, 2.4e9)
+    for surface, material in zip(stored["surface"].ravel(), stored["material"].ravel(), strict=True):
+        assert names["material"][material] == known.objects[names["surface"][surface]].radio_material.name
+    assert mesh.visual.face_colors[0][:3].tolist() == [115, 115, 115]  # concrete
+    np.testing.assert_array_equal(corners(mesh.triangles), corners(scene_surfaces(known).triangles))
+    again = open_scene(make_scene(tmp_path / "scene.ply", tmp_path / "again").folder, 2.4e9)
+    np.testing.assert_array_equal(corners(scene_surfaces(again).triangles), corners(scene_surfaces(known).triangles))
+
+
+def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, tmp_path: Path) -> None:
+    room = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
+    run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=["max_depth=0"]).folder
+    assert export(run, "ply", tmp_path / "room.ply")["surfaces"] == 6
+    # What a calibration of materials leaves in the run folder.
+    fitted = {name_of("itu_concrete", "permittivity"): np.log([3.0])}
+    write_corrected_scene(run / "corrected", open_scene(room, 2.44e9), fitted)
+    facts = export(run, "sionna", tmp_path / "out")
+    assert facts["constants at 2.44 GHz"] == "fitted_itu_concrete"
+    from sionna import rt
+
+    plain = rt.load_scene(str(tmp_path / "out" / "scene.xml"), merge_shapes=False)
+    plain.frequency = 2.44e9
+    expected = constants(open_scene(run / "corrected", 2.44e9))
+    assert expected["floor"][0] == pytest.approx(4.0)
+    for name, values in constants(plain).items():
+        assert values == pytest.approx(expected[name], rel=SINGLE)
+
+
+def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, capsys: Any) -> None:
+    mesh = tmp_path / "box.stl"
+    trimesh.creation.box((4, 3, 2.5)).export(mesh)
+    out = tmp_path / "x"
+    refused(["export", mesh, "--format", "glb", "--out", f"{out}.glb"], "a mesh has no radio material", capsys)
+    assert export(mesh, "glb", f"{out}.glb", ExportOptions(material="brick"))["materials"] == 1
+    refused(["export", write_xml(tmp_path, SHOEBOX), "--format", "sionna", "--out", out], "by --frequency HZ", capsys)
+    refused(["export", mesh, "--format", "npz", "--out", f"{out}.npz"], "a scene; format npz takes a data set", capsys)
+    refused(["export", "no-such", "--format", "glb", "--out", f"{out}.glb"], "no such file or name", capsys)
+    with pytest.raises(InputError, match="unknown; choose from 3dgs"):
+        export(mesh, "obj", out)

@@ -1,0 +1,278 @@
+"""The page of a comparison: differences on common rows, what sorts, commands that repeat the runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import SMALL
+from test_compare import captured, make_run
+
+from wrf_mi.cli.main import build_parser
+from wrf_mi.cli.train import training_arguments
+from wrf_mi.core import Record
+from wrf_mi.runs import figures
+from wrf_mi.runs.api import plan_run, train
+from wrf_mi.runs.compare import compare
+from wrf_mi.runs.compare_tables import best_run, common, common_means, differences
+from wrf_mi.runs.compressed import compress_run
+from wrf_mi.runs.folder import AntennaOptions, read_config, start_run
+from wrf_mi.runs.repeat import changed_settings, command
+from wrf_mi.runs.results import Results
+from wrf_mi.runs.run import open_run
+from wrf_mi.training.compress import Compression
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+def strengths(
+    name: str,
+    error_db: Any,
+    rows: Any = range(40),
+    seed: int | None = 0,
+    reference_db: float = 3.0,
+    receivers: int = 1,
+    path: Path = Path(),
+) -> Results:
+    """Signal strengths with given absolute errors, [m] or [n_rx, m]."""
+    rows = np.array(rows)
+    truth = np.stack([-50.0 - rows - receiver for receiver in range(receivers)])
+    prediction = truth + np.broadcast_to(error_db, truth.shape)
+    block = {"median": 1.0, "mean": float(np.nanmean(np.abs(prediction - truth)))}
+    return Results(
+        path / name,
+        name,
+        "rssi",
+        "flat",
+        {"abs_error_db": block, "split": "official", "model": name},
+        seed,
+        tuple(f"anchor{k}" for k in range(receivers)),
+        rows,
+        np.zeros((len(rows), 3)),
+        prediction,
+        truth,
+        {"idw100": truth + reference_db},
+        {},
+    )
+
+
+def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:
+    return {(one.run, one.against): one.verdict for one in differences(runs)}
+
+
+def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -> None:
+    rng = np.random.default_rng(0)
+    good, bad = strengths("good", rng.uniform(0.5, 1.5, 40)), strengths("bad", rng.uniform(3.5, 4.5, 40))
+    close = strengths("close", np.abs(good.prediction - good.truth)[0] + rng.normal(0, 0.1, 40) + 0.001)
+    runs = [bad, good, close]
+    found = verdicts(runs)
+    best = best_run(runs).name
+    assert best in ("good", "close")
+    other = {"good": "close", "close": "good"}[best]
+    assert found["bad", best] == "worse"
+    assert found[other, best] == "tie"
+    reference = "IDW of 100 nearest"
+    assert {name: found[name, reference] for name in ("bad", "good")} == {"bad": "worse", "good": "better"}
+    against = next(one for one in differences(runs) if (one.run, one.against) == ("bad", best))
+    expected = np.mean(np.abs(best_run(runs).prediction - good.truth) - np.abs(bad.prediction - bad.truth))
+    assert against.interval is not None
+    assert against.interval.value == pytest.approx(expected)
+    assert against.interval.low < expected < against.interval.high < 0
+
+
+def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> None:
+    one, other = strengths("one", 1.0), strengths("other", 2.0, rows=range(30, 70))
+    assert [row for _, row in common([one, other])] == list(range(30, 40))
+    other.truth[0, 0] = 7.0  # row 30 is another measurement
+    other.truth[0, 1] = np.nan  # row 31 was not received
+    shared = [row for _, row in common([one, other])]
+    assert shared == list(range(32, 40))
+    assert {found.rows for found in differences([one, other]) if found.against == "one"} == {8}
+    assert common_means([one, other]) == pytest.approx({"one": 1.0, "other": 2.0})
+    apart = strengths("apart", 2.0, rows=range(90, 99))
+    assert common_means([one, apart]) == {}
+    assert verdicts([one, apart])["apart", "one"] == "too few rows"
+
+
+def test_receivers_of_a_row_count_as_one_observation() -> None:
+    """Their errors are not independent: two copies of a receiver leave the interval as it is."""
+    error = np.random.default_rng(1).uniform(1, 3, 40)
+    single = differences([strengths("a", error, reference_db=2.0)])[0]
+    double = differences([strengths("a", np.stack([error, error]), reference_db=2.0, receivers=2)])[0]
+    assert (single.rows, double.rows) == (40, 40)
+    assert single.interval == double.interval
+
+
+@pytest.fixture(scope="module")
+def seeds(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Folders with the configurations of three seeds."""
+    out = tmp_path_factory.mktemp("seeds")
+    for seed in range(3):
+        _, config, splits = plan_run(flat_folder, "trees", seed=seed)
+        start_run(out / f"seed{seed}", config, splits)
+    return [out / f"seed{seed}" for seed in range(3)]
+
+
+def test_all_seeds_must_agree(seeds: list[Path]) -> None:
+    errors = (1.0, 1.0, 3.5)
+    runs = [
+        strengths(path.name, error, seed=k, path=path.parent)
+        for k, (path, error) in enumerate(zip(seeds, errors, strict=True))
+    ]
+    runs.append(strengths("worst", 5.0))
+    found = verdicts(runs)
+    reference = "IDW of 100 nearest"
+    assert {found[path.name, reference] for path in seeds} == {"tie"}  # one of three seeds is worse
+    assert found["worst", reference] == "worse"
+    assert found["worst", "seed0"] == "worse"
+    assert found["seed2", "seed0"] == "another seed"
+
+
+def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """Data and arguments of `plan_run` that differ much from the defaults."""
+    antennas = AntennaOptions(rx_pattern="dipole", tx_polarization="H")
+    small = SMALL[:-1]
+    return [
+        (folder, {"model": "wrf-gs+", "settings": [*small, "steps=7"], "seed": 3, "split": "random", "n_train": 0.5}),
+        (
+            folder,
+            {"model": "wrf-gs", "settings": ["loss.ssim_weight=0.25"], "receiver": "pixel", "deterministic": True},
+        ),
+        (folder, {"model": "factorised", "evaluation": "splatted", "split": "blocked:1"}),
+        (flat_folder, {"model": "kriging", "intervals": True, "n_train": 20}),
+        (flat_folder, {"model": "physics", "scene": flat_folder / "room", "antennas": antennas}),
+        (
+            flat_folder,
+            {"model": "ray-tracing", "scene": flat_folder / "room", "settings": ["max_depth=1", "rays=4096"]},
+        ),
+        (flat_folder, {"model": "wrf-gs+", "scene": flat_folder / "room", "settings": ["traced.depth=1"]}),
+    ]
+
+
+def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folder: Path, tmp_path: Path) -> None:
+    from wrf_mi.scene.make import make_scene
+
+    flat = Path(shutil.copytree(flat_folder, tmp_path / "a flat"))
+    make_scene(flat / "layout.csv", flat / "room", height_m=2.7)
+    for dataset, arguments in every_run(folder, flat):
+        _, config, _ = plan_run(str(dataset), **arguments)
+        line = command(config, tmp_path / "it's a run")
+        program, *words = shlex.split(line)
+        assert program == "wrf-mi"
+        parsed = build_parser().parse_args(words)
+        assert parsed.out == str(tmp_path / "it's a run")
+        again = plan_run(parsed.dataset, **training_arguments(parsed))[1]
+        assert again == config, line
+
+
+def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
+    steps = [*SMALL, "loss.ssim_weight=0.25"]
+    run = train(folder, tmp_path / "run", settings=steps, seed=2).folder
+    changed = changed_settings(read_config(run))
+    resolved = "encoding.tx_scale_m"  # found from the data, which the command states, too
+    assert set(changed) - {resolved} == {setting.partition("=")[0] for setting in steps}
+    parsed = build_parser().parse_args(shlex.split(command(read_config(run), tmp_path / "again"))[1:])
+    assert plan_run(parsed.dataset, **training_arguments(parsed))[1] == open_run(run).config
+    compress_run(run, tmp_path / "small", Compression(distil=0, precision="half"))
+    line = command(read_config(tmp_path / "small"), tmp_path / "small")
+    assert line.startswith(f"wrf-mi compress {run} --budget 0 ")
+    build_parser().parse_args(shlex.split(line)[1:])
+    page = compare([run, tmp_path / "small"], tmp_path / "out").read_text()
+    assert command(read_config(run), run) in unescape(page)
+    assert "loss.ssim_weight=0.25" in page
+    assert "deformation network" in page
+    assert "mitsuba 3" in page
+
+
+class Tags(HTMLParser):
+    """Tags that are not closed in order, and addresses that a browser would load."""
+
+    ALONE = ("meta", "img", "br", "p", "dt", "dd", "html")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.addresses += [value for name, value in attrs if name in ("src", "href") and value]
+        if tag not in self.ALONE:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.ALONE:
+            assert self.open.pop() == tag
+
+
+def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / "a<b>&"), make_run(tmp_path / "second", noise=0.4, model="idw")]
+    other = make_run(tmp_path / "other")
+    metrics = json.loads((other / "metrics.json").read_text()) | {"dataset": "another/<place>"}
+    (other / "metrics.json").write_text(json.dumps(metrics))
+    page = compare([*runs, other], tmp_path / "out").read_text()
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    assert {address.partition(",")[0] for address in tags.addresses} == {"data:image/png;base64", "#room", "#_place_"}
+    assert "a<b>" not in page
+    assert "<place>" not in page
+    assert page.count("<h2 ") == 2
+    assert "6 test rows are common to all runs" in page
+    assert "higher is better" in page
+    with (tmp_path / "out" / "differences.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["run"], row["against"], row["verdict"]) for row in rows] == [
+        ("a<b>&", "IDW of 4 nearest", "better"),
+        ("second", "a<b>&", "worse"),
+        ("second", "IDW of 4 nearest", "worse"),
+        ("other", "IDW of 4 nearest", "better"),
+    ]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_a_click_sorts_the_table_in_a_browser(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, noise=noise) for name, noise in (("m", 0.2), ("a", 0.4), ("z", 0.1))]
+    page = compare(runs, tmp_path / "out")
+    press = """
+    const table = document.querySelectorAll('table.sorts')[1];
+    const names = () => [...table.tBodies[0].rows].map(row => row.cells[0].textContent).slice(0, 4).join(' ');
+    const head = [...table.tHead.rows[0].cells].find(cell => cell.textContent === 'median').firstElementChild;
+    head.click(); const up = names(); head.click();
+    document.title = up + ' / ' + names() + ' / ' + (document.documentElement.scrollWidth <= innerWidth);
+    """
+    page.write_text(page.read_text().replace("</script>", press + "</script>"))
+    asked = [str(CHROMIUM), "--headless", "--no-sandbox", "--dump-dom", "--window-size=500,900", f"file://{page}"]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=120, check=True)
+    found = re.search("<title>(.*?)</title>", done.stdout)
+    assert found is not None
+    up, down, fits = found[1].split(" / ")
+    assert [name for name in up.split() if name in ("a", "m", "z")] == ["a", "m", "z"]
+    assert [name for name in down.split() if name in ("a", "m", "z")] == ["z", "m", "a"]
+    assert fits == "true"  # wide tables and pictures scroll by themselves
+
+
+def test_maps_show_errors_and_the_best_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, errors, times = (captured(monkeypatch, name) for name in ("choice_map", "position_table", "time_scatter"))
+    good, bad = make_run(tmp_path / "good", rows=range(9)), make_run(tmp_path / "bad", noise=0.5)
+    compare([good, bad], tmp_path / "out")
+    best, names, _ = calls[-1]
+    assert names == ["good", "bad"]
+    assert best.tolist() == [0] * 6 + [-1] * 3  # three rows are predicted by one run alone
+    (rows, columns, _, label) = errors[-1]
+    assert (columns, label) == (["good", "bad"], "SSIM")
+    assert np.isnan(rows[0][1][1]).tolist() == [False] * 6 + [True] * 3
+    panels, scores, _ = times[-1]
+    assert panels["ms per sample"] == {"good": 3.25, "bad": 3.25}
+    assert scores["good"] > scores["bad"]
+    texts = [text.get_text() for text in figures.time_scatter(*times[-1]).findobj(figures.Text)]
+    assert not any("$" in text for text in texts)

@@ -1,0 +1,85 @@
+"""Any data set in one ``.npz`` file of plain arrays, without loss.
+
+Keys: ``record_format``, ``name``, ``task`` and the attributes of `wrf_mi.core.Record` that the data have, by their
+names; ``train`` and ``test`` are the official rows, ``tx_antenna`` the attributes of the transmitter's antenna, and
+``receiver_*`` the arrays of `wrf_mi.core.receivers.receiver_arrays`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import Antenna, DataFault, Record, receiver_arrays, stored_receivers
+from ..core.files import readable, stored_arrays, write_arrays
+from .folder_files import single_file
+
+VERSION, FORMAT = "record_format", 1
+OPTIONAL = (
+    "folds",
+    "frequencies_hz",
+    "tx_heading_rad",
+    "uplink",
+    "uplink_hz",
+    "truth",
+    "n_readings",
+    "std",
+    "carriers_hz",
+    "runs",
+)
+"""Attributes of a record that may be None."""
+
+
+def write_record_file(path: str | Path, record: Record) -> Path:
+    """Write a record to an ``.npz`` file atomically; `read_record_file` gives an equal record."""
+    stated = {name: getattr(record, name) for name in OPTIONAL if getattr(record, name) is not None}
+    parts = {} if record.official is None else dict(zip(("train", "test"), record.official, strict=True))
+    arrays: dict[str, Any] = {
+        VERSION: FORMAT,
+        "name": record.name,
+        "task": record.task,
+        "tx_pos_m": record.tx_pos_m,
+        "observation": record.observation,
+        "tx_antenna": np.array(astuple(record.tx_antenna)),
+        **receiver_arrays(record.receivers),
+        **parts,
+        **stated,
+    }
+    return write_arrays(Path(path), arrays, compressed=True)
+
+
+def read_record_file(path: str | Path, name: str | None = None) -> Record:
+    """Read a file of `write_record_file`.
+
+    Args:
+        path: path of the file, or of a folder that holds it alone.
+        name: name of the record; by default the one that is stored.
+
+    Raises:
+        InputError: a file that is missing or damaged, or of another format version.
+    """
+    file = single_file(Path(path), (".npz",), "one data set in .npz")
+    with readable(file, DataFault(file, "missing; give a data set in .npz"), "export it again"):
+        arrays = stored_arrays(file)
+        if (version := int(arrays[VERSION])) != FORMAT:
+            raise DataFault(file, f"format {version}, this version reads {FORMAT}; use the version that wrote it")
+        official = (arrays["train"], arrays["test"]) if "train" in arrays else None
+        given: dict[str, Any] = {key: arrays[key] for key in OPTIONAL if key in arrays}
+        record = Record(
+            name=name or str(arrays["name"]),
+            task=str(arrays["task"]),
+            tx_pos_m=arrays["tx_pos_m"],
+            receivers=stored_receivers(arrays),
+            observation=arrays["observation"],
+            official=official,
+            tx_antenna=Antenna(*map(str, arrays["tx_antenna"])),
+            source=str(file),
+            **given,
+        )
+        rows = {len(record.tx_pos_m), record.observation.shape[1]}
+    if len(rows) > 1 or len(record.receivers) != len(record.observation):
+        raise DataFault(file, "numbers of receivers or rows do not fit together; export it again")
+    return record

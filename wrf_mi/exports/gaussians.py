@@ -1,0 +1,106 @@
+"""Gaussians of a trained field as PLY of 3D Gaussian splatting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from matplotlib import colormaps
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.carriers import carriers_text
+from ..gaussians.parameters import Gaussians
+from ..models.gaussian.model import FittedField
+from ..runs.run import Run
+from .format import ExportOptions
+from .ply import table, write_ply
+from .source import Source
+
+DEGREE_0 = 0.28209479177387814
+"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a viewer's colour is 0.5 + `DEGREE_0` f_dc."""
+RANGE_DB = 40.0
+"""Range of magnitudes of the signal, below the strongest, over which colours differ."""
+OPAQUE = 1e-6
+"""Least distance of an opacity from 0 and 1, whose logits are infinite."""
+
+
+def field_of(run: Run) -> FittedField:
+    """The trained field of Gaussians of a run, of spectra or other observations.
+
+    Raises:
+        InputError: a run of another model, or an unfinished one.
+    """
+    fitted = run.fitted
+    if not isinstance(fitted, FittedField) or fitted.field is None:
+        raise InputError(f"{run.folder}: a run of {run.config.model}, which has no Gaussians; give one of wrf-gs+")
+    return fitted
+
+
+def _log_carrier(run: Run, field: FittedField, frequency_hz: float | None) -> float | None:
+    known = field.form.carriers_hz
+    if known is None:
+        if frequency_hz is not None:
+            raise InputError(f"{run.folder}: its data have one carrier; omit --frequency")
+        return None
+    if frequency_hz is None or frequency_hz not in known:
+        raise InputError(f"{run.folder}: trained with {carriers_text(known)}; give one of them as --frequency HZ")
+    return field.predictor.graph.log_carrier(int(np.searchsorted(known, frequency_hz)))
+
+
+def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:
+    """Columns of a 3DGS file from n Gaussians for one transmitter, float32 [n] each.
+
+    Beside the properties of 3DGS: ``signal_re_<k>``, ``signal_im_<k>`` of each complex signal k of a Gaussian, and
+    under product blending ``attenuation_re``, ``attenuation_im``, the factor delta; the opacity is then 1 - abs(delta).
+    """
+    numbers = {name: np.array(getattr(gaussians, name), float) for name in ("position", "scale", "rotation", "signal")}
+    half = len(numbers["signal"]) // 2
+    signal = numbers["signal"][:half] + 1j * numbers["signal"][half:]
+    delta = None if gaussians.attenuation is None else np.array(gaussians.attenuation, float)
+    alpha = np.array(gaussians.opacity, float) if delta is None else 1 - np.hypot(*delta)
+    alpha = np.clip(alpha, OPAQUE, 1 - OPAQUE)
+    power = np.square(np.abs(signal)).sum(axis=0)
+    level_db = 10 * np.log10(np.maximum(power, np.finfo(float).tiny) / max(power.max(), np.finfo(float).tiny))
+    colour = (colormaps["viridis"](1 + level_db / RANGE_DB)[:, :3] - 0.5) / DEGREE_0
+    x, y, z, w = numbers["rotation"] / np.linalg.norm(numbers["rotation"], axis=0)
+    columns = dict(zip("xyz", numbers["position"], strict=True))
+    columns |= {f"n{axis}": np.zeros_like(alpha) for axis in "xyz"}
+    columns |= {f"f_dc_{k}": colour[:, k] for k in range(3)}
+    columns |= {"opacity": np.log(alpha) - np.log1p(-alpha)}
+    columns |= {f"scale_{k}": np.log(values) for k, values in enumerate(numbers["scale"])}
+    columns |= {f"rot_{k}": values for k, values in enumerate((w, x, y, z))}
+    for k, values in enumerate(signal):
+        columns |= {f"signal_re_{k}": values.real, f"signal_im_{k}": values.imag}
+    if delta is not None:
+        columns |= {"attenuation_re": delta[0], "attenuation_im": delta[1]}
+    return {name: values.astype(np.float32) for name, values in columns.items()}
+
+
+def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write the Gaussians of a run for one transmitter (`wrf_mi.exports.format.Write`).
+
+    Raises:
+        InputError: no Gaussians, a field that is trained on the uplink, or not one transmitter.
+    """
+    run = source.run
+    field, tx_pos_m = field_of(run), options.tx_pos_m
+    if field.form.features:
+        text = "its Gaussians depend on the uplink channel, not on a position"
+        raise InputError(f"{run.folder}: {text}; export --format field, which holds all parameters")
+    if tx_pos_m is None or len(tx_pos_m) != 1:
+        raise InputError(f"{run.folder}: its Gaussians depend on the transmitter; choose one by --tx X,Y,Z in metres")
+    log_carrier = _log_carrier(run, field, options.frequency_hz)
+    with dr.suspend_grad():
+        gaussians = field.predictor.gaussians(tx_pos_m, log_carrier)
+    columns = splat_columns(gaussians)
+    where = " ".join(f"{x:.9g}" for x in tx_pos_m[0])
+    comments = [
+        f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up",
+        f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest",
+        "signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)",
+    ]
+    write_ply(out, {"vertex": table(columns)}, comments)
+    return {"Gaussians": len(columns["x"]), "properties": len(columns)}

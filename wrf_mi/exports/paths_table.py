@@ -1,0 +1,151 @@
+"""Propagation paths as a table, CSV with one row for each path, and as a scenario of DeepMIMO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from ..core import InputError, Paths, Receiver
+from ..core.angles import FloatArray, azimuth_elevation, unit_vectors
+from ..core.antenna import UPRIGHT
+from ..core.files import atomic_file
+from ..datasets.folder_files import CsvTable, read_csv, write_csv
+from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
+from ..tracing.options import stated_kinds
+from .format import ExportOptions
+from .source import Source
+
+LETTERS = {1: "R", 2: "S", 4: "T", 8: "D"}
+"""Letters of the kinds of interaction: reflection, scattering, transmission, diffraction."""
+ANGLES = ("azimuth", "elevation")
+SEPARATOR = ";"
+"""Between the interactions, vertices and objects of a path."""
+
+
+def path_columns(traced: TraceResult) -> dict[str, Any]:
+    """Columns of the table of a trace, [p] each, see ``docs/export.md``."""
+    paths = traced.paths
+    hz = np.full(paths.n_tx, traced.frequency_hz) if traced.carriers_hz is None else traced.carriers_hz
+    rx_pos_m = np.stack([receiver.position_m for receiver in traced.receivers])
+    columns: dict[str, Any] = {"tx": paths.tx.tolist(), "rx": paths.rx.tolist()}
+    columns["receiver"] = [traced.receivers[index].name for index in paths.rx]
+    columns["frequency_hz"] = hz[paths.tx].tolist()
+    for name, values in (("tx", traced.tx_pos_m[paths.tx]), ("rx", rx_pos_m[paths.rx])):
+        columns |= {f"{name}_{axis}": column.tolist() for axis, column in zip("xyz", values.T, strict=True)}
+    columns |= {"gain_re": paths.gain.real.tolist(), "gain_im": paths.gain.imag.tolist()}
+    columns |= {"length_m": paths.length_m.tolist(), "delay_s": (paths.length_m / speed_of_light).tolist()}
+    for end in ("departure", "arrival"):
+        for name, radians in zip(ANGLES, azimuth_elevation(getattr(paths, end)), strict=True):
+            columns[f"{end}_{name}_deg"] = np.degrees(radians).tolist()
+    counts = paths.bounces
+
+    def joined(of: Callable[[int, int], str]) -> list[str]:
+        return [SEPARATOR.join(of(path, k) for k in range(count)) for path, count in enumerate(counts)]
+
+    columns["interactions"] = joined(lambda path, k: LETTERS[int(paths.interactions[path, k])])
+    # tolist gives Python's numbers, whose text reads back as the same number.
+    vertices = paths.vertices_m.astype(float).tolist()
+    columns["vertices_m"] = joined(lambda path, k: " ".join(map(repr, vertices[path][k])))
+    columns["objects"] = joined(lambda path, k: paths.object_names[paths.objects[path, k]])
+    return columns
+
+
+def _traced(source: Source, options: ExportOptions) -> TraceResult:
+    """Stored paths of a run, or paths of a scene that are traced now."""
+    given = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
+    if source.is_run:
+        more = {"--material": options.material, "--paths": options.kinds, "--depth": options.depth}
+        if stated := [name for name, value in (given | more).items() if value is not None]:
+            raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
+        return source.trace()
+    if lacking := [name for name, value in given.items() if value is None]:
+        raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {', '.join(lacking)}")
+    assert options.tx_pos_m is not None
+    assert options.rx_pos_m is not None
+    assert options.frequency_hz is not None
+    chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
+    chosen |= {} if options.depth is None else {"max_depth": options.depth}
+    scene = open_scene(source.name, options.frequency_hz, material=options.material)
+    receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
+    return trace_paths(scene, options.tx_pos_m, receivers, TraceOptions(**chosen), options.progress)
+
+
+def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write paths of a run or a scene as CSV (`wrf_mi.exports.format.Write`).
+
+    Raises:
+        InputError: a run without stored paths, a scene without transmitters, receivers or frequency.
+    """
+    traced = _traced(source, options)
+    if not len(traced.paths):
+        raise InputError(f"{source.name}: no path from {traced.paths.n_tx} transmitters; nothing to write")
+    with atomic_file(out) as part:
+        write_csv(part, path_columns(traced))
+    return {"paths": len(traced.paths), "transmitters": traced.paths.n_tx, "receivers": traced.paths.n_rx}
+
+
+def write_scenario(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write the paths of a run as a scenario of DeepMIMO (`wrf_mi.exports.format.Write`)."""
+    traced = source.trace()
+    write_deepmimo(out, traced, options.replace)
+    return {"paths": len(traced.paths), "users": traced.paths.n_tx, "base stations": traced.paths.n_rx}
+
+
+def read_paths(file: str | Path) -> Paths:
+    """Paths of a table of `write_paths`.
+
+    Gains, lengths and vertices are those that were written; directions, which are stored as angles, to 1e-15. Numbers
+    of transmitters and receivers are those up to the last one with a path.
+
+    Raises:
+        InputError: a file that is missing, or has a column or a field less or another kind of value.
+    """
+    table = read_csv(Path(file))
+    tx, rx = (_whole(table, name) for name in ("tx", "rx"))
+    lists = {name: [_parts(text) for text in table.texts(name)] for name in ("interactions", "vertices_m", "objects")}
+    depth = max((len(parts) for parts in lists["interactions"]), default=0)
+    shape = len(tx), depth
+    interactions, objects = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32)
+    vertices = np.full((*shape, 3), np.nan)
+    names = list(dict.fromkeys(name for parts in lists["objects"] for name in parts))
+    codes = {letter: code for code, letter in LETTERS.items()}
+    for path, (kinds, points, met) in enumerate(zip(*lists.values(), strict=True)):
+        try:
+            for k, (kind, point, name) in enumerate(zip(kinds, points, met, strict=True)):
+                interactions[path, k], objects[path, k] = codes[kind], names.index(name)
+                vertices[path, k] = [float(number) for number in point.split()]
+        except (ValueError, KeyError):
+            raise InputError(
+                f"{file}, row {path + 1}: interactions, vertices and objects do not fit; restore it"
+            ) from None
+    return Paths(
+        tx,
+        rx,
+        table.numbers("gain_re") + 1j * table.numbers("gain_im"),
+        table.numbers("length_m"),
+        _directions(table, "departure"),
+        _directions(table, "arrival"),
+        interactions,
+        vertices,
+        objects,
+        tuple(names),
+        int(tx.max(initial=-1)) + 1,
+        int(rx.max(initial=-1)) + 1,
+    )
+
+
+def _parts(text: str) -> list[str]:
+    return text.split(SEPARATOR) if text else []
+
+
+def _whole(table: CsvTable, name: str) -> NDArray[np.int64]:
+    return table.numbers(name).astype(np.int64)
+
+
+def _directions(table: CsvTable, end: str) -> FloatArray:
+    return unit_vectors(*(np.radians(table.numbers(f"{end}_{name}_deg")) for name in ANGLES))

@@ -1,0 +1,172 @@
+"""Scenes as a folder for plain Sionna RT and Mitsuba, and as one mesh with materials."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from wrf_mi_scenes.mitsuba_xml import COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
+
+from ..core import InputError
+from ..core.angles import FloatArray
+from ..core.files import atomic_folder, write_atomically
+from ..core.types import IntArray
+from ..tracing.corrected_scene import check_materials
+from ..tracing.materials import conductivity_exponent, in_itu_range, set_frequency
+from ..tracing.scenes import load_scene
+from ..tracing.surfaces import scene_surfaces
+from .format import ExportOptions
+from .ply import table, write_ply
+from .source import Source
+
+XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From z up to y up, as glTF has it."""
+RGB = tuple(enumerate(("red", "green", "blue")))
+
+
+@dataclass(frozen=True)
+class Part:
+    """A surface of a scene: its name, its radio material, and its mesh."""
+
+    name: str
+    material: str
+    vertices_m: FloatArray
+    faces: IntArray
+
+
+def _parts(scene: Any) -> list[Part]:
+    """Surfaces of a ``sionna.rt.Scene``; corners that coincide are one vertex."""
+    surfaces, parts = scene_surfaces(scene), []
+    for index, name in enumerate(surfaces.names):
+        triangles = surfaces.triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]]
+        vertices, faces = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+        parts.append(Part(name, scene.objects[name].radio_material.name, vertices, faces.reshape(-1, 3)))
+    return parts
+
+
+def _loaded(source: Source, options: ExportOptions) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
+    scene, material = source.scene()
+    return load_scene(scene, material if options.material is None else options.material)
+
+
+def _colour_bytes(material: str) -> IntArray:
+    """Colour in Mitsuba's pictures, RGB in 0..255."""
+    return (255 * np.array(COLOURS.get(material, OTHER_COLOUR).split(), float)).round().astype(int)
+
+
+def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write a scene as a folder for plain Sionna RT (`wrf_mi.exports.format.Write`).
+
+    ``scene.xml`` opens with ``sionna.rt.load_scene``: materials of ITU-R P.2040 follow the frequency and have the
+    scene's thicknesses; materials with constants, and those that are not in the range of ITU-R P.2040, have the
+    constants of the carrier. ``mitsuba.xml`` has colours alone, for ``mi.load_file`` in any variant. ``materials.json``
+    lists the constants at the carrier, and exponents of conductivities.
+
+    Raises:
+        InputError: a carrier that is not known, a material that is no slab or not known there, or a folder that exists.
+    """
+    frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
+    if frequency_hz is None:
+        raise InputError(f"{source.name}: a scene; state the carrier of its materials' constants by --frequency HZ")
+    scene, stated_m, laws = _loaded(source, options)
+    set_frequency(scene, frequency_hz, stated_m, laws)
+    check_materials(scene)
+    parts, renamed = _parts(scene), dict[str, str]()
+    constants: dict[str, dict[str, float]] = {}
+    thickness_m: dict[str, float] = {}
+    listed: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(part.material for part in parts):
+        material = scene.radio_materials[name]
+        numbers = (material.relative_permittivity, material.conductivity, material.thickness)
+        values = dict(zip(PERFECT_CONSTANTS, (float(np.ravel(number)[0]) for number in numbers), strict=True))
+        itu = getattr(material, "itu_type", None)
+        if itu is not None and in_itu_range(itu, frequency_hz):
+            renamed[name] = name
+            thickness_m[renamed[name]] = values["thickness"]
+        else:
+            renamed[name] = name if itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
+            constants[renamed[name]] = values
+        listed[renamed[name]] = {
+            **values,
+            "conductivity_exponent": conductivity_exponent(material, frequency_hz),
+            "follows_frequency": renamed[name] in thickness_m,
+        }
+    materials = {part.name: renamed[part.material] for part in parts}
+    with atomic_folder(out, options.replace) as folder:
+        (folder / "meshes").mkdir()
+        for part in parts:
+            mesh = trimesh.Trimesh(part.vertices_m, part.faces, process=False)
+            mesh.export(folder / "meshes" / f"{part.name}.ply", vertex_normal=False)
+        write_atomically(folder / XML, scene_xml(materials, constants, thickness_m))
+        write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
+        facts = {"frequency_hz": frequency_hz, "materials": listed}
+        write_atomically(folder / FACTS, json.dumps(facts, indent=1) + "\n")
+    fixed = ", ".join(constants) or "none"
+    return {"surfaces": len(parts), "materials": len(listed), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
+
+
+def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write a scene as binary glTF 2.0 (`wrf_mi.exports.format.Write`).
+
+    A node and a mesh for each surface, named like it, and a material for each radio material, named like it. As glTF
+    has y up, coordinates x, y, z of the scene are x, z, -y there.
+    """
+    parts = _parts(_loaded(source, options)[0])
+    materials = {
+        name: trimesh.visual.material.PBRMaterial(
+            name=name,
+            baseColorFactor=[*_colour_bytes(name).tolist(), 255],
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+            doubleSided=True,
+        )
+        for name in dict.fromkeys(part.material for part in parts)
+    }
+    scene = trimesh.Scene()
+    for part in parts:
+        mesh = trimesh.Trimesh(trimesh.transform_points(part.vertices_m, Y_UP), part.faces, process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(material=materials[part.material])
+        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name)
+    write_atomically(out, bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=False)))
+    return _counts(parts)
+
+
+def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write a scene as one PLY mesh (`wrf_mi.exports.format.Write`).
+
+    Faces have colours, and the numbers of their ``material`` and ``surface``, whose names are in the header's comments.
+    """
+    parts = _parts(_loaded(source, options)[0])
+    names = list(dict.fromkeys(part.material for part in parts))
+    first = np.cumsum([0, *(len(part.vertices_m) for part in parts)])
+    count = [len(part.faces) for part in parts]
+    number = np.array([names.index(part.material) for part in parts])
+    vertices = np.concatenate([part.vertices_m for part in parts]).astype(np.float32)
+    faces = {
+        "vertex_indices": np.concatenate([part.faces + at for part, at in zip(parts, first, strict=False)]),
+        **{
+            key: np.repeat([_colour_bytes(part.material)[k] for part in parts], count).astype(np.uint8)
+            for k, key in RGB
+        },
+        "material": np.repeat(number, count),
+        "surface": np.repeat(np.arange(len(parts)), count),
+    }
+    integers = {key: v.astype(np.int32) if v.dtype.kind == "i" else v for key, v in faces.items()}
+    comments = ["metres, z up"]
+    comments += [f"material {k} {name}" for k, name in enumerate(names)]
+    comments += [f"surface {k} {part.name}" for k, part in enumerate(parts)]
+    write_ply(out, {"vertex": table(dict(zip("xyz", vertices.T, strict=True))), "face": table(integers)}, comments)
+    return _counts(parts)
+
+
+def _counts(parts: list[Part]) -> dict[str, Any]:
+    return {
+        "surfaces": len(parts),
+        "faces": sum(len(part.faces) for part in parts),
+        "materials": len({part.material for part in parts}),
+    }

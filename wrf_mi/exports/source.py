@@ -1,0 +1,116 @@
+"""What is exported: a run, a scene or a data set, recognised by its files or its name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wrf_mi_scenes import scenes
+
+from ..core import InputError
+from ..datasets.layouts import is_data
+from ..datasets.registry import KNOWN
+from ..models.ray_tracing import CORRECTED, PATHS
+from ..runs.folder import CONFIG
+from ..runs.run import Run, open_run
+from ..scene.folder import FACTS_FILE
+from ..tracing.result import TraceResult, load_trace
+from ..tracing.scenes import MESHES
+from .format import DATASET, RUN, SCENE
+
+if TYPE_CHECKING:
+    from ..core import Record
+
+
+@dataclass(frozen=True)
+class Source:
+    """Source of an export.
+
+    Attributes:
+        name: as given: a path or a name.
+        kinds: kinds that it may be, in the order of preference.
+    """
+
+    name: str
+    kinds: tuple[str, ...]
+
+    def of(self, kinds: Collection[str]) -> Source:
+        """The source as one of some kinds."""
+        return replace(self, kinds=tuple(kind for kind in self.kinds if kind in kinds)[:1])
+
+    @property
+    def is_run(self) -> bool:
+        """Whether it is a run folder."""
+        return self.kinds == (RUN,)
+
+    @property
+    def run(self) -> Run:
+        """The run; its data set is not read."""
+        return open_run(self.name)
+
+    def record(self, progress: bool) -> Record:
+        """The data set, traced here where it is a synthetic one."""
+        from ..synthetic import load_record
+
+        return load_record(self.name, progress=progress)
+
+    def trace(self) -> TraceResult:
+        """The stored paths of a run.
+
+        Raises:
+            InputError: a run that stores none.
+        """
+        path = Path(self.name) / PATHS
+        if not path.exists():
+            text = f"{self.name}: a run of {self.run.config.model} that stores no paths"
+            raise InputError(f"{text}; give one made by wrf-mi trace without --calibrate")
+        return load_trace(path)
+
+    def scene(self) -> tuple[str, str | None]:
+        """Scene file, folder or name, and the material of a bare mesh where a run states it.
+
+        Raises:
+            InputError: a run without a scene.
+        """
+        if not self.is_run:
+            return self.name, None
+        corrected, config = Path(self.name) / CORRECTED, self.run.config
+        if corrected.is_dir():
+            return str(corrected), None
+        if config.scene is None:
+            raise InputError(f"{self.name}: a run of {config.model} without a scene; give a scene, or a traced run")
+        return config.scene, config.material
+
+    def carrier_hz(self) -> float | None:
+        """Carrier of a run's data, Hz: the middle one where rows have several; None for a scene."""
+        from ..tasks.conditions import scene_carrier
+
+        return scene_carrier(self.run.problem.record) if self.is_run else None
+
+
+def find_source(name: str | Path) -> Source:
+    """Recognise a source.
+
+    A folder is a run if it holds ``config.yaml``, else a scene if it holds ``scene.yml``, else a data set. A file is a
+    scene or a data set by its ending.
+
+    Raises:
+        InputError: neither a path nor a known name.
+    """
+    path, text = Path(name), str(name)
+    if path.is_dir():
+        kind = RUN if (path / CONFIG).exists() else SCENE if (path / FACTS_FILE).exists() else DATASET
+        return Source(text, (kind,))
+    if path.is_file():
+        kinds = {SCENE: path.suffix.lower() in (".xml", *MESHES), DATASET: is_data(path)}
+    else:
+        kinds = {SCENE: text in scenes(), DATASET: text in {dataset.name for dataset in KNOWN}}
+    if not any(kinds.values()):
+        known = ", ".join(scenes())
+        ways = f"a run folder, a scene (a folder, XML, mesh, or of {known}) or a data set (`wrf-mi data list`)"
+        raise InputError(
+            f"{name}: {'a file of another kind' if path.exists() else 'no such file or name'}; give {ways}"
+        )
+    return Source(text, tuple(kind for kind, fits in kinds.items() if fits))

@@ -1,0 +1,275 @@
+"""Page of a comparison: one HTML file that needs no network, for laptops and telephones."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import platform
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from ..datasets.registry import KNOWN
+from ..tasks import TASKS
+from .compare_tables import (
+    BETTER,
+    COLUMNS,
+    DIFFERENCES,
+    WORSE,
+    Difference,
+    best_run,
+    common,
+    difference_rows,
+)
+from .repeat import changed_settings, command, known_config, model_words, stored_versions
+from .results import Results
+
+NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
+CONSTANT = ("dataset", "metric")
+"""Columns that are equal in a section, whose heading states them."""
+FIRST = ("run", "median", "mean", "common_mean")
+"""Columns that narrow screens show without scrolling."""
+
+STYLE = """
+:root { color-scheme: light; --line: #d5d9de; --soft: #f4f6f8; --ink: #1c2430; }
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 76rem; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.3rem; margin-top: 2.5rem; border-top: 2px solid var(--line);
+  padding-top: 1rem; } h3 { font-size: 1.05rem; margin: 1.8rem 0 0.4rem; }
+.scroll { overflow-x: auto; -webkit-overflow-scrolling: touch; }
+table { border-collapse: collapse; font-size: 0.875rem; }
+th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.6rem; text-align: left; vertical-align: top; }
+th { background: var(--soft); vertical-align: bottom; }
+th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer;
+  text-align: inherit; color: inherit; }
+th button::after { content: " \\2195"; color: #98a2b0; }
+th[aria-sort=ascending] button::after { content: " \\2191"; color: inherit; }
+th[aria-sort=descending] button::after { content: " \\2193"; color: inherit; }
+.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td:first-child { position: sticky; left: 0; background: #fff; min-width: 7rem; overflow-wrap: anywhere; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.2rem 1rem; margin: 0; }
+dt { font-weight: 600; } dd { margin: 0; overflow-wrap: anywhere; }
+.better { color: #0a6b2d; font-weight: 600; } .worse { color: #a11212; font-weight: 600; }
+pre { background: var(--soft); padding: 0.6rem; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 0.8rem; }
+img { max-width: 100%; height: auto; display: block; }
+.note { color: #4a5563; font-size: 0.9rem; margin: 0.3rem 0; }
+@media (max-width: 40rem) {
+  body { padding: 0.6rem; } dl { grid-template-columns: 1fr; gap: 0; } dd { margin-bottom: 0.4rem; }
+  img { max-width: none; width: var(--least); min-width: 100%; }
+}
+"""
+SCRIPT = """
+for (const table of document.querySelectorAll('table.sorts')) {
+  const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
+  heads.forEach((head, k) => head.firstElementChild.addEventListener('click', () => {
+    const down = head.getAttribute('aria-sort') === 'ascending', sign = down ? -1 : 1;
+    heads.forEach(other => other.removeAttribute('aria-sort'));
+    head.setAttribute('aria-sort', down ? 'descending' : 'ascending');
+    const of = row => row.cells[k].dataset.value ?? row.cells[k].textContent;
+    const number = head.classList.contains('n');
+    const order = (a, b) => {
+      const [x, y] = [of(a), of(b)];
+      if (x === '' || y === '') return (x === '') - (y === '');
+      return sign * (number ? x - y : x.localeCompare(y));
+    };
+    body.append(...[...body.rows].sort(order));
+  }));
+}
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Runs of a data set with their tables and pictures.
+
+    Attributes:
+        slug: name of the section in links, and beginning of its files' names.
+        runs: the runs.
+        scores: rows of the table of scores, by `COLUMNS`.
+        differences: paired differences.
+        pictures: file and heading of each picture.
+    """
+
+    slug: str
+    runs: Sequence[Results]
+    scores: Sequence[Mapping[str, Any]]
+    differences: Sequence[Difference]
+    pictures: Sequence[tuple[Path, str]]
+
+    @property
+    def title(self) -> str:
+        """Data set and task."""
+        return f"{_data_name(self.runs[0])}: {TASKS[self.runs[0].task].heading}"
+
+
+def page(sections: Sequence[Section], folder: Path) -> str:
+    """HTML of a comparison in a folder; the pictures must have been written."""
+    runs = [run for section in sections for run in section.runs]
+    count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
+    links = " · ".join(f'<a href="#{_text(one.slug)}">{_text(one.title)}</a>' for one in sections)
+    contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
+    made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    again = shlex.join(["wrf-mi", "compare", *(str(run.path) for run in runs), "--out", str(folder)])
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Comparison of runs</title>
+<style>{STYLE}</style>
+<h1>Comparison of {count}</h1>
+<p class="note">Made {made} by <code>{_text(again)}</code></p>
+{contents}
+{"".join(map(_section, sections))}
+<h2>Versions and machines</h2>
+{_versions(runs)}
+<script>{SCRIPT}</script>
+</html>
+"""
+
+
+def _section(section: Section) -> str:
+    task = TASKS[section.runs[0].task]
+    shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in CONSTANT}
+    scores = _table(shown, section.scores, NUMERIC)
+    gains = difference_rows(section.differences)
+    numeric = frozenset(("rows", "difference", "low", "high"))
+    images = "\n".join(_image(path, title) for path, title in section.pictures)
+    best = best_run(section.runs).name
+    rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
+    return f"""
+<h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
+{_facts(section.runs)}
+<h3>Models</h3>
+{_models(section.runs)}
+<h3>Scores</h3>
+<p class="note">{_text(task.label)}, {_better(section.runs[0])}. Click a heading to sort.</p>
+{scores}
+<h3>Paired differences</h3>
+<p class="note">Each run against {_text(rival)}its reference, on the test rows that both have: mean difference per row,
+positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of rows. {BETTER} and {WORSE}: the
+interval excludes zero, in all seeds; else a tie. Rows along a path resemble each other, and the interval is then too
+narrow.</p>
+{_table(DIFFERENCES, gains, numeric)}
+{images}
+<h3>Commands</h3>
+{_commands(section.runs)}
+"""
+
+
+def _data_name(run: Results) -> str:
+    return Path(run.dataset).name or "unknown data"
+
+
+def _better(run: Results) -> str:
+    return "higher is better" if TASKS[run.task].higher_is_better else "lower is better"
+
+
+def _facts(runs: Sequence[Results]) -> str:
+    """What was compared, on which rows."""
+    first, task = runs[0], TASKS[runs[0].task]
+    known = {dataset.name: dataset for dataset in KNOWN}.get(first.dataset)
+    origin = f"{first.dataset or 'unknown'}" + ("" if known is None else f" ({known.licence}; {known.origin})")
+    rows = dict.fromkeys(
+        f"{run.metrics['split']}: {run.metrics['n_train']} training rows, {run.metrics['n_test']} test rows"
+        for run in runs
+    )
+    count = len(first.receivers)
+    receivers = f"{count} receivers" if count > 1 else "1 receiver"
+    facts = {"data": origin, "task": f"{task.heading}, {receivers}"}
+    facts["score"] = f"{task.label}, {_better(first)}. {task.note}"
+    facts["rows"] = "; ".join(rows)
+    if len(runs) > 1:
+        keys = common(runs)
+        count = len({row for _, row in keys})
+        text = f"{count} test rows are common to all runs"
+        facts["common"] = text + (
+            "; pairs are compared on the rows that both have" if count else ", so means differ in rows"
+        )
+    facts["reference"] = "; ".join(dict.fromkeys(run.reference_name for run in runs)) + " (of the same training rows)"
+    scenes = dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene"))
+    if scenes:
+        facts["scene"] = "; ".join(scenes)
+    return "<dl>" + "".join(f"<dt>{key}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+
+
+def _models(runs: Sequence[Results]) -> str:
+    """Models in words, and what differs from their defaults."""
+    columns = {"run": "run", "model": "model", "settings": "settings that differ from the defaults", "scene": "scene"}
+    rows = []
+    for run in runs:
+        config = known_config(run.path)
+        if config is None:
+            rows.append({"run": run.name, "model": run.metrics["model"], "settings": "not stored", "scene": None})
+            continue
+        changed = ", ".join(f"{name}={value}" for name, value in changed_settings(config).items())
+        words = f"{config.model}: {model_words(config)}" + (", calibrated intervals" if config.intervals else "")
+        rows.append({"run": run.name, "model": words, "settings": changed or "none", "scene": config.scene})
+    return _table(columns, rows, frozenset())
+
+
+def _commands(runs: Sequence[Results]) -> str:
+    lines = []
+    for run in runs:
+        config = known_config(run.path)
+        lines.append(f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path))
+    return f"<pre>{_text(chr(10).join(lines))}</pre>"
+
+
+def _versions(runs: Sequence[Results]) -> str:
+    """Versions with which the runs were made, grouped, and the machine of this page."""
+    groups: dict[str, list[str]] = {}
+    for run in runs:
+        found = ", ".join(f"{name} {value}" for name, value in stored_versions(run.path).items())
+        groups.setdefault(found or "not stored", []).append(run.name)
+    here = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    facts = {", ".join(names): words for words, names in groups.items()} | {"this page": here}
+    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+
+
+def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
+    """Table that sorts by a click on a heading; columns without a value are left out."""
+    kept = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
+    head = "".join(
+        f'<th scope="col"{_class(key, numeric)}><button type="button">{_text(title)}</button></th>'
+        for key, title in kept.items()
+    )
+    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in kept) + "</tr>" for row in rows)
+    return (
+        f'<div class="scroll"><table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+    )
+
+
+def _class(key: str, numeric: frozenset[str]) -> str:
+    return ' class="n"' if key in numeric else ""
+
+
+def _cell(key: str, value: Any, numeric: frozenset[str]) -> str:
+    """A value with four significant digits, empty where unknown; verdicts are coloured."""
+    if value is None:
+        return f"<td{_class(key, numeric)}></td>"
+    if key == "verdict":
+        return f'<td class="{_text(str(value).partition(" ")[0])}">{_text(value)}</td>'
+    exact = f' data-value="{_text(value)}"' if key in numeric else ""
+    shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"<td{_class(key, numeric)}{exact}>{_text(shown)}</td>"
+
+
+def _image(path: Path, title: str) -> str:
+    content = path.read_bytes()
+    with Image.open(path) as picture:
+        width, height = picture.size
+    data = base64.b64encode(content).decode()
+    # On a telephone a wide picture keeps half its size, at which its texts are legible, and scrolls.
+    size = f'width="{width}" height="{height}" style="--least: {width // 2}px"'
+    image = f'<img src="data:image/png;base64,{data}" {size} alt="{_text(title)}">'
+    return f'<h3>{_text(title)}</h3>\n<div class="scroll">{image}</div>'
+
+
+def _text(value: Any) -> str:
+    return html.escape(str(value))

@@ -1,0 +1,225 @@
+"""Tables of a comparison: scores of runs and references, and paired differences on common rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.angles import FloatArray
+from ..tasks import TASKS
+from .repeat import known_config
+from .results import Results
+from .timing import Interval, bootstrap
+
+COLUMNS = {
+    "run": "run",
+    "model": "model",
+    "dataset": "data set",
+    "split": "split",
+    "seed": "seed",
+    "n_train": "training rows",
+    "n_test": "test rows",
+    "metric": "score",
+    "median": "median",
+    "mean": "mean",
+    "p10": "p10",
+    "p90": "p90",
+    "common_mean": "mean, common rows",
+    "inside_90": "inside 90 %",
+    "crps": "CRPS",
+    "ms_per_sample": "ms per sample",
+    "train_seconds": "training (s)",
+    "peak_memory_mb": "peak memory (MB)",
+}
+"""Columns of ``compare.csv`` and their headings on the page."""
+DIFFERENCES = {
+    "run": "run",
+    "against": "against",
+    "verdict": "verdict",
+    "difference": "difference",
+    "low": "95 % from",
+    "high": "to",
+    "rows": "common rows",
+}
+"""Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
+BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
+FEWEST = 2
+"""Least number of common rows of a difference with an interval."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Paired difference of a run and a run or reference, in favour of the first where it is positive.
+
+    Attributes:
+        run: name of the run.
+        against: name of the other run or of the reference.
+        rows: number of common rows.
+        interval: mean difference of the score per row with its 95 % interval; None: too few rows.
+        verdict: `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`.
+        seeds: number of seeds of which the verdict is.
+    """
+
+    run: str
+    against: str
+    rows: int
+    interval: Interval | None
+    verdict: str
+    seeds: int = 1
+
+
+def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
+    """Receiver and row of the observations that all runs score, with the same truth."""
+    first, rows = runs[0], [run.scored for run in runs]
+
+    def same(key: tuple[str, int]) -> bool:
+        truth = first.truth[rows[0][key]]
+        return all(
+            key in of and np.array_equal(run.truth[of[key]], truth, equal_nan=True)
+            for run, of in zip(runs[1:], rows[1:], strict=True)
+        )
+
+    return [key for key in rows[0] if same(key)]
+
+
+def common_means(runs: Sequence[Results]) -> dict[str, float]:
+    """Mean score over the observations that all runs score, by the runs' names; empty without any."""
+    keys = common(runs)
+    if not keys:
+        return {}
+    return {run.name: float(np.mean([run.score[of[key]] for key in keys])) for run in runs for of in [run.scored]}
+
+
+def best_run(runs: Sequence[Results]) -> Results:
+    """The run of the best mean score on common rows; of all its rows where there are none."""
+    task = TASKS[runs[0].task]
+    means = common_means(runs) or {run.name: run.metrics[task.block]["mean"] for run in runs}
+    return (max if task.higher_is_better else min)(runs, key=lambda run: means[run.name])
+
+
+def differences(runs: Sequence[Results]) -> list[Difference]:
+    """Each run against its reference and, of several runs, against the best one.
+
+    "Better" and "worse": the 95 % interval of the difference, resampled over test rows, excludes zero in all seeds; all
+    else is a tie. Runs that differ in their seed alone are seeds of one method.
+    """
+    best, methods = best_run(runs), [_method(run) for run in runs]
+    found: list[Difference] = []
+    for run, method in zip(runs, methods, strict=True):
+        seeds = [other for other, of in zip(runs, methods, strict=True) if of == method]
+        if run is not best:
+            rivals = [other for other, of in zip(runs, methods, strict=True) if of == methods[runs.index(best)]]
+
+            def rival_of(one: Results, rivals: list[Results] = rivals) -> Results:
+                return next((other for other in rivals if other.seed == one.seed), best)
+
+            if method == methods[runs.index(best)]:
+                found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
+            else:
+                found.append(_of_seeds(run, seeds, lambda one: (rival_of(one).name, _paired(one, rival_of(one)))))
+        found.append(_of_seeds(run, seeds, lambda one: (one.reference_name, _against_reference(one))))
+    return found
+
+
+def _of_seeds(
+    run: Results, seeds: Sequence[Results], paired: Callable[[Results], tuple[str, FloatArray]]
+) -> Difference:
+    each = {one.name: _of_rows(one, *paired(one)) for one in seeds}
+    words = {one.verdict for one in each.values()}
+    return replace(each[run.name], verdict=words.pop() if len(words) == 1 else TIE, seeds=len(seeds))
+
+
+def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
+    """Difference from the differences of rows, in favour of the run where positive."""
+    if len(rows) < FEWEST:
+        return Difference(run.name, against, len(rows), None, FEW)
+    interval = bootstrap(rows, np.mean)
+    verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
+    return Difference(run.name, against, len(rows), interval, verdict)
+
+
+def _paired(run: Results, other: Results) -> FloatArray:
+    ours, theirs = run.scored, other.scored
+    keys = common([run, other])
+    return _per_row(run, [key[1] for key in keys], [run.score[ours[k]] - other.score[theirs[k]] for k in keys])
+
+
+def _against_reference(run: Results) -> FloatArray:
+    known = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
+    change = [run.score[r, m] - run.reference_score[r, m] for r, m in known]
+    return _per_row(run, run.row[known[:, 1]].tolist(), change)
+
+
+def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatArray:
+    """Mean over the receivers of each row, since what they observe is not independent; positive is better."""
+    if not len(row):
+        return np.zeros(0)
+    _, which = np.unique(row, return_inverse=True)
+    sums = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
+    result: FloatArray = sums if TASKS[run.task].higher_is_better else -sums
+    return result
+
+
+def _method(run: Results) -> Any:
+    """What runs of several seeds have in common; runs without a configuration are methods of their own."""
+    config = known_config(run.path)
+    if config is None:
+        return run.name
+    settings = config.settings
+    if "seed" in config.entry.given:
+        settings = replace(settings, seed=0)
+    return repr(replace(config, seed=0, settings=settings))
+
+
+def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
+    """Rows of the table for a data set: each run, and each reference once."""
+    task = TASKS[runs[0].task]
+    means = common_means(runs)
+    named = [
+        (
+            {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
+            | {"run": run.name, "seed": run.seed, "common_mean": means.get(run.name)},
+            run.metrics[task.block],
+        )
+        for run in runs
+    ]
+    for name, (run, key) in references(runs).items():
+        kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
+        named.append((kept | {"run": name, "model": key}, run.metrics["reference"][key]))
+    shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
+    scores = ("median", "mean", "p10", "p90")
+    rows = [row | shared | {key: block.get(key) for key in scores} for row, block in named]
+    return [{key: row.get(key) for key in COLUMNS} for row in rows]
+
+
+def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
+    """Rows of the table of differences."""
+    return [
+        {
+            "run": one.run,
+            "against": one.against,
+            "rows": one.rows,
+            "difference": None if one.interval is None else one.interval.value,
+            "low": None if one.interval is None else one.interval.low,
+            "high": None if one.interval is None else one.interval.high,
+            "verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else ""),
+        }
+        for one in found
+    ]
+
+
+def references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
+    """A run and the key of each reference by name, once for runs with the same training and test rows."""
+    found: dict[str, tuple[Results, str]] = {}
+    for run in runs:
+        for key, scores in run.reference_scores.items():
+            known = (r.reference_scores[key] for r, k in found.values() if k == key)
+            if any(np.array_equal(scores, other, equal_nan=True) for other in known):
+                continue
+            name = f"{TASKS[run.task].references[key]}, {run.metrics['split']}"
+            found[f"{name} of {run.name}" if name in found else name] = run, key
+    return found
