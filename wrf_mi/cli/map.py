@@ -47,8 +47,8 @@ def map_command(a: Arguments) -> int:
     run = open_run(a.run)
     with Watch() as watch:
 
-        def on_progress(stage: str, fraction: float) -> None:
-            watch.on_progress(stage, fraction)
+        def on_progress(stage: str, fraction: float, progress: Any = None, /) -> None:
+            watch.on_progress(stage, fraction, progress)
             if watch.stop():
                 raise KeyboardInterrupt
 

@@ -84,7 +84,8 @@ def map_dataset(
     }
     data: dict[str, Any] = {}
     if isinstance(places, Grid):
-        dims, shape = ("y", "x"), (len(places.y_m), len(places.x_m))
+        dims: tuple[str, ...] = ("y", "x")
+        shape: tuple[int, ...] = (len(places.y_m), len(places.x_m))
         coordinates["x"] = "x", places.x_m, _metres("x of the transmitter") | {"axis": "X"}
         coordinates["y"] = "y", places.y_m, _metres("y of the transmitter") | {"axis": "Y"}
         height = _metres("z of the transmitter") | {"axis": "Z", "positive": "up"}

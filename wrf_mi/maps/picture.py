@@ -91,7 +91,8 @@ def _draw_plan(
     axes: Axes, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Sequence[FloatArray]
 ) -> None:
     x, y = dataset["x"].values, dataset["y"].values
-    axes.pcolormesh(x, y, values, shading="nearest", cmap=colours.cmap, norm=colours.norm, rasterized=True)
+    shades: Any = {"cmap": colours.cmap, "norm": colours.norm}
+    axes.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
     for lines in walls:
         if len(lines):
             axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))

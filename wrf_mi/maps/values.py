@@ -16,12 +16,12 @@ from ..core.angles import FloatArray
 from ..models import Inputs
 from ..receivers.spreads import PathStatistics
 from ..runs.run import Run
-from ..tasks import Task, task_of
+from ..tasks import task_of
 from ..training.session import OnProgress, quiet
 from .coverage import coverage_probability
 
 CHUNK_SIZE = 10_000
-"""Largest number of positions in a chunk; where paths are traced, of pairs of a position and a receiver."""
+"""Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
 CHUNK_BYTES = 1 << 28
 """Bytes of a chunk's observations, with the copies that models make of them."""
 VALUE_BYTES = 32
@@ -49,16 +49,6 @@ class Conditions:
     frequency_hz: float | None = None
 
 
-@dataclass(frozen=True)
-class _Levels:
-    """Levels in dB at m positions: of the prediction, and of its sides; statistics of paths."""
-
-    whole: Prediction
-    traced: FloatArray | None
-    learned: FloatArray | None
-    paths: PathStatistics | None
-
-
 def map_values(
     run: Run,
     positions_m: FloatArray,
@@ -83,7 +73,7 @@ def map_values(
     Raises:
         InputError: inputs that the model does not predict from.
     """
-    size = chunk_size or _chunk_size(run)
+    size = chunk_size or _chunk_size(run, len(conditions.headings_rad))
     found: Arrays = {}
     outside = _outside_solids(run, positions_m)
     with _each_warning_once():
@@ -101,10 +91,11 @@ def map_values(
     return found
 
 
-def _chunk_size(run: Run) -> int:
+def _chunk_size(run: Run, headings: int) -> int:
     values = int(np.prod(run.problem.record.observation.shape[2:]))
     size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * values))
-    return max(1, size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers)))
+    size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
+    return max(1, size // max(headings, 1))
 
 
 def _outside_solids(run: Run, positions_m: FloatArray) -> NDArray[np.bool_]:
@@ -120,42 +111,45 @@ def _outside_solids(run: Run, positions_m: FloatArray) -> NDArray[np.bool_]:
 
 def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:
     """Variables [m] at a receiver."""
-    task = task_of(run.problem.record)
-    levels = [_levels(run, task, inputs, receiver) for inputs in _inputs(positions_m, conditions)]
-    # The law of total variance: that of a heading, and between headings.
-    mean = np.mean([one.whole.mean for one in levels], axis=0)
+    task, count = task_of(run.problem.record), len(positions_m)
+    inputs = _inputs(positions_m, conditions)
+    run.check_inputs(inputs)
+    parts = run.fitted.decompose(inputs, receiver)
     added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0
-    found: dict[str, Any] = {"power_dbm": mean + added}
-    if levels[0].whole.std is not None:
-        variances = np.mean([np.square(one.whole.stated_std) for one in levels], axis=0)
-        found["power_std_db"] = np.sqrt(variances + np.var([one.whole.mean for one in levels], axis=0))
+
+    def of_headings(values: Any) -> FloatArray:
+        return np.asarray(values, float).reshape(count, -1)
+
+    whole = task.level(parts.whole)
+    means = of_headings(whole.mean)
+    found: dict[str, Any] = {"power_dbm": means.mean(axis=1) + added}
+    if whole.std is not None:
+        # The law of total variance: within a heading, and between headings.
+        variance = np.square(of_headings(whole.std)).mean(axis=1) + means.var(axis=1)
+        found["power_std_db"] = np.sqrt(variance)
         if conditions.threshold_db is not None:
             given = found["power_dbm"], found["power_std_db"], conditions.threshold_db
             found["coverage_probability"] = coverage_probability(*given)
-    if levels[0].traced is not None:
-        sides = {name: np.mean([getattr(one, name) for one in levels], axis=0) for name in ("traced", "learned")}
-        found |= {f"{name}_share": values + added for name, values in sides.items()}
-        found["share_difference_db"] = sides["traced"] - sides["learned"]
-    if levels[0].paths is not None:
-        for one in fields(PathStatistics):
-            found[one.name] = np.mean([getattr(part.paths, one.name) for part in levels], axis=0)
+    if parts.traced is not None and parts.learned is not None:
+        traced, learned = (
+            of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added
+            for side in (parts.traced, parts.learned)
+        )
+        found |= {"traced_share": traced, "learned_share": learned, "share_difference_db": traced - learned}
+    if parts.paths is not None:
+        found |= {one.name: of_headings(getattr(parts.paths, one.name)).mean(axis=1) for one in fields(PathStatistics)}
     if task.level_kind != "relative":
         found["path_gain_db"] = found["power_dbm"] - conditions.transmit_dbm
     return found
 
 
-def _inputs(positions_m: FloatArray, conditions: Conditions) -> Iterator[Inputs]:
-    count, hz = len(positions_m), conditions.frequency_hz
-    carriers = None if hz is None else np.full(count, hz)
-    for heading in conditions.headings_rad or (None,):
-        yield Inputs(positions_m, None if heading is None else np.full(count, heading), carriers_hz=carriers)
-
-
-def _levels(run: Run, task: Task, inputs: Inputs, receiver: int) -> _Levels:
-    run.check_inputs(inputs)
-    found = run.fitted.decompose(inputs, receiver)
-    sides = [None if side is None else task.level(Prediction(side)).mean for side in (found.traced, found.learned)]
-    return _Levels(task.level(found.whole), *sides, found.paths)
+def _inputs(positions_m: FloatArray, conditions: Conditions) -> Inputs:
+    """Each position with all headings one after the other, at the carrier."""
+    turns = np.asarray(conditions.headings_rad)
+    positions = np.repeat(positions_m, max(len(turns), 1), axis=0)
+    headings = np.tile(turns, len(positions_m)) if len(turns) else None
+    hz = conditions.frequency_hz
+    return Inputs(positions, headings, carriers_hz=None if hz is None else np.full(len(positions), hz))
 
 
 @contextmanager

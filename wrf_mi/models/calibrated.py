@@ -59,9 +59,9 @@ class FittedWithIntervals(Fitted):
         found = self.fitted.predict_rows(rows, receiver)
         return None if found is None else self._stated(found, self._record.tx_pos_m[rows], receiver)
 
-    def decompose(self, inputs: Inputs, receiver: int) -> Decomposition:
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Decomposition of the model's prediction, with calibrated standard deviations."""
-        found = self.fitted.decompose(inputs, receiver)
+        found = self.fitted.decompose(inputs, receiver, std)
         return replace(found, whole=self._stated(found.whole, inputs.tx_pos_m, receiver))
 
     @property

@@ -192,9 +192,13 @@ class Fitted(ABC):
             InputError: inputs that it cannot predict from.
         """
 
-    def decompose(self, inputs: Inputs, receiver: int) -> Decomposition:
-        """`predict`, with both sides and the paths of a model that has them."""
-        return Decomposition(self.predict(inputs, receiver))
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, for callers that need no standard deviations."""
+        return self.predict(inputs, receiver).mean
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """`predict`, with both sides and the paths of a model that has them; ``std``: whether deviations are needed."""
+        return Decomposition(self.predict(inputs, receiver) if std else Prediction(self.predict_mean(inputs, receiver)))
 
     @property
     def depends_on_heading(self) -> bool:

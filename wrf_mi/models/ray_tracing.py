@@ -133,7 +133,7 @@ class FittedTracing(Fitted):
         """
         return self.decompose(inputs, receiver).whole
 
-    def decompose(self, inputs: Inputs, receiver: int) -> Decomposition:
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Predictions of a receiver with statistics of its paths (`predict`)."""
         # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
         if self._last is None or receiver in self._last[3] or not _same(self._last[0], inputs):

@@ -78,10 +78,10 @@ class FittedField(Fitted):
         heading = inputs.tx_heading_rad if self.uses_heading else None
         return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading, inputs.carriers_hz))
 
-    def decompose(self, inputs: Inputs, receiver: int) -> Decomposition:
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Observations, and with a scene the paths' and the Gaussians' share of them."""
         if self._problem.scene is None:
-            return super().decompose(inputs, receiver)
+            return super().decompose(inputs, receiver, std)
         heading = inputs.tx_heading_rad if self.uses_heading else None
         found, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
         return Decomposition(Prediction(found["whole"]), found.get("traced"), found.get("learned"), paths)

@@ -101,7 +101,7 @@ class FittedHybrid(Fitted):
         self._check(inputs)
 
         def predicted(one: Fitted, some: IntArray) -> Decomposition:
-            return Decomposition(one.predict(inputs.rows(some), receiver))
+            return Decomposition(Prediction(one.predict_mean(inputs.rows(some), receiver)))
 
         return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
 
@@ -114,14 +114,14 @@ class FittedHybrid(Fitted):
 
         return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
 
-    def decompose(self, inputs: Inputs, receiver: int) -> Decomposition:
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """The prediction; the weighted means of the ingredients with the scene and of those without, each of weights
         of sum one; and the traced paths of the first ingredient that knows them, where it has a weight.
         """
         self._check(inputs)
 
         def decomposed(one: Fitted, some: IntArray) -> Decomposition:
-            return one.decompose(inputs.rows(some), receiver)
+            return one.decompose(inputs.rows(some), receiver, std=False)
 
         return self._mixed(inputs.tx_pos_m, receiver, decomposed, sides=True)
 
