@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from .core import BackendError, InputError, Receiver, Record, Split
     from .core.settings import with_settings
     from .datasets import fetch, make_splits
+    from .maps.api import radio_map
+    from .maps.coverage import run_reliability
+    from .maps.dataset import write_map
     from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .runs.compare import compare
     from .runs.figures import spectrum_table
@@ -47,11 +50,14 @@ _HOME = {
     "make_splits": "datasets",
     "open_run": "runs.api",
     "predict_to_file": "runs.api",
+    "radio_map": "maps.api",
     "resume": "runs.api",
+    "run_reliability": "maps.coverage",
     "scene_view": "runs.scene_view",
     "spectrum_table": "runs.figures",
     "train": "runs.api",
     "with_settings": "core.settings",
+    "write_map": "maps.dataset",
 }
 
 __all__ = [
@@ -74,11 +80,14 @@ __all__ = [
     "make_splits",
     "open_run",
     "predict_to_file",
+    "radio_map",
     "resume",
+    "run_reliability",
     "scene_view",
     "spectrum_table",
     "train",
     "with_settings",
+    "write_map",
 ]
 
 

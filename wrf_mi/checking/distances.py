@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core import Record
+from ..core import Prediction, Record
 from ..core.angles import FloatArray
+from ..tasks import task_of
 from .placements import other_plans
 from .units import Found, distances_m
 
@@ -46,11 +47,8 @@ def distance_law(record: Record) -> Found:
 
 def levels_db(record: Record) -> FloatArray:
     """Received power [n_rx, n] in dB, NaN where nothing was received."""
-    if record.task == "rssi":
-        return np.asarray(record.observation, float)
-    power = np.square(np.abs(record.observation.astype(complex)))
-    mean = power.reshape(*power.shape[:2], -1).mean(axis=2)
-    return 10 * np.log10(np.where(mean > 0, mean, np.nan))
+    task = task_of(record)
+    return np.stack([task.level(Prediction(observed)).mean for observed in record.observation]).astype(float)
 
 
 def explained(levels: FloatArray, distance_m: FloatArray) -> tuple[float, float]:

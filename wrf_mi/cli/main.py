@@ -24,6 +24,7 @@ from . import (
     edit,
     evaluate,
     export,
+    map
     mesh,
     predict,
     sweep,
@@ -32,7 +33,7 @@ from . import (
 )
 from .options import Parser
 
-COMMANDS = (doctor, data, mesh, correct, edit, train, trace, sweep, evaluate, predict, compress, compare, export, bench, demo)
+COMMANDS = (doctor, data, mesh, correct, edit, train, trace, sweep, evaluate, predict, map, compress, compare, export, bench, demo)
 
 
 def build_parser() -> Parser:

@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import sys
+import time
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -66,6 +67,7 @@ class Watch:
         self._stage: str | None = None
         self._score = ""
         self._stop = False
+        self._begun = 0.0
 
     def __enter__(self) -> Watch:
         """Handle Ctrl-C."""
@@ -93,7 +95,8 @@ class Watch:
         new = stage != self._stage
         if new:
             self._stage, self._task, self._score = stage, None, ""
-        text = "" if progress is None else self._text(progress)
+            self._begun = time.perf_counter()
+        text = self._left(fraction) if progress is None else self._text(progress)
         if self._console.is_terminal:
             if self._task is None:
                 self._bar.start()  # not before: the tracer has a bar of its own
@@ -105,10 +108,20 @@ class Watch:
         elif progress is None and new:
             print(stage, file=sys.stderr, flush=True)
 
+    def _left(self, fraction: float) -> str:
+        """Time left of a stage that has gone on as fast as so far; empty at its start."""
+        if not 0 < fraction < 1:
+            return ""
+        return _minutes((time.perf_counter() - self._begun) * (1 - fraction) / fraction)
+
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
             rows = "validation rows" if p.held_out else "validation rows, now trained on"
             self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
         gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
-        minutes, seconds = divmod(int(p.left_s), 60)
-        return f"loss {p.loss:.4f}  {self._score}  {gaussians}{minutes}:{seconds:02d} left"
+        return f"loss {p.loss:.4f}  {self._score}  {gaussians}{_minutes(p.left_s)}"
+
+
+def _minutes(left_s: float) -> str:
+    minutes, seconds = divmod(int(left_s), 60)
+    return f"{minutes}:{seconds:02d} left"

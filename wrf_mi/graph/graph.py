@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -77,6 +77,8 @@ class Batch:
     carrier: Any | None = None
 
 
+Alone = Literal["traced", "learned"]
+"""One of both sides of a graph."""
 Report = Callable[[Mapping[str, Any], Batch], Any]
 """``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
 
@@ -288,6 +290,7 @@ class Graph:
         learned: bool = True,
         chunked: bool = False,
         surface: bool = True,
+        alone: Alone | None = None,
     ) -> Report:
         """Reports of a port as a function of parameters, for transmitters of a traced side.
 
@@ -297,19 +300,25 @@ class Graph:
             learned: with the learned side, where the graph has one.
             chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
             surface: with the Gaussians on surfaces, where the graph has some.
+            alone: report one of both sides alone, without an instrument's scaling of each report, so that the two
+                compare; the unit of the Gaussians is that beside the paths. None: both together.
         """
-        model, receiver = self.models[number], self.receivers[number // self.carriers]
+        model: Any = self.models[number]
+        receiver = self.receivers[number // self.carriers]
+        if alone is not None:
+            model = getattr(model, "unscaled", model)
         moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
             paths = None if side is None else side(params, batch.slots)
-            if self.field is None or not learned:
+            if self.field is None or not learned or alone == "traced":
                 return model(paths, None)
             here = receiver_pose(receiver, params, mi.Float) if moves else batch.pose
             gaussians = self.gaussians(params, batch, paths, chunked)
-            return model(paths, self.evaluation(gaussians, here, batch.plane, model.sphere, params))
+            signal = self.evaluation(gaussians, here, batch.plane, model.sphere, params)
+            return model(None if alone == "learned" else paths, signal)
 
         return report
 

@@ -1,1 +1,1 @@
-"""Maps of what a fitted model predicts over an area."""
+"""Radio maps of runs: values over grids and meshes, their files and pictures, and the reliability of coverage."""

@@ -16,6 +16,7 @@ from .held_out import HeldOut, distance_to_rows, held_out_predictions, hold_out_
 from .intervals import Intervals, expected_size, fit_intervals
 from .model import (
     Arrays,
+    Decomposition,
     Fitted,
     Inputs,
     Model,
@@ -57,6 +58,16 @@ class FittedWithIntervals(Fitted):
         """Stored predictions of the model with calibrated standard deviations."""
         found = self.fitted.predict_rows(rows, receiver)
         return None if found is None else self._stated(found, self._record.tx_pos_m[rows], receiver)
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Decomposition of the model's prediction, with calibrated standard deviations."""
+        found = self.fitted.decompose(inputs, receiver, std)
+        return replace(found, whole=self._stated(found.whole, inputs.tx_pos_m, receiver))
+
+    @property
+    def depends_on_heading(self) -> bool:
+        """As the model."""
+        return self.fitted.depends_on_heading
 
     def arrays(self) -> Arrays:
         """Arrays of the model and of the intervals."""

@@ -19,6 +19,7 @@ from ..core.antenna import AS_STATED
 from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..parallel import Scheduler
+from ..receivers.spreads import PathStatistics
 from ..training.session import FitSession
 
 Kind = TypeVar("Kind")
@@ -150,6 +151,24 @@ class Session(FitSession):
     progress: bool = False
 
 
+@dataclass(frozen=True)
+class Decomposition:
+    """A prediction for m transmitters and what it is made of.
+
+    Attributes:
+        whole: the prediction.
+        traced: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as
+            magnitudes in a common unit of both sides; NaN where they are not used. None: the model has one side.
+        learned: what the side without paths predicts, likewise.
+        paths: statistics of the traced paths; None: the model traces none.
+    """
+
+    whole: Prediction
+    traced: NDArray[Any] | None = None
+    learned: NDArray[Any] | None = None
+    paths: PathStatistics | None = None
+
+
 class Fitted(ABC):
     """A fitted model.
 
@@ -172,6 +191,19 @@ class Fitted(ABC):
         Raises:
             InputError: inputs that it cannot predict from.
         """
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, for callers that need no standard deviations."""
+        return self.predict(inputs, receiver).mean
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """`predict`, with both sides and the paths of a model that has them; ``std``: whether deviations are needed."""
+        return Decomposition(self.predict(inputs, receiver) if std else Prediction(self.predict_mean(inputs, receiver)))
+
+    @property
+    def depends_on_heading(self) -> bool:
+        """Whether predictions depend on the heading of the transmitter."""
+        return bool(self.uses_heading)
 
     @abstractmethod
     def arrays(self) -> Arrays:

@@ -31,6 +31,7 @@ from ..core.types import IntArray
 from ..datasets.observations import place_of
 from ..parallel import row_parts
 from ..receivers.instruments import Instrument
+from ..receivers.spreads import PathStatistics
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
@@ -45,7 +46,7 @@ from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField
 from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field
-from .model import Arrays, Fitted, Inputs, Model, Problem, Session
+from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
@@ -95,7 +96,7 @@ class FittedTracing(Fitted):
 
     def __init__(self, problem: Problem, arrays: Arrays, paths: Path) -> None:
         self._problem, self._arrays, self._paths = problem, arrays, paths
-        self._last: tuple[Inputs, NDArray[Any], set[int]] | None = None
+        self._last: tuple[Inputs, NDArray[Any], list[PathStatistics], set[int]] | None = None
         self._of_rows: tuple[IntArray, NDArray[Any]] | None = None
         self._offsets: Offsets | None = None
         if "offset_db" in arrays:
@@ -130,12 +131,17 @@ class FittedTracing(Fitted):
         Raises:
             InputError: a position inside a solid object.
         """
+        return self.decompose(inputs, receiver).whole
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Predictions of a receiver with statistics of its paths (`predict`)."""
         # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
-        if self._last is None or receiver in self._last[2] or not _same(self._last[0], inputs):
+        if self._last is None or receiver in self._last[3] or not _same(self._last[0], inputs):
             traced = self._tracer.trace(inputs.tx_pos_m, False, inputs.first_row, inputs.carriers_hz)
-            self._last = inputs, self._reported(traced), set()
-        self._last[2].add(receiver)
-        return Prediction(self._last[1][receiver])
+            statistics = [PathStatistics.of_receiver(traced.paths, index) for index in range(traced.paths.n_rx)]
+            self._last = inputs, self._reported(traced), statistics, set()
+        self._last[3].add(receiver)
+        return Decomposition(Prediction(self._last[1][receiver]), paths=self._last[2][receiver])
 
     def arrays(self) -> Arrays:
         """Numbers of rays and paths, duration of tracing, and offsets."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..core import InputError
+from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..models.ray_tracing import PATHS
 from ..tasks import TASKS
@@ -131,25 +131,17 @@ def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
     first = runs[0]
     aligned = [_aligned(run, indices) for run, indices in zip(runs, indices(runs), strict=True)]
-    maps = [first.truth, *aligned, first.reference]
+    maps, task = [first.truth, *aligned, first.reference], TASKS[first.task]
     rows = [
-        (name, [None if values is None else _power_db(values[r]) for values in maps])
+        (name, [None if values is None else task.level(Prediction(values[r])).mean for values in maps])
         for r, name in enumerate(first.receivers)
     ]
-    quantity = TASKS[first.task].quantity
+    quantity = task.quantity
     if not np.isfinite(first.tx_pos_m).all():
         heading = f"Power at each receiver over the test rows of {first.name}"
         return heading, figures.row_table(rows, _columns(runs), first.row, quantity)
     heading = f"Power at each receiver over the test positions of {first.name}"
     return heading, figures.position_table(rows, _columns(runs), first.tx_pos_m, quantity)
-
-
-def _power_db(values: np.ndarray) -> np.ndarray:
-    """RSSI unchanged; the power of channel coefficients, summed over antennas and subcarriers, in dB."""
-    if not np.iscomplexobj(values):
-        return values
-    power = np.square(np.abs(values)).reshape(len(values), -1).sum(axis=-1)
-    return 10 * np.log10(np.where(power > 0, power, np.nan))
 
 
 def _aligned(run: Results, positions: np.ndarray) -> np.ndarray | None:

@@ -51,6 +51,7 @@ class Results:
             [n_rx, m, antennas, subcarriers].
         truth: observations of the same shape; NaN where nothing was received.
         references: reference predictions of the same shape by name (`wrf_mi.tasks.Task.references`).
+        std: stated standard deviations of the predictions, of the same shape and real; None: none are stated.
         validation: pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without
             folds.
     """
@@ -67,6 +68,7 @@ class Results:
     prediction: Observations
     truth: Observations
     references: dict[str, Observations]
+    std: NDArray[np.float32] | None
     validation: dict[str, list[tuple[float, float]]]
 
     @cached_property
@@ -130,6 +132,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
         prediction=arrays["prediction"],
         truth=arrays["truth"],
         references={key: arrays[reference_key(key)] for key in references},
+        std=arrays.get("std"),
         validation={fold: points for fold, points in curves.items() if points},
     )
 
@@ -173,12 +176,13 @@ def _read_metrics(path: Path) -> dict[str, Any]:
 
 
 def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict[str, Any]:
-    observed = ("prediction", "truth", *map(reference_key, references))
+    observed = ["prediction", "truth", *map(reference_key, references)]
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
     absent = [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]
     if absent:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
+    observed += ["std"] if "std" in stored else []
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
     names = stored["receiver_name"]
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())

@@ -43,7 +43,7 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     if field is not None:
         cloud = _cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
     return draw_scene(
-        _surfaces_of(scene),
+        scene_parts(scene),
         paths=replace(paths, tx=np.zeros_like(paths.tx), n_tx=1),
         transmitters_m=transmitter,
         receivers_m=[receiver.position_m for receiver in found.receivers],
@@ -52,7 +52,7 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     )
 
 
-def _surfaces_of(scene: Any) -> list[Surface]:
+def scene_parts(scene: Any) -> list[Surface]:
     """Objects of a ``sionna.rt.Scene`` as surfaces; the kind is the prefix of the name, else ``other``."""
     faces = scene_surfaces(scene)
     surfaces = []

@@ -233,6 +233,13 @@ def _draw_slant(
     axes.grid(False)
 
 
+def cut_lines(surface: Surface, height_m: float) -> FloatArray:
+    """Horizontal cut of a surface at a height: lines [n, 2, 2] in plan, metres; none where it is not met."""
+    mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+    cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height_m])
+    return np.asarray(cut, float).reshape(-1, 2, 3)[..., :2]
+
+
 def _draw_plan(
     axes: Axes, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
 ) -> None:
@@ -246,13 +253,10 @@ def _draw_plan(
                 PolyCollection(list(triangles), facecolors=[light], edgecolors="none", antialiased=False, zorder=1)
             )
             continue
-        mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-        cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, level])
+        cut = cut_lines(surface, level)
         if len(cut):
             edge = tuple(0.6 * c for c in to_rgb(colour))
-            axes.add_collection(
-                LineCollection(list(cut[..., :2]), colors=[edge], linewidths=2.2, capstyle="round", zorder=3)
-            )
+            axes.add_collection(LineCollection(list(cut), colors=[edge], linewidths=2.2, capstyle="round", zorder=3))
     size = np.maximum(high - low, 0.1)[:2]
     margin = 0.06 * size.max()
     axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Record
+from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
 from ..receivers.instruments import ChannelInstrument
+from .levels import level_of_amplitudes
 from .scores import cea_db
 from .task import Task, carrier_hz
 
@@ -24,6 +25,7 @@ class Csi(Task):
     receiver = receiver_with_scene = "csi"
     from_uplink = "copy of the uplink"
     heading, quantity = "channel coefficients", "power (dB)"
+    level_kind, level_note = "gain", "mean of |h|^2 over antennas and subcarriers, in the unit of the data"
     note = (
         "CEA is the channel estimation accuracy, -10 log10 of the relative squared error over a sample's antennas "
         "and subcarriers; the blend mixes the four nearest training rows by inverse squared distance; the copy of the "
@@ -39,6 +41,11 @@ class Csi(Task):
         from .losses import squared_error
 
         return squared_error(prediction, truth)
+
+    def level(self, prediction: Prediction) -> Prediction:
+        """Channel gain: mean power of the coefficients over antennas and subcarriers (`level_of_amplitudes`)."""
+        shape = prediction.mean.shape[1:]
+        return level_of_amplitudes(prediction, np.full(shape, 1 / max(int(np.prod(shape)), 1)))
 
     def unit(self, observed: NDArray[Any]) -> float:
         """Root mean square of a receiver's channels: far and near receivers then have equal weight."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import Record
+from ..core import Prediction, Record
 from ..core.angles import FloatArray
 from ..receivers.instruments import PowerInstrument
 from .scores import abs_error_db
@@ -23,6 +23,7 @@ class Rssi(Task):
     # Best of 0 to 1.6 m in a tenfold cross-validation, in the order of time, on flat-ble's training run.
     neighbours, softening_m = 100, 0.4
     heading, quantity = "received signal strength", "RSSI (dBm)"
+    level_kind, level_note = "power", "received power as the receiver reports it"
     note = (
         "The absolute error in dB counts rows that were received; the blend mixes the 100 nearest training rows "
         "that the same receiver received by inverse squared distance, 0.4 m added."
@@ -31,6 +32,10 @@ class Rssi(Task):
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Absolute error (`wrf_mi.tasks.scores.abs_error_db`)."""
         return abs_error_db(prediction, truth)
+
+    def level(self, prediction: Prediction) -> Prediction:
+        """The received power in dBm itself."""
+        return prediction
 
     def unit(self, observed: NDArray[Any]) -> float:
         """Ten decibels: errors are then of the size that the learning rates expect."""

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Record
-from ..core.angles import FloatArray
+from ..core import InputError, Prediction, Record
+from ..core.angles import FloatArray, solid_angles
 from ..receivers.instruments import SpectrumInstrument
+from .levels import level_of_amplitudes
 from .mixtures import MixtureScores, ssim_mixtures
 from .scores import ssim
 from .task import Task, carrier_hz
@@ -23,6 +24,12 @@ class Spectrum(Task):
     axes, image = 2, True
     receiver, receiver_with_scene = "pixel", "array"
     heading, quantity = "spatial spectra", "grey"
+    level_kind = "relative"
+    level_note = (
+        "mean of the squared grey values over the solid angle of the upper hemisphere, relative to a spectrum of ones; "
+        "spectra are scaled to their own maximum, so this states how much of the sky the signal arrives from, not how "
+        "strong it is"
+    )
     note = (
         "SSIM is scikit-image's structural similarity with a data range of one; the blend mixes the four nearest "
         "training spectra by inverse squared distance."
@@ -37,6 +44,12 @@ class Spectrum(Task):
         from .losses import spectrum_loss
 
         return spectrum_loss(prediction, truth, batch, shape[0], shape[1], ssim_weight)[0]
+
+    def level(self, prediction: Prediction) -> Prediction:
+        """Mean power over the solid angle: greys are magnitudes of a beam former (`level_of_amplitudes`)."""
+        height, width = prediction.mean.shape[1:]
+        weight = solid_angles(height, width)
+        return level_of_amplitudes(prediction, weight / weight.sum())
 
     def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
         """Structural similarity on windows that do not overlap (`wrf_mi.tasks.mixtures.ssim_mixtures`)."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Container
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Record
+from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
 from ..receivers.instruments import Instrument
 from .mixtures import MixtureScores, mixture_scores
@@ -37,6 +37,9 @@ class Task(ABC):
         axes: number of axes of one observation, at one receiver and row.
         more_axes: number of optional further axes (antennas) of an observation.
         image: whether an observation is shown as an image; else its level is drawn over positions.
+        level_kind: what `level` states: ``"power"`` received, dBm; ``"gain"`` of the channel, dB; or ``"relative"``,
+            dB without a common unit.
+        level_note: what `level` states, in words.
         is_complex: whether observations are complex.
         receiver: name of the default receiver model (`wrf_mi.graph.receivers`).
         receiver_with_scene: name of the default receiver model beside the paths of a scene.
@@ -59,6 +62,8 @@ class Task(ABC):
     axes: ClassVar[int]
     more_axes: ClassVar[int] = 0
     image: ClassVar[bool] = False
+    level_kind: ClassVar[Literal["power", "gain", "relative"]] = "relative"
+    level_note: ClassVar[str] = ""
     is_complex: ClassVar[bool] = False
     receiver: ClassVar[str] = ""
     receiver_with_scene: ClassVar[str] = ""
@@ -86,6 +91,22 @@ class Task(ABC):
         Raises:
             InputError: the data lack positions, carrier or array.
         """
+
+    def level(self, prediction: Prediction) -> Prediction:
+        """Level of predictions or observations of one receiver, for maps (`level_kind`); a single number is its own.
+
+        Args:
+            prediction: mean [m, ...] and, where stated, standard deviation.
+
+        Returns:
+            Decibels [m], NaN where nothing was received, and their standard deviation where it is stated.
+
+        Raises:
+            InputError: the task defines no level.
+        """
+        if not self.axes:
+            return prediction
+        raise InputError(f"task {self.name}: defines no level of an observation, so there is nothing to map")
 
     def check(self, record: Record) -> None:  # noqa: B027 - most tasks have nothing to check
         """Refuse a record with inconsistent parts.

@@ -31,6 +31,7 @@ from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..gaussians.footprint import Pose
 from ..gaussians.recurrence import times
+from ..receivers.spreads import PathStatistics
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
 from .devices import NEAREST_M
@@ -268,6 +269,16 @@ class TracedField:
     def pose(self, parameters: Mapping[str, Any], float_type: Any = mi.Float) -> Pose:
         """Corrected pose of the receiver, for Gaussians."""
         return receiver_pose(self.receiver, parameters, float_type)
+
+    def statistics(self, parameters: Mapping[str, Any]) -> PathStatistics:
+        """Statistics of each transmitter's paths with the given parameters but the instrument's gain."""
+        with dr.suspend_grad():
+            paths = self({name: values for name, values in parameters.items() if name != self.gain_name})
+            gain, length_m, arrival = dr.detach((paths.gain, paths.length_m, paths.arrival))
+        power = np.square(gain[0].numpy()) + np.square(gain[1].numpy())
+        world = np.stack([part.numpy() for part in arrival], axis=-1) @ self.receiver.to_world.T
+        transmitter = np.repeat(np.arange(len(self)), self._each)
+        return PathStatistics.of_paths(transmitter, len(self), power, length_m.numpy(), world)
 
     @property
     def interactions(self) -> Interactions:

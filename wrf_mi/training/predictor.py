@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -25,8 +25,9 @@ from ..gaussians.chunks import CHUNK_SIZE
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import Gaussians
 from ..gaussians.tiles import Plane, perception_plane
-from ..graph.graph import Batch, Field, Graph
+from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
+from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
 from .static_operator import StaticOperator
@@ -148,14 +149,61 @@ class Predictor:
         if not len(tx_pos_m):
             return self._reported(tx_pos_m, receiver * self.graph.carriers)
         found, order = list[NDArray[Any]](), list[IntArray]()
+        for rows, predictor, port, side in self._sides(tx_pos_m, receiver, heading_rad, carriers_hz):
+            found.append(predictor._reported(tx_pos_m[rows], port, side))
+            order.append(rows)
+        return np.concatenate(found)[np.argsort(np.concatenate(order))]
+
+    def _sides(
+        self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
+    ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
+        """Groups of positions: their numbers, predictor and port, and traced side."""
         for rows in self._searched_together(tx_pos_m, carriers_hz):
             turned, carriers = (None if part is None else part[rows] for part in (heading_rad, carriers_hz))
             sides = self.graph.trace(tx_pos_m[rows], receiver, turned, carriers, self._params)
             for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
-                predictor, port = self._at_carrier(carrier_hz, receiver)
-                found.append(predictor._reported(tx_pos_m[rows[which]], port, side))
-                order.append(rows[which])
-        return np.concatenate(found)[np.argsort(np.concatenate(order))]
+                yield rows[which], *self._at_carrier(carrier_hz, receiver), side
+
+    def decompose(
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        tx_heading_rad: FloatArray | None = None,
+        carriers_hz: FloatArray | None = None,
+    ) -> tuple[dict[str, NDArray[Any]], PathStatistics]:
+        """Reports with a scene's paths, by sides, and statistics of the paths, from one search.
+
+        Arguments as those of a call with finite positions.
+
+        Returns:
+            ``whole`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.report`), [m, ...], NaN where Gaussians
+            are out of reach; and statistics of the paths before the instrument's gain.
+        """
+        turned = self._headings(tx_heading_rad, len(tx_pos_m))
+        self.graph.check(tx_pos_m)
+        reports, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
+        for rows, predictor, port, side in self._sides(tx_pos_m, receiver, turned, carriers_hz):
+            assert side is not None, "a graph without a scene has one side"
+            here = tx_pos_m[rows]
+            reports.append({"whole": predictor._reported(here, port, side)})
+            if self._field is not None:
+                reports[-1] |= {alone: predictor._of_one_side(here, port, side, alone) for alone in get_args(Alone)}
+            statistics.append(side.statistics(self._params))
+            order.append(rows)
+        back = np.argsort(np.concatenate(order))
+        whole = {name: np.concatenate([part[name] for part in reports])[back] for name in reports[0]}
+        return whole, joined(statistics).rows(back)
+
+    def _of_one_side(self, tx_pos_m: FloatArray, port: int, side: TracedField, alone: Alone) -> NDArray[Any]:
+        """Reports of one side alone, NaN where Gaussians are out of reach."""
+        weight = None if self.reach is None else self.reach.weight(tx_pos_m, port // self.graph.carriers)
+        used = np.arange(len(tx_pos_m))
+        if alone == "learned" and weight is not None:
+            used = np.flatnonzero(weight)
+        found = self.of_side(tx_pos_m[used], port, side, used, None if weight is None else weight[used], alone)
+        whole = np.full((len(tx_pos_m), *found.shape[1:]), np.nan, found.dtype)
+        whole[used] = found
+        return whole
 
     def _searched_together(self, tx_pos_m: FloatArray, carriers_hz: FloatArray | None) -> list[IntArray]:
         """Rows of positions [m, 3] in groups, those of one position at several carriers in the same."""
@@ -187,10 +235,11 @@ class Predictor:
         side: TracedField | None,
         slots: IntArray | None,
         weight: NDArray[Any] | None,
+        alone: Alone | None = None,
     ) -> Any:
         """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
         learned = side is None or weight is None or bool(np.any(weight))
-        report = self.graph.report(receiver, side, learned)
+        report = self.graph.report(receiver, side, learned, alone=alone)
         return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight)
 
     def _where(self, port: int) -> tuple[int, Pose, Plane, float | None]:
@@ -204,6 +253,7 @@ class Predictor:
         side: TracedField | None,
         slots: IntArray,
         weight: NDArray[Any] | None,
+        alone: Alone | None = None,
     ) -> NDArray[Any]:
         """Predictions for transmitters whose paths are known.
 
@@ -213,6 +263,7 @@ class Predictor:
             side: its traced side, or None.
             slots: rows of the traced side [m].
             weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
+            alone: one of both sides (`Graph.report`); None: both.
 
         Returns:
             Predictions as of `__call__`.
@@ -220,7 +271,7 @@ class Predictor:
 
         def found(part: slice) -> Any:
             weights = None if weight is None else weight[part]
-            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weights)
+            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weights, alone)
 
         return self._in_parts(len(tx_pos_m), receiver, found)
 

@@ -180,6 +180,18 @@ def test_unknown_heading_is_averaged_over() -> None:
     assert (average.std > turns[0].std + 1).all()
 
 
+@pytest.mark.parametrize("repeated", [True, False])
+def test_mean_alone_equals_that_with_deviations(repeated: bool) -> None:
+    record = made(200, noise_db=1.0, body_db=6.0)
+    model = fit_rssi(record, np.arange(200), None, FAST)
+    assert record.tx_heading_rad is not None
+    position, heading = record.tx_pos_m[:40], record.tx_heading_rad[:40]
+    if repeated:
+        position, heading = np.repeat(position, 4, axis=0), np.tile(heading[:4], 40)
+    for turn in (heading, None):
+        np.testing.assert_allclose(model.predict_mean(position, 1, turn), model.predict(position, 1, turn).mean)
+
+
 def test_model_is_restored_from_arrays() -> None:
     record = made(80, noise_db=2.0)
     record.observation[1, ::3] = np.nan

@@ -30,7 +30,7 @@ from ...training.reach import Reach
 from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
-from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, keyed, under
+from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
@@ -77,6 +77,14 @@ class FittedField(Fitted):
         """Observations of the receiver of that index, [m, ...]."""
         heading = inputs.tx_heading_rad if self.uses_heading else None
         return Prediction(self.predictor(inputs.tx_pos_m, receiver, inputs.uplink, heading, inputs.carriers_hz))
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Observations, and with a scene the paths' and the Gaussians' share of them."""
+        if self._problem.scene is None:
+            return super().decompose(inputs, receiver, std)
+        heading = inputs.tx_heading_rad if self.uses_heading else None
+        found, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
+        return Decomposition(Prediction(found["whole"]), found.get("traced"), found.get("learned"), paths)
 
     def arrays(self) -> Arrays:
         """Parameters, form of the observations, antennas, receivers and reach."""

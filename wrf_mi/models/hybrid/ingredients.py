@@ -66,6 +66,11 @@ def from_uplink(name: str) -> bool:
     return MODELS[INGREDIENTS.get(name, Ingredient(name)).model].uplink == "required"
 
 
+def uses_scene(name: str) -> bool:
+    """Whether an ingredient is given the scene."""
+    return INGREDIENTS.get(name, Ingredient(name)).scene
+
+
 def problems(problem: Problem, names: Sequence[str] | None) -> dict[str, tuple[Model, Problem]]:
     """Entry and problem of each ingredient that serves the data.
 

@@ -37,6 +37,7 @@ from ..held_out import (
 from ..intervals import Intervals, expected_size, fit_intervals
 from ..model import (
     Arrays,
+    Decomposition,
     Fitted,
     Inputs,
     Model,
@@ -48,7 +49,7 @@ from ..model import (
     known_positions,
     under,
 )
-from .ingredients import from_uplink, most_trusted, problems, serving
+from .ingredients import from_uplink, most_trusted, problems, serving, uses_scene
 from .mixture import Mixture, choose, constant
 
 logger = logging.getLogger(__name__)
@@ -97,20 +98,50 @@ class FittedHybrid(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the ingredients' predictions, [m, ...], with its standard deviation."""
-        needed = [name for name in self.ingredients if inputs.uplink is None and from_uplink(name)]
-        if needed:
-            raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
-        return self._mixed(inputs.tx_pos_m, receiver, lambda one, some: one.predict(inputs.rows(some), receiver))
+        self._check(inputs)
+
+        def predicted(one: Fitted, some: IntArray) -> Decomposition:
+            return Decomposition(Prediction(one.predict_mean(inputs.rows(some), receiver)))
+
+        return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; ingredients use what they have stored."""
         record = self._problem.record
-        positions = record.tx_pos_m[rows]
-        return self._mixed(positions, receiver, lambda one, some: predicted_rows(one, record, rows[some], receiver))
+
+        def stored(one: Fitted, some: IntArray) -> Decomposition:
+            return Decomposition(predicted_rows(one, record, rows[some], receiver))
+
+        return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """The prediction; the weighted means of the ingredients with the scene and of those without, each of weights
+        of sum one; and the traced paths of the first ingredient that knows them, where it has a weight.
+        """
+        self._check(inputs)
+
+        def decomposed(one: Fitted, some: IntArray) -> Decomposition:
+            return one.decompose(inputs.rows(some), receiver, std=False)
+
+        return self._mixed(inputs.tx_pos_m, receiver, decomposed, sides=True)
+
+    @property
+    def depends_on_heading(self) -> bool:
+        """Whether an ingredient's predictions do."""
+        return any(fitted.depends_on_heading for fitted in self.ingredients.values())
+
+    def _check(self, inputs: Inputs) -> None:
+        needed = [name for name in self.ingredients if inputs.uplink is None and from_uplink(name)]
+        if needed:
+            raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
 
     def _mixed(
-        self, tx_pos_m: FloatArray, receiver: int, predict: Callable[[Fitted, IntArray], Prediction]
-    ) -> Prediction:
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        predict: Callable[[Fitted, IntArray], Decomposition],
+        sides: bool = False,
+    ) -> Decomposition:
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
         distance = distance_to_rows(self._problem.record, self._known, tx_pos_m, receiver)
@@ -118,16 +149,31 @@ class FittedHybrid(Fitted):
         weights = np.where(weights < NEGLIGIBLE, 0, weights)
         weights /= weights.sum(axis=1, keepdims=True)
         observed = self._problem.record.observation
-        mean = np.zeros((len(tx_pos_m), *observed.shape[2:]), np.result_type(observed, np.float64))
-        for fitted, weight in zip(self.ingredients.values(), weights.T, strict=True):
+        traced = np.array([uses_scene(name) for name in self.ingredients])
+        both = sides and traced.any() and not traced.all()
+        # The mean, or the share of each side, whose sum it is.
+        sums = np.zeros((1 + both, len(tx_pos_m), *observed.shape[2:]), np.result_type(observed, np.float64))
+        paths = None
+
+        def spread(weight: FloatArray) -> FloatArray:
+            return weight.reshape(-1, *[1] * (sums.ndim - 2))
+
+        for fitted, weight, with_scene in zip(self.ingredients.values(), weights.T, traced, strict=True):
             rows = np.flatnonzero(weight)
             if len(rows):
-                found = predict(fitted, rows).mean
-                mean[rows] += weight[rows].reshape(-1, *[1] * (mean.ndim - 1)) * found
+                found = predict(fitted, rows)
+                sums[int(both and with_scene), rows] += spread(weight[rows]) * found.whole.mean
+                if paths is None and found.paths is not None:
+                    paths = found.paths.placed(rows, len(tx_pos_m))
+        mean = sums.sum(axis=0) if both else sums[0]
         whole = Prediction(mean)
-        if self.intervals is None:
-            return whole
-        return self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance)
+        if self.intervals is not None:
+            whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance)
+        if not both:
+            return Decomposition(whole, paths=paths)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            learned, scene = (sums[k] / spread(weights[:, traced == k].sum(axis=1)) for k in (0, 1))
+        return Decomposition(whole, scene, learned, paths)
 
     def arrays(self) -> Arrays:
         """Weights, intervals, training rows, and the arrays of the ingredients."""

@@ -106,6 +106,11 @@ class ByReceiver(Fitted):
 
         return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
 
+    @property
+    def depends_on_heading(self) -> bool:
+        """Whether the models use headings."""
+        return self.heading
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of all models, use of headings, and carriers."""
         arrays = {HEADING: np.asarray(self.heading)}

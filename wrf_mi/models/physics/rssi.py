@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
@@ -109,10 +109,27 @@ class RssiPhysics(PhysicsModel):
         """Whether the training rows had headings."""
         return self.field.headings
 
+    def predict_mean(
+        self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
+    ) -> NDArray[Any]:
+        """The mean of `predict` in a fraction of its time: variances take the most of that."""
+        positions, index, heading = self._checked(tx_pos_m, receiver, tx_heading_rad)
+        mean = np.empty(len(positions))
+        for begin in range(0, len(positions), self.chunk_size):
+            rows = slice(begin, begin + self.chunk_size)
+            headings = self._headings(len(positions[rows]), None if heading is None else heading[rows])
+            means = [self.field.mean(Poses(positions[rows], turn), index) for turn in headings]
+            mean[rows] = np.mean(means, axis=0) + self.shift_db
+        return mean
+
+    def _headings(self, count: int, heading_rad: FloatArray | None) -> list[FloatArray | None]:
+        """Headings that predictions are averaged over: the given ones, or several where they count and are unknown."""
+        if heading_rad is None and self.uses_heading:
+            return [np.full(count, turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
+        return [heading_rad]
+
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
-        headings = [heading_rad]
-        if self.uses_heading and heading_rad is None:
-            headings = [np.full(len(tx_pos_m), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
+        headings = self._headings(len(tx_pos_m), heading_rad)
         means, variances = zip(*(self.field.predict(Poses(tx_pos_m, h), receiver) for h in headings), strict=True)
         variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
         return np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)

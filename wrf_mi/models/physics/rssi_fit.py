@@ -99,6 +99,10 @@ class PooledProcess:
         mean = basis @ self.beta + cross @ self._weights[receiver]
         return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
 
+    def weights(self, receiver: int) -> tuple[Any, FloatArray]:
+        """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
+        return self._parts[receiver].inputs, self._weights[receiver]
+
     def _reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
         """Parts with the noise variances that their residuals imply for Student-t noise.
 
@@ -167,6 +171,13 @@ class Field:
         expected, columns, _ = self.prior.columns(moved, receiver)
         mean, variance = self._process.predict(receiver, moved, columns)
         return expected + mean, variance + (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2
+
+    def mean(self, poses: Poses, receiver: int) -> FloatArray:
+        """The mean of `predict`, dBm."""
+        moved = poses.moved(self.hyperparameters.lever_m)
+        expected, columns, _ = self.prior.columns(moved, receiver)
+        field = self.hyperparameters.weighted_covariance(moved, *self._process.weights(receiver))
+        return expected + columns @ self._process.beta + field
 
 
 def folds(count: int) -> Iterator[tuple[IntArray, IntArray]]:

@@ -54,6 +54,10 @@ LEAST_SHARE = 1e-3
 """Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
 
 
+MOST_PAIRS = 2
+"""Pairs of a distinct position and a distinct heading, relative to the poses, up to which all pairs are evaluated."""
+
+
 @dataclass(frozen=True)
 class Poses:
     """Positions [n, 3] and headings [n] of the transmitter; None where the data have no headings."""
@@ -120,6 +124,21 @@ class Hyperparameters:
             turn = np.cos(here.heading_rad[:, None] - there.heading_rad[None]) - 1
             covariance += self.body_db**2 * np.exp(self.concentration * turn - distance / self.body_m)
         return np.asarray(covariance)
+
+    def weighted_covariance(self, here: Poses, there: Poses, weights: FloatArray) -> FloatArray:
+        """Covariances times weights [m], shape [n]; positions and headings that repeat are evaluated once."""
+        places, place = np.unique(here.position_m, axis=0, return_inverse=True)
+        headings = np.zeros(len(here)) if here.heading_rad is None else here.heading_rad
+        turns, turn = np.unique(headings, return_inverse=True)
+        if len(places) * len(turns) > MOST_PAIRS * len(here):
+            return np.asarray(self.covariance(here, there) @ weights)
+        distance = cdist(places, there.position_m)
+        found = np.asarray(self.shadow_db**2 * (np.exp(-distance / self.shadow_m) @ weights))[place.ravel()]
+        if here.heading_rad is not None and there.heading_rad is not None:
+            shares = np.exp(self.concentration * (np.cos(turns[:, None] - there.heading_rad) - 1)) * weights
+            body = self.body_db**2 * (np.exp(-distance / self.body_m) @ shares.T)
+            found = found + body[place.ravel(), turn]
+        return found
 
     def variance(self, headings: bool) -> float:
         """Variance of the field, with or without the part that depends on headings, dB^2."""

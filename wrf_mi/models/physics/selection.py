@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
@@ -56,15 +56,7 @@ class PhysicsModel(ABC):
         Raises:
             InputError: positions or headings of another shape or not finite, or no such receiver.
         """
-        positions = np.atleast_2d(np.asarray(tx_pos_m, float))
-        if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-            raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
-        heading = None
-        if self.uses_heading and tx_heading_rad is not None:
-            heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
-            if heading.shape != (len(positions),) or not np.isfinite(heading).all():
-                raise InputError(f"predict: {len(positions)} positions and headings {heading.shape}; give one for each")
-        index = receiver_index(self.receivers, receiver)
+        positions, index, heading = self._checked(tx_pos_m, receiver, tx_heading_rad)
         mean, std = np.empty(0), np.empty(0)  # filled chunk by chunk: joined chunks would take the memory twice
         for begin in range(0, max(len(positions), 1), self.chunk_size):
             rows = slice(begin, begin + self.chunk_size)
@@ -77,6 +69,27 @@ class PhysicsModel(ABC):
             if not shared:
                 std[rows] = deviation
         return Prediction(mean, np.broadcast_to(std, mean.shape))
+
+    def predict_mean(
+        self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
+    ) -> NDArray[Any]:
+        """The mean of `predict`, by subclasses that save time without standard deviations."""
+        return self.predict(tx_pos_m, receiver, tx_heading_rad).mean
+
+    def _checked(
+        self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None
+    ) -> tuple[FloatArray, int, FloatArray | None]:
+        """Positions [m, 3], number of the receiver, and headings [m] where they are used."""
+        positions = np.atleast_2d(np.asarray(tx_pos_m, float))
+        if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
+            raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
+        heading = None
+        if self.uses_heading and tx_heading_rad is not None:
+            heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
+            if heading.shape != (len(positions),) or not np.isfinite(heading).all():
+                raise InputError(f"predict: {len(positions)} positions and headings {heading.shape}; give one for each")
+        index = receiver_index(self.receivers, receiver)
+        return positions, index, heading
 
     @abstractmethod
     def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
@@ -100,6 +113,10 @@ class FittedPhysics(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction with standard deviations, see `Fitted`."""
         return self.model.predict(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """Mean of the prediction, see `Fitted`."""
+        return self.model.predict_mean(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
 
     def arrays(self) -> Arrays:
         """Arrays of the fitted model, see `Fitted`."""

@@ -1,0 +1,259 @@
+"""Radio maps: closed forms, files that other readers open, chunks, sides and paths, what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+import xarray as xr
+from calling import SMALL, call, refused
+from PIL import Image
+from scipy.constants import speed_of_light
+from traced_rooms import SHOEBOX, THICKNESS_M, write_xml
+
+import wrf_mi
+from wrf_mi.core import InputError, Record
+from wrf_mi.maps.api import radio_map
+from wrf_mi.maps.dataset import write_map
+from wrf_mi.models import Inputs
+from wrf_mi.models.held_out import distance_to_rows
+from wrf_mi.models.hybrid.mixture import Mixture
+from wrf_mi.models.hybrid.model import FittedHybrid
+from wrf_mi.runs.run import Run
+
+HZ = 2.44e9
+FIT_DB = 1e-3
+"""Of a law that is fitted to float32 values of its own form."""
+FLOAT32 = 1e-5
+TRANSMIT_DBM = 12.0
+REFLECTED_DB = 3.0
+"""Of the power of one-bounce reflections beside a line of sight in the room."""
+
+
+@pytest.fixture(scope="module")
+def strengths() -> Record:
+    """Strengths in free space of a transmitter of 12 dBm, with isotropic antennas."""
+    rng = np.random.default_rng(0)
+    positions = rng.uniform([1, 1, 1.3], [5, 4, 1.3], (60, 3))
+    receivers = tuple(
+        wrf_mi.Receiver(name, np.array(at), np.array([0.0, 0, 0, 1]))
+        for name, at in (("hall $_$", (0.0, 0.5, 2.0)), ("kitchen", (5.5, 4.5, 2.2)))
+    )
+    observed = np.stack([free_space_db(positions, receiver) + TRANSMIT_DBM for receiver in receivers])
+    rows = np.arange(60)
+    known = {"frequencies_hz": np.array([HZ]), "official": (rows[:45], rows[45:])}
+    return Record("open", "rssi", positions, receivers, observed.astype(np.float32), **known)
+
+
+def free_space_db(positions_m: np.ndarray, receiver: wrf_mi.Receiver) -> np.ndarray:
+    """Friis' path gain of isotropic antennas."""
+    distance = np.linalg.norm(positions_m - receiver.position_m, axis=-1)
+    return 20 * np.log10(speed_of_light / HZ / (4 * np.pi * distance))
+
+
+@pytest.fixture(scope="module")
+def law(strengths: Record, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return wrf_mi.train(strengths, tmp_path_factory.mktemp("runs") / "law", "mri", intervals=True)
+
+
+@pytest.fixture(scope="module")
+def mapped(law: Run) -> xr.Dataset:
+    return radio_map(law, step_m=0.5, transmit_dbm=TRANSMIT_DBM, threshold_dbm=-32.0)
+
+
+def grid_positions(mapped: xr.Dataset) -> np.ndarray:
+    y, x = np.meshgrid(mapped["y"], mapped["x"], indexing="ij")
+    return np.stack([x, y, np.full(x.shape, float(mapped["height"]))], axis=-1)
+
+
+def test_path_gain_of_a_path_loss_law_in_free_space_is_that_of_friis(mapped: xr.Dataset, strengths: Record) -> None:
+    positions = grid_positions(mapped)
+    for gain, receiver in zip(mapped["path_gain_db"], strengths.receivers, strict=True):
+        np.testing.assert_allclose(gain, free_space_db(positions, receiver), atol=FIT_DB)
+    np.testing.assert_allclose(mapped["power_dbm"], mapped["path_gain_db"] + TRANSMIT_DBM, atol=FIT_DB)
+
+
+def test_best_receiver_is_the_nearest_in_free_space(mapped: xr.Dataset, strengths: Record) -> None:
+    at = np.stack([receiver.position_m for receiver in strengths.receivers])
+    distance = np.linalg.norm(grid_positions(mapped)[..., None, :] - at, axis=-1)
+    np.testing.assert_array_equal(mapped["best_receiver"], distance.argmin(axis=-1))
+
+
+def test_variables_have_units_and_dimensions(mapped: xr.Dataset) -> None:
+    assert mapped["power_dbm"].dims == ("receiver", "y", "x")
+    assert mapped["best_receiver"].dims == ("y", "x")
+    assert all("long_name" in mapped[name].attrs for name in (*mapped.data_vars, *mapped.coords))
+    assert mapped["power_std_db"].attrs["units"] == "dB"
+    assert mapped["x"].attrs["units"] == "m"
+    assert mapped.attrs["Conventions"].startswith("CF-")
+    assert mapped.attrs["threshold_dbm"] == -32.0
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+def test_files_open_with_xarray_as_they_were_written(mapped: xr.Dataset, suffix: str, tmp_path: Path) -> None:
+    for _ in range(2):  # once more over the first
+        file = write_map(mapped, tmp_path / f"map{suffix}")
+    with xr.open_dataset(file) as opened:
+        xr.testing.assert_equal(opened.load(), mapped)
+        assert opened["power_dbm"].attrs == mapped["power_dbm"].attrs
+        assert set(opened.attrs) == set(mapped.attrs)
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_table_has_a_row_for_each_receiver_and_position(mapped: xr.Dataset, tmp_path: Path) -> None:
+    table = pd.read_csv(write_map(mapped, tmp_path / "map.csv"))
+    assert len(table) == mapped["power_dbm"].size
+    row = table.iloc[57]
+    found = mapped["power_dbm"].sel(receiver=row["receiver"], x=row["x"], y=row["y"], method=None)
+    assert float(found) == pytest.approx(row["power_dbm"], rel=FLOAT32)
+    assert set(table["best_receiver"]) == {"hall $_$", "kitchen"}
+
+
+def test_chunks_and_choices_of_receivers_do_not_change_values(law: Run, mapped: xr.Dataset) -> None:
+    given = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
+    xr.testing.assert_allclose(radio_map(law, chunk_size=7, **given), mapped, rtol=FLOAT32)
+    kitchen = radio_map(law, receivers=["kitchen"], **given)
+    np.testing.assert_array_equal(kitchen["power_dbm"][0], mapped["power_dbm"][1])
+
+
+def test_surface_has_the_values_of_its_points(law: Run, tmp_path: Path) -> None:
+    trimesh.creation.box((2.0, 1.0, 0.5), transform=trimesh.transformations.translation_matrix([3, 2, 1])).export(
+        tmp_path / "box.ply"
+    )
+    found = radio_map(law, surface=tmp_path / "box.ply", step_m=0.4)
+    assert found["power_dbm"].dims == ("receiver", "point")
+    points = np.stack([found[axis] for axis in "xyz"], axis=-1)
+    np.testing.assert_allclose(points, found["triangle"].mean("corner"), atol=FLOAT32)
+    np.testing.assert_allclose(found["power_dbm"][1], law.predict(points, 1).mean, rtol=FLOAT32)
+
+
+def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, tmp_path: Path) -> None:
+    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", intervals=True)
+    found = radio_map(run, step_m=1.5)
+    positions = grid_positions(found).reshape(-1, 3)
+    each = [run.predict(positions, 0, np.full(len(positions), turn)) for turn in np.arange(8) * np.pi / 4]
+    mean = np.mean([one.mean for one in each], axis=0)
+    std = np.sqrt(np.mean([one.stated_std**2 for one in each], axis=0) + np.var([one.mean for one in each], axis=0))
+    np.testing.assert_allclose(found["power_dbm"][0].values.ravel(), mean, rtol=FLOAT32)
+    np.testing.assert_allclose(found["power_std_db"][0].values.ravel(), std, rtol=FLOAT32)
+    turned = radio_map(run, step_m=1.5, heading_deg=45.0)
+    np.testing.assert_allclose(turned["power_dbm"][0].values.ravel(), each[1].mean, rtol=FLOAT32)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+    """A room with a solid cabinet in it, and strengths measured there."""
+    folder = tmp_path_factory.mktemp("room")
+    cabinet = trimesh.creation.box((0.4, 0.4, 2.0), transform=trimesh.transformations.translation_matrix([3, 2, 1]))
+    parts = SHOEBOX | {"cabinet": ("itu_concrete", cabinet)}
+    assert set(THICKNESS_M) >= {material for material, _ in SHOEBOX.values()}
+    rng = np.random.default_rng(3)
+    positions = rng.uniform([0.5, 0.5, 1.3], [2.5, 4.5, 1.3], (30, 3))
+    receiver = wrf_mi.Receiver("rx", np.array([5.0, 4.0, 2.0]), np.array([0.0, 0, 0, 1]))
+    observed = (free_space_db(positions, receiver) + 3)[None].astype(np.float32)
+    known = {"frequencies_hz": np.array([HZ]), "official": (np.arange(22), np.arange(22, 30))}
+    return write_xml(folder, parts), Record("room", "rssi", positions, (receiver,), observed, **known)
+
+
+def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, Record], tmp_path: Path) -> None:
+    scene, record = room
+    given: dict[str, Any] = {"scene": scene, "settings": ["max_depth=0", "rays=1024"]}
+    found = radio_map(wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given), step_m=0.4, height_m=1.3)
+    reached = ~np.isnan(found["k_factor_db"][0].values)
+    # The line of sight alone: no spread, an infinite K-factor.
+    assert reached.sum() > 20
+    assert (found["k_factor_db"][0].values[reached] == np.inf).all()
+    assert (found["delay_spread_s"][0].values[reached] == 0).all()
+    inside = found["power_dbm"][0].sel(x=3.0, y=2.0, method="nearest")
+    assert np.isnan(inside)
+    assert found["best_receiver"].sel(x=3.0, y=2.0, method="nearest") == -1
+    assert "power_std_db" not in found
+
+
+def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tmp_path: Path) -> None:
+    scene, record = room
+    traced = wrf_mi.train(record, tmp_path / "traced", "ray-tracing", scene=scene, settings=["rays=1024"])
+    law = wrf_mi.train(record, tmp_path / "law", "mri")
+    mixture = Mixture(np.array([0.0, 1.0]), np.array([[1.0, 0.0], [0.2, 0.8]]))
+    fitted = {"ray-tracing": traced.fitted, "mri": law.fitted}
+    hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, {})
+    positions = np.concatenate([record.tx_pos_m[:2], record.tx_pos_m[:2] + np.array([0.0, 0.0, 0.7])])
+    found = hybrid.decompose(Inputs(positions), 0)
+    np.testing.assert_array_equal(found.whole.mean, hybrid.predict(Inputs(positions), 0).mean)
+    assert found.traced is not None
+    assert found.learned is not None
+    # Training rows are traced alone.
+    np.testing.assert_array_equal(np.isnan(found.learned), [True, True, False, False])
+    np.testing.assert_array_equal(found.traced[:2], found.whole.mean[:2])
+    share = hybrid.mixture(distance_to_rows(record, np.arange(22), positions, 0))[2:]
+    np.testing.assert_allclose(share[:, 0] * found.traced[2:] + share[:, 1] * found.learned[2:], found.whole.mean[2:])
+    assert found.paths is not None
+
+
+def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], tmp_path: Path) -> None:
+    scene, record = room
+    settings = [*SMALL, "traced.depth=1", "traced.reflections=1", "traced.rays=1024"]
+    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", scene=scene, settings=settings)
+    run.field.predictor.reach = None  # Gaussians everywhere, whatever these few steps gained
+    positions = record.tx_pos_m[:5]
+    found = run.fitted.decompose(Inputs(positions), 0)
+    np.testing.assert_allclose(found.whole.mean, run.predict(positions).mean, atol=FIT_DB)
+    assert found.traced is not None
+    assert found.learned is not None
+    whole, traced, learned = (10 ** (x / 20) for x in (found.whole.mean, found.traced, found.learned))
+    assert (whole <= (traced + learned) * (1 + FIT_DB)).all()
+    assert (whole >= np.abs(traced - learned) * (1 - FIT_DB)).all()
+    assert found.paths is not None
+    line_of_sight = free_space_db(positions, record.receivers[0])
+    # The cabinet hides one of the positions.
+    assert np.median(np.abs(found.paths.path_gain_db - line_of_sight)) < REFLECTED_DB
+
+
+def test_command_writes_map_and_picture(law: Run, strengths: Record, tmp_path: Path, capsys: Any) -> None:
+    from wrf_mi.datasets import write_ble_folder
+
+    data = write_ble_folder(tmp_path / "data", strengths)
+    wrf_mi.train(data, tmp_path / "run", "mri", intervals=True)
+    status, out, err = call(["map", tmp_path / "run", "--step", "0.5", "--out", tmp_path / "map.nc"], capsys)
+    assert (status, err) == (0, "mapping\n")
+    assert "map.nc" in out
+    assert "map.png" in out
+    with Image.open(tmp_path / "map.png") as picture:
+        assert picture.size[0] > 300
+    assert call(["evaluate", tmp_path / "run", "--reliability", tmp_path / "r.png"], capsys)[0] == 0
+    assert (tmp_path / "r.png").stat().st_size > 1000
+
+
+def test_bad_input_is_one_line(law: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "map.nc"
+    for more, message in (
+        (["--out", tmp_path / "map.txt"], "maps are written as NetCDF"),
+        (["--out", tmp_path], "maps are written as|is a folder"),
+        (["--out", out, "--step", "one"], "invalid float"),
+    ):
+        refused(["map", law.folder, *more], message, capsys)
+    refused(["map", tmp_path / "none", "--out", out], "none", capsys)
+    for given, message in (
+        ({"step_m": 0.0}, "positive number"),
+        ({"height_m": float("nan")}, "height nan"),
+        ({"receivers": ["attic"]}, "no receiver 'attic'"),
+        ({"heading_deg": 30.0}, "do not depend on the heading"),
+        ({"frequency_hz": 1e9}, "one carrier"),
+        ({"surface": "none.ply"}, "no such file"),
+        ({"surface": "none.ply", "height_m": 1.0}, "belongs to a grid"),
+    ):
+        with pytest.raises(InputError, match=message):
+            radio_map(law, **given)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_package_is_named(mapped: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(InputError, match=r"need zarr: pip install 'wrf-mi\[maps\]'"):
+        write_map(mapped, tmp_path / "map.zarr")

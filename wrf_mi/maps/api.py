@@ -1,0 +1,178 @@
+"""Radio maps of a run: power, coverage, best receiver and statistics of paths over a plane or a mesh.
+
+Powers of a made-up receiver with noise of 2 dB, mapped by kriging with intervals:
+
+    >>> import shutil, tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import wrf_mi
+    >>> rng = np.random.default_rng(0)
+    >>> positions_m = rng.uniform([1, 1, 1.3], [5, 4, 1.3], (40, 3))
+    >>> rssi_dbm = -40 - 20 * np.log10(np.linalg.norm(positions_m, axis=1))[None] + rng.normal(0, 2, (1, 40))
+    >>> receiver = wrf_mi.Receiver("anchor1", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    >>> known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(30), np.arange(30, 40))}
+    >>> record = wrf_mi.Record("made-up", "rssi", positions_m, (receiver,), rssi_dbm.astype("float32"), **known)
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> run = wrf_mi.train(record, folder / "run", "kriging", intervals=True)
+    >>> dataset = wrf_mi.radio_map(run, step_m=0.5, threshold_dbm=-52)
+    >>> dict(dataset["power_dbm"].sizes), dataset["power_dbm"].units
+    ({'receiver': 1, 'y': 8, 'x': 10}, 'dBm')
+    >>> bool((dataset["coverage_probability"] <= 1).all())
+    True
+    >>> wrf_mi.write_map(dataset, folder / "map.nc").name
+    'map.nc'
+    >>> shutil.rmtree(folder)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core import InputError
+from ..core.carriers import FREQUENCY
+from ..core.receivers import receiver_index
+from ..runs.run import Run, open_run
+from ..tasks import Task, task_of
+from ..training.session import OnProgress, quiet
+from .dataset import map_dataset, maps_package
+from .grid import Grid, area_of, grid_over, usual_height
+from .surface import SurfaceMesh, surface_of
+from .values import HEADINGS, Conditions, map_values
+
+if TYPE_CHECKING:
+    import xarray
+
+STEP_M = 0.1
+THRESHOLD_DBM = -90.0
+
+
+def radio_map(
+    run: Run | str | Path,
+    *,
+    height_m: float | None = None,
+    step_m: float | None = None,
+    surface: str | Path | None = None,
+    receivers: Sequence[int | str] | None = None,
+    threshold_dbm: float | None = None,
+    transmit_dbm: float = 0.0,
+    heading_deg: float | None = None,
+    frequency_hz: float | None = None,
+    on_progress: OnProgress = quiet,
+    chunk_size: int | None = None,
+) -> xarray.Dataset:
+    """What the receivers of a run receive from a transmitter at the positions of a plane or a mesh.
+
+    Args:
+        run: run, or its folder, with one fitted model.
+        height_m: z of a horizontal grid over the scene, or over the data where there is none; None: the median height
+            of the transmitters in the data.
+        step_m: spacing of the grid, or longest edge of a mesh's triangles, which are halved; None: 0.1 m, or the
+            triangles as they are.
+        surface: mesh whose triangles' centres are the positions, in place of the grid.
+        receivers: names, or numbers from 0; None: all.
+        threshold_dbm: received power above which a position counts as covered; None: -90 dBm, and no coverage for
+            levels without a unit.
+        transmit_dbm: transmit power, which separates path gain from received power.
+        heading_deg: yaw of the transmitter; None: models that know it are averaged over 8 headings.
+        frequency_hz: carrier, where the data have several.
+        on_progress: progress callback: stage and fraction done.
+        chunk_size: positions that are predicted together; None: at most 10,000, fewer of large observations.
+
+    Returns:
+        Dataset as `wrf_mi.maps.dataset.map_dataset` describes it; ``docs/maps.md`` defines the variables.
+
+    Raises:
+        InputError: positions, receiver, heading or carrier that the run cannot be mapped with, or a missing package.
+    """
+    opened = run if isinstance(run, Run) else open_run(run)
+    maps_package("xarray")
+    task = task_of(opened.problem.record)
+    _check(opened, task, surface, height_m, transmit_dbm, threshold_dbm)
+    known = opened.receivers
+    numbers = range(len(known)) if receivers is None else [receiver_index(known, one) for one in receivers]
+    if task.level_kind != "relative" and threshold_dbm is None:
+        threshold_dbm = THRESHOLD_DBM
+    conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
+    _check_carrier(opened, frequency_hz)
+    places = _places(opened, height_m, step_m, surface)
+    values = map_values(opened, places.positions_m, numbers, conditions, on_progress, chunk_size)
+    unit = "dB" if task.level_kind == "relative" else "dBm"
+    attributes = _attributes(opened, task, conditions, heading_deg) | {"receiver_numbers": list(numbers)}
+    return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
+
+
+def _check(
+    run: Run,
+    task: Task,
+    surface: str | Path | None,
+    height_m: float | None,
+    transmit_dbm: float,
+    threshold_dbm: float | None,
+) -> None:
+    if run.model.uplink == "required":
+        raise InputError(f"{run.folder}: {run.config.model} predicts from the uplink, not from positions; no map of it")
+    if surface is not None and height_m is not None:
+        raise InputError("map: a height belongs to a grid; omit it, or the surface")
+    numbers = (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold_dbm))
+    for name, value in numbers:
+        if value is not None and not np.isfinite(value):
+            raise InputError(f"{name} {value:g}: give a finite number")
+    if task.level_kind == "relative" and transmit_dbm:
+        text = f"its {task.name} observations state no power in dBm"
+        raise InputError(f"{run.folder}: {text}; omit the transmit power")
+
+
+def _check_carrier(run: Run, frequency_hz: float | None) -> None:
+    known = run.problem.record.carriers_hz
+    if frequency_hz is None and known is not None and run.model.several_carriers:
+        first = ", ".join(f"{one:.10g}" for one in np.unique(known)[:4])
+        raise InputError(f"{run.folder}: its data have several carriers ({first} Hz); give the frequency of the map")
+    if frequency_hz is not None and not (np.isfinite(frequency_hz) and frequency_hz > 0):
+        raise InputError(f"frequency {frequency_hz:g} Hz: give a positive number")
+    if frequency_hz is not None and known is None:
+        raise InputError(f"{run.folder}: its data have one carrier; omit the frequency")
+
+
+def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
+    if heading_deg is not None and not np.isfinite(heading_deg):
+        raise InputError(f"heading {heading_deg:g} degrees: give a finite number")
+    if not run.fitted.depends_on_heading:
+        if heading_deg is not None:
+            raise InputError(f"{run.folder}: its predictions do not depend on the heading; omit it")
+        return ()
+    turns = np.arange(HEADINGS) / HEADINGS * 2 * np.pi if heading_deg is None else [np.radians(heading_deg)]
+    return tuple(map(float, turns))
+
+
+def _places(run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None) -> Grid | SurfaceMesh:
+    if surface is not None:
+        return surface_of(surface, step_m)
+    height = usual_height(run) if height_m is None else height_m
+    return grid_over(*area_of(run), STEP_M if step_m is None else step_m, height)
+
+
+def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
+    """Attributes of the whole dataset."""
+    config, headings = run.config, conditions.headings_rad
+    found: dict[str, Any] = {
+        "title": f"Radio map of {run.problem.record.name} by {config.model}",
+        "source": f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}",
+        "dataset": run.problem.record.name,
+        "model": config.model,
+        "task": task.name,
+        "level": task.level_note or task.quantity,
+        "level_is_absolute": int(task.level_kind != "relative"),
+        "transmit_power_dbm": conditions.transmit_dbm,
+    }
+    if conditions.threshold_db is not None:
+        found["threshold_dbm"] = conditions.threshold_db
+    if headings:
+        words = f"mean over {len(headings)} headings" if heading_deg is None else f"{heading_deg:g} degrees"
+        found["transmitter_heading"] = words
+    if conditions.frequency_hz is not None:
+        found[FREQUENCY] = conditions.frequency_hz
+    return found

@@ -1,0 +1,129 @@
+"""Probability of coverage from predicted powers, and how reliable it is on test rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from ..core import InputError, Prediction
+from ..core.angles import FloatArray
+from ..runs.results import read_run
+from ..tasks import TASKS
+
+BINS = 10
+"""Number of bins of the predicted probability."""
+QUANTILES = np.linspace(0.1, 0.9, 9)
+"""Quantiles of the measured levels that are thresholds where none is stated."""
+FEWEST = 20
+"""Least number of pairs in a bin that is drawn."""
+
+
+def coverage_probability(level_db: ArrayLike, std_db: ArrayLike, threshold_db: float) -> FloatArray:
+    """Probability that a normal level with a mean and a standard deviation exceeds a threshold, in any shape.
+
+    >>> coverage_probability([-90.0, -80.0], [5.0, 5.0], -90.0).round(3).tolist()
+    [0.5, 0.977]
+    """
+    above = np.asarray(level_db, float) - threshold_db
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(ndtr(above / np.asarray(std_db, float)))
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Predicted probabilities of coverage against observed shares, in bins of the probability; NaN in empty bins.
+
+    Attributes:
+        predicted: mean predicted probability in each bin [b].
+        observed: share of the measured levels above the threshold [b].
+        count: number of pairs of an observation and a threshold [b].
+        error: mean of abs(observed - predicted) over all pairs (expected calibration error).
+        brier: mean of (predicted - 0 or 1)^2 over all pairs. Source: Brier, "Verification of forecasts expressed in
+            terms of probability" (1950).
+        threshold_db: thresholds [t].
+    """
+
+    predicted: FloatArray
+    observed: FloatArray
+    count: NDArray[np.int64]
+    error: float
+    brier: float
+    threshold_db: FloatArray
+
+
+def reliability(
+    level_db: FloatArray, std_db: FloatArray, measured_db: FloatArray, threshold_db: FloatArray | None = None
+) -> Reliability:
+    """Reliability of probabilities of coverage.
+
+    Args:
+        level_db: predicted levels, any shape.
+        std_db: their standard deviations, likewise.
+        measured_db: measured levels, likewise; NaN where nothing was received, which is left out.
+        threshold_db: thresholds [t]; None: the quantiles `QUANTILES` of the measured levels.
+
+    Raises:
+        InputError: nothing was measured.
+    """
+    known = np.isfinite(measured_db)
+    level, std, measured = (np.asarray(values, float)[known] for values in (level_db, std_db, measured_db))
+    if not len(measured):
+        raise InputError("coverage: no measured level to compare with; give a run whose test rows were received")
+    thresholds = np.quantile(measured, QUANTILES) if threshold_db is None else np.atleast_1d(threshold_db).astype(float)
+    probability = np.concatenate([coverage_probability(level, std, threshold) for threshold in thresholds])
+    exceeded = np.concatenate([measured > threshold for threshold in thresholds])
+    place = np.minimum((probability * BINS).astype(int), BINS - 1)
+    count = np.bincount(place, minlength=BINS)
+    with np.errstate(invalid="ignore"):
+        predicted, observed = (np.bincount(place, values, BINS) / count for values in (probability, exceeded))
+    error = float(np.nansum(np.abs(observed - predicted) * count) / count.sum())
+    brier = float(np.square(probability - exceeded).mean())
+    return Reliability(predicted, observed, count, error, brier, thresholds)
+
+
+def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) -> Reliability:
+    """Reliability of probabilities of coverage on the test rows of a run, those of all its folds.
+
+    Args:
+        folder: run folder of a model that states standard deviations.
+        threshold_db: thresholds in the unit of `wrf_mi.tasks.Task.level`; None: quantiles of the measured levels.
+
+    Raises:
+        InputError: not a finished run, or its model states no standard deviation.
+    """
+    results = read_run(folder)
+    if results.std is None:
+        raise InputError(f"{folder}: its model states no standard deviation; train with --intervals")
+    task = TASKS[results.task]
+
+    def levels(values: Any, std: Any = None) -> Prediction:
+        rows = int(np.prod(values.shape[:2]))
+        given = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
+        return task.level(Prediction(values.reshape(rows, *values.shape[2:]), given))
+
+    stated = levels(results.prediction, results.std)
+    return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db)
+
+
+def reliability_figure(found: Mapping[str, Reliability]) -> Figure:
+    """Observed share against predicted probability of coverage; bins of fewer than `FEWEST` pairs are left out."""
+    figure = Figure(figsize=(4.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--", label="calibrated")
+    for name, one in found.items():
+        shown = one.count >= FEWEST
+        label = f"{name} (error {one.error:.3f})"
+        axes.plot(one.predicted[shown], one.observed[shown], marker="o", markersize=4, linewidth=1.2, label=label)
+    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    axes.set_xlabel("predicted P(level > threshold)")
+    axes.set_ylabel("observed share of test values")
+    axes.legend(fontsize=7)
+    axes.grid(alpha=0.3)
+    return figure

@@ -1,0 +1,164 @@
+"""Radio maps as `xarray.Dataset` with coordinates, units and attributes of the CF conventions, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Receiver
+from ..core.files import atomic_file, atomic_folder, os_failure
+from .grid import Grid
+from .surface import SurfaceMesh
+from .variables import BEST, LEVELS, POWER, VARIABLES
+
+if TYPE_CHECKING:
+    import xarray
+
+CONVENTIONS = "CF-1.11"
+NETCDF, ZARR, CSV = ".nc", ".zarr", ".csv"
+PACKAGES = {NETCDF: "h5netcdf", ZARR: "zarr", CSV: "pandas"}
+"""Suffixes of files, and the package beside xarray that writes each."""
+COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
+
+
+def maps_package(name: str) -> Any:
+    """A package of the extra ``maps``; an `InputError` if it is not installed."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        raise InputError(f"radio maps need {name}: pip install 'wrf-mi[maps]'") from None
+
+
+def check_map_file(out: Path) -> None:
+    """Refuse a file name of another format than NetCDF, Zarr and CSV, and a missing package.
+
+    Raises:
+        InputError: naming suffixes, or the package.
+    """
+    suffix = out.suffix.lower()
+    if suffix not in PACKAGES:
+        raise InputError(f"{out}: maps are written as NetCDF ({NETCDF}), Zarr ({ZARR}) or {CSV}; give such a name")
+    if out.is_dir() and suffix != ZARR:
+        raise InputError(f"{out}: is a folder; give the name of a file")
+    if suffix == ZARR and out.exists() and not (out / ".zgroup").is_file():
+        raise InputError(f"{out}: exists and is no Zarr store; remove it or give another name")
+    for name in ("xarray", PACKAGES[suffix]):
+        maps_package(name)
+
+
+def map_dataset(
+    places: Grid | SurfaceMesh,
+    receivers: Sequence[Receiver],
+    values: Mapping[str, NDArray[Any]],
+    level_unit: str,
+    attributes: Mapping[str, Any],
+) -> xarray.Dataset:
+    """Dataset of a map.
+
+    Args:
+        places: positions of the map.
+        receivers: receivers of the map.
+        values: arrays [receivers, m] by the names of `VARIABLES`.
+        level_unit: unit of received powers: ``dBm``, or ``dB`` without an absolute calibration.
+        attributes: attributes of the whole.
+
+    Returns:
+        Variables with dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, and
+        ``best_receiver`` without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``,
+        ``receiver_z``; ``x``, ``y``, ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are
+        ``triangle`` (point, corner, axis). Metres, in the frame of the data.
+    """
+    xr = maps_package("xarray")
+    at = np.stack([receiver.position_m for receiver in receivers])
+    coordinates: dict[str, Any] = {
+        "receiver": ("receiver", [receiver.name for receiver in receivers], {"long_name": "name of the receiver"}),
+        **{
+            f"receiver_{axis}": ("receiver", at[:, k], _metres(f"{axis} of the receiver"))
+            for k, axis in enumerate("xyz")
+        },
+    }
+    data: dict[str, Any] = {}
+    if isinstance(places, Grid):
+        dims: tuple[str, ...] = ("y", "x")
+        shape: tuple[int, ...] = (len(places.y_m), len(places.x_m))
+        coordinates["x"] = "x", places.x_m, _metres("x of the transmitter") | {"axis": "X"}
+        coordinates["y"] = "y", places.y_m, _metres("y of the transmitter") | {"axis": "Y"}
+        height = _metres("z of the transmitter") | {"axis": "Z", "positive": "up"}
+        coordinates["height"] = (), places.height_m, height
+    else:
+        dims, shape = ("point",), (len(places.triangles_m),)
+        for k, axis in enumerate("xyz"):
+            coordinates[axis] = "point", places.positions_m[:, k], _metres(f"{axis} of the transmitter")
+        coordinates["axis"] = "axis", list("xyz")
+        corners = places.triangles_m.astype(np.float32)
+        data["triangle"] = ("point", "corner", "axis"), corners, _metres("corners of the triangle around each point")
+    for name, variable in VARIABLES.items():
+        if name in values:
+            described = {"units": level_unit if name in LEVELS else variable.units, "long_name": variable.long_name}
+            data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), described
+    data[BEST] = dims, _best(values[POWER]).reshape(shape), _best_attributes(receivers)
+    return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
+
+
+def _metres(long_name: str) -> dict[str, str]:
+    return {"units": "m", "long_name": f"{long_name} in the frame of the data"}
+
+
+def _best(power: NDArray[Any]) -> NDArray[np.int32]:
+    """Number of the receiver of the highest power [m], -1 where none has one."""
+    known = np.where(np.isfinite(power), power, -np.inf)
+    return np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
+
+
+def _best_attributes(receivers: Sequence[Receiver]) -> dict[str, Any]:
+    # Meanings are separated by spaces.
+    names = ["_".join(receiver.name.split()) for receiver in receivers]
+    return {
+        "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
+        "flag_values": np.arange(-1, len(names), dtype=np.int32),
+        "flag_meanings": " ".join(["none", *names]),
+    }
+
+
+def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:
+    """Write a map atomically as NetCDF 4, Zarr (format 2) or CSV, by the suffix of the name.
+
+    CSV has a row for each receiver and position, with the name of the best receiver; empty where nothing is known.
+
+    Raises:
+        InputError: another suffix, a missing package, or a file that cannot be written.
+    """
+    path = Path(out)
+    check_map_file(path)
+    try:
+        if path.suffix.lower() == ZARR:
+            with atomic_folder(path, replace=True) as part:
+                dataset.to_zarr(part, mode="w", zarr_format=2, consolidated=True)
+            return path
+        with atomic_file(path) as part:
+            if path.suffix.lower() == CSV:
+                _write_csv(dataset, part)
+            else:
+                packed = {name: COMPRESSION for name in dataset.data_vars}
+                dataset.to_netcdf(part, engine="h5netcdf", format="NETCDF4", encoding=packed)
+    except OSError as error:
+        raise InputError(os_failure(error, path, "cannot be written")) from None
+    return path
+
+
+def _write_csv(dataset: xarray.Dataset, path: Path) -> None:
+    names = np.append(dataset["receiver"].values.astype(object), "")
+    best = dataset[BEST].copy(data=names[dataset[BEST].values])
+    plain = dataset.drop_vars(["triangle", "axis", *(f"receiver_{axis}" for axis in "xyz")], errors="ignore")
+    plain = plain.assign({BEST: best})
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        for number in range(plain.sizes["receiver"]):
+            table = plain.isel(receiver=number).to_dataframe().reset_index()
+            first = ["receiver", *(name for name in ("x", "y", "z", "height") if name in table)]
+            columns = [*first, *(name for name in (*VARIABLES, BEST) if name in table)]
+            table[columns].to_csv(stream, index=False, header=number == 0, lineterminator="\n")
