@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .core import BackendError, InputError, Receiver, Record, Split
     from .core.settings import with_settings
     from .datasets import fetch, make_splits
+    from .maps.locate import locate
     from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .runs.compare import compare
     from .runs.figures import spectrum_table
@@ -41,6 +42,7 @@ _HOME = {
     "evaluate_run": "runs.api",
     "fetch": "datasets",
     "load": "synthetic:load_record",
+    "locate": "maps.locate:locate",
     "make_scene": "scene.make",
     "make_splits": "datasets",
     "open_run": "runs.api",
@@ -67,6 +69,7 @@ __all__ = [
     "evaluate_run",
     "fetch",
     "load",
+    "locate",
     "make_scene",
     "make_splits",
     "open_run",
